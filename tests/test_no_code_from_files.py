@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 UNRULED = re.compile(
     r"(?<![.\w])(?<!def )(?:compile|__import__)\(|\.extractall\b|\.(?:to|read)_pickle\b|unsafe_load|runpy\."
-    r"|joblib\.load\(|allow_pickle=(?!False)|(?<!json)\.load\([^)]*\b(?:device|map_location|custom_objects)=|torch\.load\("
+    r"|joblib\.load\(|allow_pickle=(?!False)|(?<!json)\.load\([^)]*\b(?:device|map_location|custom_objects)=|torch\.load\((?![^)]*\bweights_only=True\))"
 )
 PLACES = {"ethbrake_marl/files/python_file.py"}  # a file that the user names is code
 
@@ -28,6 +28,8 @@ def test_package__runs_no_code_from_files_but_in_the_named_places() -> None:
         ("open_archive(path).extractall(folder)", True), ("frame.to_pickle(path)", True), ("json.load(file)", False),
         ("np.load(path, allow_pickle=given)", True), ("np.load(path, allow_pickle=False)", False),
         ("classes[name].load(path, device='cpu')", True), ("yaml.unsafe_load(text)", True),
+        ("torch.load(file)", True), ("torch.load(file, weights_only=given)", True),
+        ("torch.load(file, weights_only=True)", False),
     ],
 )  # fmt: skip
 def test_planted__is_found_where_ruff_has_no_rule(source: str, told: bool) -> None:

@@ -108,6 +108,12 @@ class State(NamedTuple):
         return self.clock[:, ENDED] == 1.0
 
     @property
+    def at_rest(self) -> Bools:
+        """Whether every vehicle is at rest and no command would move it, [n]; if not, at the end, the horizon came."""
+        moves = (self.line[:, SPEED] != 0.0) | (self.wanted > 0.0) | (self.line[:, FORCE] > 0.0)
+        return ~moves[:, 1:].any(axis=1)
+
+    @property
     def speeds_mps(self) -> Floats:
         """Speeds, [n, N] m/s."""
         return self.line[:, SPEED, 1:]

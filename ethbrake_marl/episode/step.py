@@ -205,8 +205,9 @@ def step(
             commands[i], memories[i] = asked(script, state, memories[i], i)
     if not donate:
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
+    running = clock[:, ENDED] == 0.0  # nothing changes in an episode that has ended
     for i, command_mps2 in commands.items():
-        wanted[:, i] = command_mps2
+        np.copyto(wanted[:, i], command_mps2, where=running)
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
     failed = step_worlds(line, car, clock, wanted, actions, scratch_for(wanted.shape[1]), out, reward, *rules)
     if failed >= 0:

@@ -40,7 +40,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
-from ethbrake_marl.motion.layout import COUNT, FIRST, FORCE, SPEED
+from ethbrake_marl.motion.layout import COUNT, FIRST
 
 Values = NDArray[Any]
 Given = Values | Mapping[str, Values] | None
@@ -135,8 +135,7 @@ def end_s(game: Game, alert: State, last: State) -> Given:
 
 def ended(game: Game, alert: State, last: State) -> Given:
     """at_rest: all vehicles came to rest; horizon: the horizon came first."""
-    moves = (last.line[:, SPEED] != 0.0) | (last.wanted > 0.0) | (last.line[:, FORCE] > 0.0)
-    return np.where(moves[:, 1:].any(axis=1), HORIZON, AT_REST)
+    return np.where(last.at_rest, AT_REST, HORIZON)
 
 
 def predicted_harm(game: Game, alert: State, last: State) -> Given:

@@ -15,44 +15,32 @@ import numpy as np
 from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import advance_worlds
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.measures import AT_REST, ended
 from ethbrake_marl.evaluation.pushing import POST_M
-from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.drive import MET, drive
 from ethbrake_marl.motion.layout import (
+    COUNT,
     FAR_M,
+    FIRST,
     FORCE,
     GAP,
     LATENCY,
-    NEW_COUNT,
-    NEW_FIRST,
-    NEW_TOTAL,
     NEXT_CLOSING,
     NEXT_TIME,
     SPEED,
+    TOTAL,
     Floats,
     Ints,
     scratch_for,
 )
 
 SAMPLE_S = 0.02  # usual time between two samples
-OF_IMPACT = (NEXT_TIME, NEXT_CLOSING, NEW_COUNT, NEW_FIRST, NEW_TOTAL)
-
-
-@large
-def drive_each(line, car, wanted, start, until, scratch, rows, out):
-    """Advance every world in place, and write ``rows`` of scratch memory to ``out`` [n, rows, N + 1]; 0 if apart."""
-    for k in range(len(until)):
-        met = drive(line[k], car[k], wanted[k], scratch, start[k], until[k])
-        for r in range(len(rows)):
-            for p in range(line.shape[2]):
-                out[k, r, p] = scratch[rows[r], p] if met == MET else 0.0
 
 
 @dataclass(frozen=True)
 class Impacts:
-    """Impacts of one episode in order of time; several of a pair within 0.02 s are one row."""
+    """Impacts of one episode in order of time; several of a pair between two samples are one row."""
 
     time_s: Floats  # [m] of the first
     pair: Ints  # [m] 0: Vehicle 1 with the obstacle, p: vehicle_p and the one behind it
@@ -124,48 +112,50 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
         raise InvalidInput(f"record_episode: sample_s = {sample_s!r}: must be a finite number of seconds above 0")
     states = [world, *(state for _, state in play(game, world, team))]
     pieces = [_between(before, after, sample_s) for before, after in pairwise(states)]
-    times, lines, wanted, impacts = (np.concatenate(part) for part in zip(*pieces, strict=True))
+    times, lines, wanted = (np.concatenate(part) for part in zip(*pieces, strict=True))
     way_m = np.cumsum(lines[:, 0, GAP, 0] - lines[:, 1, GAP, 0])  # of Vehicle 1, up to the end of each piece
     line = np.concatenate([lines[:, 0], lines[-1:, 1]])
     time_s = np.append(times[:, 0], times[-1, 1])
     front_m = np.append(0.0, way_m)
     behind_m = np.cumsum(line[:, GAP, 1:-1], axis=1)
     in_force = world.car[:, LATENCY, 1:] <= time_s[:, np.newaxis]
+    commands = np.concatenate([wanted, wanted[-1:]])[:, 1:]
     last = states[-1]
     return EpisodeRecord(
         team.name, game.name, tuple(team.drivers), tuple(states), time_s, line[:, GAP, 1:-1], line[:, SPEED, 1:],
         np.column_stack([front_m, front_m[:, np.newaxis] - behind_m]),
-        np.where(in_force, np.concatenate([wanted, wanted[-1:]]), 0.0), line[:, FORCE, 1:], _impacts(times, impacts),
+        np.where(in_force, commands, 0.0), line[:, FORCE, 1:], _impacts(times, lines, world.car, wanted),
         bool(np.asarray(ended(game, world, last))[0] == AT_REST),
     )  # fmt: skip
 
 
-def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return k pieces of the motion between two states: times [k, 2], lines [k, 2, ...] at their beginning and end,
+def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
+    """Return k pieces of the motion between two states: times [k, 2], lines [k, 2, ...], and commands [k, N + 1].
 
-    commands [k, N], and rows OF_IMPACT [k, rows, N + 1]. Without an obstacle, a post measures the way of Vehicle 1.
+    Lines are those at the beginning and the end of a piece; without an obstacle, a post measures Vehicle 1's way.
     """
     start, end = float(before.time_s[0]), float(after.time_s[0])
     count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
     ends = np.linspace(start, end, count + 1)
     line = before.line.copy()
     line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
-    every, scratch = np.zeros(count + 1, np.int64), scratch_for(line.shape[2])
-    lines, car, wanted = line[every], before.car[every], after.wanted[every]
-    rows, out = np.array(OF_IMPACT), np.empty((count + 1, len(OF_IMPACT), line.shape[2]))
-    drive_each(lines, car, wanted, np.full(count + 1, start), ends, scratch, rows, out)
-    lines[0] = line[0]
-    drive_each(lines[:-1].copy(), car[:-1], wanted[:-1], ends[:-1].copy(), ends[1:].copy(), scratch, rows, out[:-1])
-    times = np.column_stack([ends[:-1], ends[1:]])
-    return times, np.stack([lines[:-1], lines[1:]], axis=1), wanted[:-1, 1:], out[:-1]
+    every = np.zeros(count, np.int64)
+    lines, wanted = line[every], after.wanted[every]
+    advance_worlds(lines, before.car[every], np.full(count, start), ends[1:], wanted, scratch_for(line.shape[2]))
+    lines = np.concatenate([line, lines])
+    return np.column_stack([ends[:-1], ends[1:]]), np.stack([lines[:-1], lines[1:]], axis=1), wanted
 
 
-def _impacts(times: Floats, rows: Floats) -> Impacts:
-    piece, pair = np.nonzero(rows[:, OF_IMPACT.index(NEW_COUNT)])
-    of = {row: rows[piece, k, pair] for k, row in enumerate(OF_IMPACT)}
-    time_s = times[piece, 0] + of[NEXT_TIME]
-    order = np.argsort(time_s, kind="stable")
-    return Impacts(
-        time_s[order], pair[order], of[NEXT_CLOSING][order], of[NEW_COUNT][order].astype(np.int64),
-        of[NEW_FIRST][order], of[NEW_TOTAL][order],
-    )  # fmt: skip
+def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
+    """Return the impacts; pieces of the motion with impacts are driven again, for the times of the first."""
+    rows = [FIRST, TOTAL, COUNT]
+    made = lines[:, 1, rows] - lines[:, 0, rows]
+    piece, pair = np.nonzero(made[:, 2])
+    firsts = np.empty((len(piece), 2))
+    for row, (k, p) in enumerate(zip(piece, pair, strict=True)):
+        scratch = scratch_for(car.shape[2])
+        advance_worlds(lines[k : k + 1, 0].copy(), car, times[k, :1], times[k, 1:], wanted[k : k + 1], scratch)
+        firsts[row] = times[k, 0] + scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p]
+    order = np.argsort(firsts[:, 0], kind="stable")
+    first, total, number = made[piece, :, pair][order].T
+    return Impacts(firsts[order, 0], pair[order], firsts[order, 1], number.astype(np.int64), first, total)

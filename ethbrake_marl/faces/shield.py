@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from inspect import signature
 from typing import Any
 
@@ -13,7 +14,7 @@ from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.faces.rendering import make_renderer
 from ethbrake_marl.faces.stream import Stream
-from ethbrake_marl.names import team_of, teams_of
+from ethbrake_marl.names import Driver, team_of, teams_of
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
@@ -62,21 +63,38 @@ def shield(
     """
     if mode not in MODES:
         raise unknown_name("shield mode", mode, MODES)
-    make = MODES[mode]
-    known = [name for name in signature(make).parameters if name != "drivers"]
+    known = [name for name in signature(MODES[mode]).parameters if name != "drivers"]
     for name in options:
         if name not in known:
             raise unknown_name(f"option of a shield in mode {mode}", name, known)
-    if isinstance(env, Team) or hasattr(env, "act"):
-        if policy is not None:
-            raise InvalidInput(f"shield: {env.name!r} proposes by itself; leave out policy")
-        if not isinstance(env, Team):
-            if scenario is None:
-                raise InvalidInput(f"shield: agent {env.name!r}: pass scenario=..., in which it drives")
-            env = team_of(env, load_scenario(scenario))
-        if env.shield is not None:
-            raise InvalidInput(f"shield: team {env.name!r} already has a shield")
-        return env._replace(name=f"{env.name}+{mode}", shield=make(env.drivers, **options))
+    make = partial(MODES[mode], **options)
+    if not isinstance(env, Team) and not hasattr(env, "act"):
+        if scenario is not None:
+            raise InvalidInput("shield: scenario: an environment has its own; leave it out")
+        return shielded_environment(env, policy, make, options.get("harm_count", "first"))
+    if policy is not None:
+        raise InvalidInput(f"shield: {env.name!r} proposes by itself; leave out policy")
+    team = shielded_team(env, scenario, make)
+    return team._replace(name=f"{team.name}+{mode}")
+
+
+def shielded_team(driver: Driver, scenario: AnyScenario | None, make: MakeShield) -> Team:
+    """Return a team with a shield, or an agent for all learners of a scenario."""
+    if isinstance(driver, Team):
+        team = driver
+        if scenario is not None:
+            raise InvalidInput(f"shield: team {team.name!r}: needs no scenario; leave it out")
+    elif scenario is None:
+        raise InvalidInput(f"shield: agent {driver.name!r}: pass scenario=..., in which it drives")
+    else:
+        team = team_of(driver, load_scenario(scenario))
+    if team.shield is not None:
+        raise InvalidInput(f"shield: team {team.name!r} already has a shield")
+    return team._replace(shield=make(team.drivers))
+
+
+def shielded_environment(env: Any, policy: Any, make: MakeShield, harm_count: str) -> Any:
+    """Return a copy of an environment with a shield. A policy that is a name minimises ``harm_count``."""
     base: Any = getattr(env, "unwrapped", None)
     game, stream = getattr(base, "game", None), getattr(base, "stream", None)
     if isinstance(env, type) or not isinstance(game, Game) or not isinstance(stream, Stream):
@@ -92,10 +110,12 @@ def shield(
     if not len(game.rules.learners):
         raise InvalidInput(f"shield: scenario {game.name!r} has no learner to shield; pass learners=['vehicle_2']")
     if policy is None:
-        return guarded(env, base, game._replace(shield=make(None, **options)))
+        return guarded(env, base, game._replace(shield=make(None)))
     policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
-    team = teams_of({"policy": policy}, base.scenario, harm_count=options.get("harm_count", "first"))["policy"]
-    return guarded(env, base, team._replace(shield=make(team.drivers, **options)).game(game))
+    team = teams_of({"policy": policy}, base.scenario, harm_count=harm_count)["policy"]
+    if team.shield is not None:
+        raise InvalidInput(f"shield: policy {policy!r:.60} has a shield of its own; pass it without one")
+    return guarded(env, base, team._replace(shield=make(team.drivers)).game(game))
 
 
 def guarded(env: Any, base: Any, game: Game) -> Any:

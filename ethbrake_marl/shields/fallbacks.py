@@ -21,6 +21,7 @@ from ethbrake_marl.motion.layout import BRAKING, Floats
 SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
 ROUNDS = 2  # in which they try them
 CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # of the plan's next actions, tried as constants
+ALONE = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried while the others follow the plan
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
@@ -54,11 +55,17 @@ def best_constant(game: Game, state: State, plans: Floats, count: str) -> tuple[
     """Return the best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
 
     Tried are the plan's next actions, all of them a little harder or softer: deviations from a good plan are mended by
-    small changes far more often than by a fixed set of constants that spans all brakes.
+    small changes far more often than by a fixed set of constants that spans all brakes. With several learners, also
+    these actions with another one of a single learner, from all of its brakes.
     """
     learners, rows = game.rules.learners, np.arange(state.n)
     planned = plans[rows, np.minimum(state.steps, plans.shape[1] - 1)]
     actions = np.minimum(np.maximum(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0), 0.0)
+    if len(learners) > 1:
+        alone = np.repeat(planned[:, np.newaxis], len(learners) * len(ALONE), axis=1)
+        for column in range(len(learners)):
+            alone[:, column * len(ALONE) : (column + 1) * len(ALONE), column] = ALONE
+        actions = np.concatenate([actions, alone], axis=1)
     commands = actions * state.car[:, np.newaxis, BRAKING, learners]
     harm = hold(state, state.wanted, learners.tolist(), commands, game.rules.horizon_s, count)[0]
     best = harm.argmin(axis=1)

@@ -26,7 +26,7 @@ once.
 **Allowance.** With an allowance A > 0, a plan may cost up to max(c, B + A), which is then the bound until the end.
 
 It assumes that the physics of the state is true, and that all others follow the game's scripts; a script may look at
-the state. Every learner is shielded: a game has one shield.
+the state, but must decide alike whenever it is asked alike. Every learner is shielded: a game has one shield.
 """
 
 from __future__ import annotations
@@ -111,8 +111,11 @@ class StepShield:
         if drivers:
             self.rests.append((POLICY_ROLLOUT, agents_drive))
 
-    def seen(self, state: State) -> State:
-        """Return the states that the worlds may be in now, M rows for each world, the nominal one first."""
+    def seen(self, state: State, memory: Memory | None) -> State:
+        """Return the states that the worlds may be in now, M rows for each world, the nominal one first.
+
+        ``memory`` None: at the first decision.
+        """
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
@@ -131,7 +134,7 @@ class StepShield:
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
         """Return the memory at the first decision ``state``: the best constant actions, or the agents' own play."""
-        states, rows = self.seen(state), np.arange(state.n)
+        states, rows = self.seen(state, None), np.arange(state.n)
         plans = first_plans(game, alert, state, self.count)
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         plan, harm = np.stack(plans)[prices.argmin(axis=0), rows], prices.min(axis=0)
@@ -214,7 +217,7 @@ class StepShield:
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
-        before = self.part(self.seen(state), rows)
+        before = self.part(self.seen(state, memory), rows)
         least = self.price(game, before, plans, most, take(memory.caps, rows))
         reason = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE)
         for code, rest in rests:
@@ -223,7 +226,7 @@ class StepShield:
                 break
             here = self.part(before, left)
             after, _ = game.follow(here, actions[left].repeat(self.M, axis=0))
-            after = after if self.M == 1 else after.take(slice(None, None, self.M))
+            after = after if self.M == 1 else after.take(np.arange(0, after.n, self.M))
             later, value = rest(self, game, after, plans[left], most[left])
             hopeful = (value <= most[left] + NEARLY).nonzero()[0]
             if len(hopeful):

@@ -178,7 +178,7 @@ def read(path: Path) -> dict[str, Any]:
                 stored = all(part.compress_type == zipfile.ZIP_STORED for part in archive.infolist())
                 whole = stored and archive.testzip() is None
             stream.seek(0)
-            saved = torch.load(stream, map_location="cpu", weights_only=True) if whole else None
+            saved = torch.load(stream, weights_only=True) if whole else None
         except Exception as error:  # zipfile and torch raise many kinds for a file that is not theirs
             raise CorruptBundle(f"{path}: is damaged ({' '.join(str(error).split()):.200})") from None
     if not isinstance(saved, dict) or any(type(saved.get(key)) is not kind for key, kind in KINDS.items()):

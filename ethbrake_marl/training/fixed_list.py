@@ -7,12 +7,11 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team, play
+from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent
-from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.training import Training
@@ -40,29 +39,18 @@ def measure_on_list(training: Training) -> Evaluate:
     def measure(policies: Policies) -> dict[str, float]:
         drivers = {1 + scenario.vehicle_names.index(name): LearnedAgent(each) for name, each in policies.items()}
         team = Team("policy", drivers)
-        ends, at_rest = zip(*(drive_to_the_end(game, part, team) for part in parts), strict=True)
-        return metrics_of(training, State.join(ends), np.concatenate(at_rest))
+        return metrics_of(training, State.join([drive(game, part, team) for part in parts]))
 
     return measure
 
 
-def drive_to_the_end(game: Game, alert: State, team: Team) -> tuple[State, Bools]:
-    """Return the last state of these worlds, and whether each line came to rest before the horizon, [n]."""
-    at_rest = np.zeros(alert.n, np.bool_)
-    for step, state in play(game, alert, team, donate=True):
-        if step is not None:
-            at_rest |= step.terminated
-        last = state
-    return last, at_rest
-
-
-def metrics_of(training: Training, last: State, at_rest: Bools) -> dict[str, float]:
+def metrics_of(training: Training, last: State) -> dict[str, float]:
     """Return the metrics of episodes whose last state is ``last``."""
     metrics = {
         "first_impact_harm": mean(last.harm("first")),
         "total_harm": mean(last.harm("total")),
         "collision_rate": float(last.collided.mean()),
-        "horizon_rate": float((~at_rest).mean()),
+        "horizon_rate": float((~last.at_rest).mean()),
     }
     reward, scenario = training.recipe.reward, training.scenario
     objectives = objectives_of(reward.objective or scenario.objective, scenario.vehicles)

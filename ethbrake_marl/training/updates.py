@@ -168,8 +168,8 @@ class BetweenUpdates(BaseCallback):
             return
         recipe = self.training.recipe
         metrics = dict(self.evaluations[-1]) if self.evaluations else {}
-        if metrics and recipe.reward.harm_count == "total":  # the harm that the reward counts comes first
-            metrics = {"total_harm": metrics.get("total_harm", 0.0), **metrics}
+        if "total_harm" in metrics and recipe.reward.harm_count == "total":  # what is counted comes first
+            metrics = {"total_harm": metrics["total_harm"], **metrics}
         rollout = self.model.n_envs * recipe.rounds
         planned = -(-recipe.total_steps // rollout) * rollout
         note, self.notes = "; ".join(self.notes), []
@@ -206,7 +206,7 @@ class BetweenUpdates(BaseCallback):
         try:
             checkpoint.restore(self.model, saved["model"])
             self.count = int(course["updates"])
-            self.evaluations = [{name: float(each[name]) for name in each} for each in course["evaluations"]]
+            self.evaluations = [{name: value + 0 for name, value in each.items()} for each in course["evaluations"]]
             self.ended = {column: [float(each) for each in course["ended"][column]] for column in EPISODE_COLUMNS}
             self.best_value = float(course["best_value"])
             self.wall_start, self.cpu_start = (

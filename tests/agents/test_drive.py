@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -40,8 +41,8 @@ def test_agents__are_asked_at_every_decision_from_the_first_and_never_before():
     asked, times = states[-1].memories[2]
     assert (times[:, 0] == worlds.latency_s[:, 1]).all() and (times[:, 0] == states[0].time_s).all()
     assert (asked == len(states) - 1).all()
-    for k, state in enumerate(states[1:], 1):
-        assert (state.commands_mps2[:, 1] == -0.1 * k).all()
+    for k, (before, state) in enumerate(pairwise(states), 1):
+        assert (state.commands_mps2[~before.ended, 1] == -0.1 * k).all()
 
 
 def test_an_episode__is_the_one_that_an_environment_plays_with_the_same_actions():
@@ -180,3 +181,13 @@ def test_a_role__that_names_an_agent_is_played_by_it_in_every_face(monkeypatch: 
     env.reset(seed=1)
     first = env.step({"vehicle_2": [-1.0]})[4]["vehicle_3"]["chosen_command_mps2"]
     assert first == -0.2  # asked at the alert, and at the first decision
+
+
+def test_an_episode__that_has_ended_changes_no_more_while_others_go_on():
+    worlds = PAPER.replace(gaps_m=[9.0, 9.0]).sample(20, 7)
+    ended: dict[int, Any] = {}
+    for _, state in play(GAME, worlds, Team("counting", {2: Counting()})):
+        for k, last in ended.items():
+            assert all((a[k] == b).all() for a, b in zip(state[:5], last, strict=True))
+        ended |= {k: [array[k].copy() for array in state[:5]] for k in np.flatnonzero(state.ended) if k not in ended}
+    assert len(ended) == 20

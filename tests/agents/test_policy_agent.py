@@ -27,6 +27,7 @@ from ethbrake_marl.agents.drive import Agent, Team, drive
 from ethbrake_marl.agents.foreign import ask_torch
 from ethbrake_marl.agents.policy_agent import LearnedAgent, policy_agent
 from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
@@ -283,6 +284,7 @@ def test_list_of_features__may_be_any_sequence() -> None:
         assert policy_agent(brake, observation=listed).observation == View(OTHERS)
 
 
+@pytest.mark.skipif("contact" not in GROUPS, reason="the extension with these features is not installed")
 def test_forecasts__need_the_scenario_for_its_time_step() -> None:
     listed = ["own", "contact.brake_front_time"]
     with refused("agent 'brake': observes forecasts, which need the time between two decisions; pass scenario="):

@@ -22,7 +22,7 @@ from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.game import game_of
 
 LINES = (("paper-random", "first"), ("paper-random-obstacle", "total"), ("cooperation-3-pair", "first"))
-WAYS = ("random", "drive", "ppo")
+WAYS = ("random", "drive", "brake", "ppo")
 
 
 class Told(NamedTuple):
@@ -36,7 +36,7 @@ class Told(NamedTuple):
 
 
 def proposed(way: str, rng: np.random.Generator, shape: tuple[int, int]) -> Any:
-    return {"random": rng.uniform(-1.0, 1.0, shape), "drive": np.ones(shape)}.get(way)
+    return {"random": rng.uniform(-1.0, 1.0, shape), "drive": np.ones(shape), "brake": -np.ones(shape)}.get(way)
 
 
 def first(name: str, count: str, way: str, n: int, begin: int = 0) -> Told:

@@ -167,6 +167,20 @@ def test_every_new_episode_of_a_vec_env_reports_its_own_bound() -> None:
     assert numbers != list(range(8))
 
 
+@pytest.mark.parametrize("policy", [None, "ppo"])
+def test_the_bound_holds_where_the_next_step_begins_the_next_episode(policy: Any) -> None:
+    """Gymnasium's default: the step after an episode's last one reports the bound of the next one."""
+    env = shield(EthBrakeVectorEnv(8, "paper-random"), policy)
+    first, over, episodes = env.reset(seed=1)[1]["shield_bound_harm"].copy(), np.zeros(8, bool), 0
+    for _ in range(120):
+        *_, ended, cut, infos = env.step(np.full((8, 1), 1.0 if policy is None else np.nan))
+        assert (infos["shield_reason"][over] == ShieldReason.NO_DECISION).all()
+        first[over], over = infos["shield_bound_harm"][over], ended | cut
+        assert (infos["world_first_impact_harm"][over] <= first[over]).all()
+        episodes += over.sum()
+    assert episodes > 8
+
+
 def test_mode_episode() -> None:
     env = shield(EthBrakeEnv("paper-random"), "full_brake", "episode", bound="pairwise")
     env.reset(seed=7)
@@ -223,6 +237,9 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: shield(shield(Team("t", {2: COAST}))), InvalidInput, "team 't\\+step' already has a shield"),
     (lambda: shield(Team("t", {2: COAST}), "coast"), InvalidInput, "'t' proposes by itself; leave out policy"),
     (lambda: shield(COAST), InvalidInput, "agent 'coast': pass scenario="),
+    (lambda: shield(Team("t", {2: COAST}), scenario="paper-random"), InvalidInput, "team 't': needs no scenario"),
+    (lambda: shield(EthBrakeEnv(), scenario="paper-random"), InvalidInput, "an environment has its own; leave it out"),
+    (lambda: shield(EthBrakeEnv(), "coast+step"), InvalidInput, "policy 'coast\\+step' has a shield of its own"),
     (lambda: shield(EthBrakeEnv(), mode="stp"), UnknownName, "unknown shield mode 'stp'; did you mean 'step'"),
     (lambda: shield(EthBrakeEnv(), alowance=1), UnknownName, "option .* 'alowance'; did you mean 'allowance'"),
     (lambda: shield(EthBrakeEnv(), bound="coupled"), UnknownName, "option of a shield in mode step 'bound'"),

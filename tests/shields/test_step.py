@@ -330,7 +330,7 @@ class Robust(StepShield):
 
     M, FACTORS = 3, (1.0, 0.6, 1.5)
 
-    def seen(self, state: State) -> State:
+    def seen(self, state: State, memory: Any) -> State:
         many = state.take(np.arange(state.n).repeat(self.M))
         car = many.car.copy()
         car[:, MASS, 2] *= np.tile(self.FACTORS, state.n)

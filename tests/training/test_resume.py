@@ -103,6 +103,33 @@ def test_resume__after_the_disk_was_full(whole: Whole, tmp_path: Path, monkeypat
     assert kept(run) == whole["ppo"]
 
 
+@pytest.mark.parametrize("nth", [1, 2, 3, 4])
+def test_resume__after_a_kill_while_policies_are_saved(
+    nth: int, whole: Whole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, rename, count = tmp_path / "run", Path.rename, 0
+
+    def fail(progress: Progress) -> None:
+        if progress.updates == 5:
+            raise LookupError
+
+    def fatal(path: Path, target: Path) -> Path:
+        nonlocal count
+        count += 1
+        if count == nth:
+            die()
+        return rename(path, target)
+
+    with pytest.raises(LookupError):
+        begin("ppo", run, on_progress=fail)  # leaves policies, which are replaced later
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "rename", fatal)
+        killed(go_on, run)
+    go_on(run)
+    assert kept(run) == whole["ppo"]
+    assert not list(run.glob("**/.ethbrake-*"))
+
+
 @pytest.mark.parametrize("name", ["sac", "turns"])
 def test_resume__after_ctrl_c_everything_is_the_same(name: str, whole: Whole, tmp_path: Path) -> None:
     run, seen = tmp_path / "run", list[int]()

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.drive import Team, drive
-from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.policies.bundle import load_drivers, load_policy
+from ethbrake_marl.names import make_agent, team_of
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training import train as train_module
 from ethbrake_marl.training.recipe import TrainingRecipe, algorithm_of
 from ethbrake_marl.training.train import make_environment, train
@@ -41,10 +41,9 @@ def test_train__leaves_policies_that_drive_as_they_were_measured(scheme: Any, tm
         "vehicles": 3,
         "drivers": {name: f"policy/{name}" if separate else "policy" for name in NAMES},
     }
-    drivers = load_drivers(run / "policy")
+    assert result.agent == f"team@{run}"
     scenario, game = game_of(PAIR)
-    agents = {body: LearnedAgent(drivers[f"vehicle_{body}"]) for body in (2, 3)}
-    last = drive(game, scenario.sample(10, 7), Team("team", agents))
+    last = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))
     least = min(each["first_impact_harm"] for each in result.evaluations)
     assert last.harm("first").mean() == pytest.approx(least, rel=1e-12)
     manifests = [load_policy(run / folder).manifest for folder in team["drivers"].values()]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import random
 import signal
-import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,10 +21,10 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ethbrake_marl.agents.drive import Team, drive
-from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.names import make_agent, team_of
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import train as train_module
@@ -56,7 +58,8 @@ def test_train__leaves_a_folder_whose_policy_is_the_best_on_the_list(tmp_path: P
     assert policy.manifest.learners == ("vehicle_2",) and policy.manifest.seeds == {"training": 0, "evaluation": 7}
 
     scenario, game = game_of("paper-random")
-    ended = drive(game, scenario.sample(10, 7), Team("mine", {2: LearnedAgent(policy)}))
+    assert result.agent == f"ppo@{run}"
+    ended = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent), scenario))
     assert ended.harm("first").mean() == pytest.approx(min(harm), rel=1e-12)
 
     status, config = (json.loads((run / name).read_text()) for name in ("run.json", "config.json"))
@@ -113,26 +116,40 @@ def test_train__objectives_decide_where_they_are_not_the_harm_of_the_line(tmp_pa
         assert each["objective"] == pytest.approx(sum(own) / 2) and 0.0 < sum(own) < each["first_impact_harm"]
 
 
-@pytest.mark.parametrize("broken", ["closed", "missing", "no isatty", "full"])
-def test_train__needs_no_stream_for_its_progress(broken: str, tmp_path: Path) -> None:
-    lines = {
-        "closed": "sys.stderr.close()",
-        "missing": "sys.stderr = None",
-        "no isatty": "import types; sys.stderr = types.SimpleNamespace(write=len, flush=lambda: None)",
-        "full": "sys.stderr = open('/dev/full', 'w')",
-    }
-    code = (
-        f"import sys; from tests.training.tiny import TINY, UPDATE; from ethbrake_marl.training.train import train\n"
-        f"{lines[broken]}\n"
-        f"result = train(TINY, 'paper-random', {str(tmp_path / 'run')!r}, steps=2 * UPDATE)\n"
-        f"print(result.status)"
-    )
-    ended = subprocess.run(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=False,
-        stderr=None if broken != "missing" else subprocess.DEVNULL,
-    )  # fmt: skip
-    assert ended.stdout == "finished\n"
-    assert broken == "full" or ended.returncode == 0
+def closed() -> Any:
+    """Return a stream that is closed."""
+    stream = io.StringIO()
+    stream.close()
+    return stream
+
+
+def full(text: str) -> int:
+    """Write to a full disk."""
+    raise OSError(28, "No space left on device")
+
+
+STREAMS: dict[str, Callable[[], Any]] = {
+    "none": lambda: None,
+    "closed": closed,
+    "without isatty": lambda: SimpleNamespace(write=len, flush=lambda: None),
+    "without flush": lambda: SimpleNamespace(write=len, isatty=lambda: False),
+    "full": lambda: SimpleNamespace(write=full, flush=lambda: None, isatty=lambda: True),
+}
+
+
+@pytest.mark.parametrize("broken", STREAMS)
+def test_train__needs_no_stream_for_its_progress(broken: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stderr", STREAMS[broken]())
+        result = begin("ppo", tmp_path / "run", steps=UPDATE, on_progress="show")
+    assert result.status == "finished"
+
+
+def test_train__shows_its_progress(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result = begin("ppo", tmp_path / "run", steps=2 * UPDATE, on_progress="show")
+    harm = [f"first-impact harm {each['first_impact_harm']:.2f}" for each in result.evaluations]
+    lines = [f"training: 0 of 256, {harm[0]}", f"training: 128 of 256, {harm[0]}", f"training: 256 of 256, {harm[1]}"]
+    assert capsys.readouterr().err.splitlines() == lines
 
 
 def test_train__in_two_threads_is_refused_and_the_first_one_is_as_alone(tmp_path: Path) -> None:

@@ -1,0 +1,98 @@
+"""Save the actors of a training loop of one's own, so that ``policy@FOLDER`` or ``team@FOLDER`` drives with them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor, nn
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
+from ethbrake_marl.policies.bundle import save_drivers
+from ethbrake_marl.policies.layers import Float32s
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.algorithm import ACTIVATIONS
+
+CONTRACT = (
+    "must have the attributes mean, an nn.Sequential of linear layers with ReLU (or with Tanh) between them, from the"
+    " observation to one action, and log_std, [1]"
+)
+
+
+def save_team(
+    folder: str | os.PathLike[str], actors: Mapping[str, Any], env: EthBrakeParallelEnv, *, seed: int, steps: int
+) -> None:
+    """Save actors, learner -> actor, as the policies of a run. Learners with the same actor object share one policy.
+
+    An actor draws its action from a normal distribution, which the environment clips to [-1, 1]: ``mean`` is an
+    ``nn.Sequential``, ``log_std`` [1] the logarithm of the standard deviation.
+
+    Args:
+        folder: new folder, or one without policies.
+        actors: the actor of each learner of ``env``, by the vehicle's name.
+        env: in which they have learned. Its scenario, observations and reward are recorded.
+        seed: of the training.
+        steps: number of decisions of the training.
+
+    Raises ``InvalidInput`` for other learners or other actors, and ``AlreadyExists``.
+
+    """
+    scenario, game = env.unwrapped.scenario, env.unwrapped.game
+    views = {scenario.vehicle_names[body - 1]: game.views[body] for body in game.rules.learners.tolist()}
+    if actors.keys() != views.keys():
+        raise InvalidInput(
+            f"save_team: has actors of {', '.join(actors) or 'nobody'}; must have one of each learner of the"
+            f" environment, {', '.join(views)}"
+        )
+    policies: dict[str, Policy] = {}
+    for name in views:
+        network = network_of(name, actors[name])
+        sharing = tuple(other for other in views if actors[other] is actors[name])
+        policies[name] = policies.get(sharing[0]) or Policy.make(
+            tensors_of(actors[name]),
+            network=network,
+            observation=views[name],
+            algorithm="ppo",
+            learners=sharing,
+            scenario=scenario.content(),
+            reward=game.rewarding.params.model_dump(mode="json"),
+            seeds={"training": seed},
+            steps=steps,
+        )
+    save_drivers(policies, Path(folder) / "policy")
+
+
+def network_of(name: str, actor: Any) -> NetworkSpec:
+    """Return the network of an actor. Raises ``InvalidInput`` if it is something else than the contract says."""
+    mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
+    layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
+    linear, between = layers[::2], layers[1::2]
+    kinds = {next((key for key, kind in ACTIVATIONS.items() if isinstance(layer, kind)), None) for layer in between}
+    activation = kinds.pop() if len(kinds) == 1 else None
+    fits = len(linear) == len(between) + 1 and all(isinstance(layer, nn.Linear) for layer in linear)
+    one = fits and linear[-1].out_features == 1 and isinstance(log_std, Tensor) and log_std.shape == (1,)
+    if activation is None or not one:
+        raise InvalidInput(f"save_team: the actor of {name}, a {type(actor).__name__}, {CONTRACT}")
+    return NetworkSpec(
+        observation_size=linear[0].in_features,
+        action_size=1,
+        policy_hidden=tuple(layer.out_features for layer in linear[:-1]),
+        value_hidden=(),
+        activation=activation,
+        output="clip",
+    )
+
+
+def tensors_of(actor: Any) -> dict[str, Float32s]:
+    """Return the weights of an actor, by their names in a policy file."""
+    linear = [layer for layer in actor.mean if isinstance(layer, nn.Linear)]
+    places = [*range(len(linear) - 1), "output"]
+    named = {f"policy.{place}": layer for place, layer in zip(places, linear, strict=True)}
+    tensors = {f"{place}.{kind}": getattr(layer, kind) for place, layer in named.items() for kind in ("weight", "bias")}
+    tensors["policy.log_std"] = actor.log_std
+    return {place: tensor.detach().cpu().numpy().astype(np.float32) for place, tensor in tensors.items()}
