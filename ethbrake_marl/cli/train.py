@@ -138,12 +138,12 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
 
     ``scenario`` (name or path) stands in the command that evaluates the agent; None: the name in the run's folder.
     """
-    from ethbrake_marl.agents.drive import Team
+    from ethbrake_marl.agents.drive import Team, drive
     from ethbrake_marl.agents.scripts import Held
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.files.plain import read_object
     from ethbrake_marl.names import open_game
-    from ethbrake_marl.training.fixed_list import OBJECTIVE, drive_to_the_end, metrics_of
+    from ethbrake_marl.training.fixed_list import OBJECTIVE, metrics_of
 
     training, plan = result.training, result.training.recipe
     loaded, game = open_game(training.scenario)
@@ -155,7 +155,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
         Column("Total harm", "total_harm"),
         Column("Collisions", "collision_rate", digits=1, scale=100.0, unit=" %"),
     ]
-    measured = {"full_brake": metrics_of(training, *drive_to_the_end(game, worlds, brake))}
+    measured = {"full_brake": metrics_of(training, drive(game, worlds, brake))}
     measured[result.agent] = dict(result.metrics or {})
     if OBJECTIVE in measured["full_brake"]:
         columns.append(Column("Objective", OBJECTIVE))
