@@ -58,9 +58,9 @@ def evaluate_command(
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
-    `ethbrake agent list` shows all agents; the name ladder is short for all agents from coast to best_harm in this
-    list. A name can be followed by +search and by one shield, +episode or +step; for instance full_brake+step or
-    ppo@PATH+step, where PATH is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
+    `ethbrake agent list` shows all agents; the name ladder is short for those that need no training, from bad to good.
+    A name can be followed by a shield, +episode or +step; for instance full_brake+step or policy@PATH+step, where PATH
+    is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
     total harm instead of first-impact harm. --set measures=injury,sampled_harm adds measures to the results.
     """
     with Out(as_json=as_json, force=force) as out:

@@ -94,7 +94,7 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
     learners = ", ".join(trial.known) or "none"
     yield f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; tried in {n} worlds"
     for name, column in _kinds(trial).items():
-        counts = ", ".join(f"{kind} {count}" for kind, count in sorted(Counter(column.tolist()).items()))
+        counts = ", ".join(f"{kind or 'no type'} {count}" for kind, count in sorted(Counter(column.tolist()).items()))
         yield from _folded(f"{name}: {counts}", 2)
     drawn = {name: each for name, each in ranges.items() if each["least"] != each["largest"]}
     width = max(map(len, drawn), default=0)
