@@ -39,7 +39,15 @@ Driver = Agent | Team
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """What a function that makes an agent may want to know, beside the argument in the agent's name."""
+    """What a function that makes an agent may want to know, beside the argument in the agent's name.
+
+    >>> import ethbrake_marl as eb
+    >>> def make_mine(argument, settings):
+    ...     return eb.make_agent("e_v2x_bm", scenario=settings.needed_scenario(), harm_count=settings.harm_count)
+    >>> make_mine(None, eb.AgentSettings("mine", scenario=eb.load_scenario("paper-random"))).name
+    'e_v2x_bm'
+
+    """
 
     spec: str  # as the user has written it
     policy: str | None = None  # path after the @

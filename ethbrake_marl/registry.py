@@ -44,7 +44,7 @@ class Part:
     ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
-    >>> def closing(episodes):
+    >>> def closing(game, alert, last):
     ...     '''Largest closing speed of an impact in the line.'''
     >>> part = eb.Part(closing, unit="m/s")
     """

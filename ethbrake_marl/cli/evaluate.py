@@ -117,7 +117,8 @@ def _show(out: Out, results: dict[str, Result], output: Path | None, per_world: 
                 out.note(f"results: {path}")
     if len(tables) > 1:
         sheet = summarise_lists(tables, results)
-        out.result(sheet.json(), sheet)
+        scenarios = (name for name, table in tables.items() for _ in table)
+        out.result([{"scenario": name, **row} for name, row in zip(scenarios, sheet.json(), strict=True)], sheet)
         return
     (table,) = tables.values()
     out.result(table.to_json(), *table.tables())

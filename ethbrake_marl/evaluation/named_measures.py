@@ -47,11 +47,10 @@ def register_measure(
         watch: in place of ``of``: ``watch(game, alert)`` returns a ``Watch``, which sees every step.
 
     >>> import ethbrake_marl as eb
-    >>> from ethbrake_marl.evaluation.named_measures import register_measure
-    >>> def hardest(game, alert, last):
+    >>> def rear_speed(game, alert, last):
     ...     '''Speed at which the rear vehicle ends, m/s.'''
     ...     return last.speeds_mps[:, -1]
-    >>> register_measure("rear_speed_mps", hardest, unit="m/s")
+    >>> eb.register_measure("rear_speed_mps", rear_speed, unit="m/s")
 
     """
     right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"

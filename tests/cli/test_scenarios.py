@@ -78,13 +78,10 @@ def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_pat
     "name", [name for name, file in shipped_recipes().items() if file.parent == shipped_folder("train")]
 )
 def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(name: str, tmp_path: Path) -> None:
-    check_new_recipe(name, tmp_path / "mine.yaml")
-
-
-def check_new_recipe(based_on: str, file: Path) -> None:
-    text = new_recipe_text("mine", load_recipe(based_on))
+    base, file = load_recipe(name), tmp_path / "mine.yaml"
+    text = new_recipe_text("mine", base)
     file.write_text(text)
-    made, base = load_recipe(file), load_recipe(based_on)
+    made = load_recipe(file)
     words = {"name", "title", "description", "source"}
     assert made.model_dump(exclude=words) == base.model_dump(exclude=words)
     lines = text.splitlines()
