@@ -199,13 +199,15 @@ def scenario_new(
 
 @scenario_group.command("parts", epilog=example("scenario parts"))
 def scenario_parts(as_json: JsonOption = False) -> None:
-    """List the names that scenarios and recipes can use.
+    """List the names that scenarios, recipes and --set can use.
 
-    Lists features of observations, V2X presets, objectives, terms of rewards, training algorithms and recipes.
+    Lists features of observations, V2X presets, objectives, terms of rewards, measures beside the usual ones, training
+    algorithms and recipes.
     """
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
+    from ethbrake_marl.evaluation.named_measures import MEASURES, USUAL
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
     from ethbrake_marl.worlds.channel import CHANNELS
 
@@ -216,6 +218,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
         "V2X presets": [*CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Terms": [*BUILT_IN, *TERMS],
+        "Measures": [name for name in MEASURES if name not in USUAL],
         "Algorithms": [*ALGORITHMS],
         "Recipes": [*usable_recipes()],
     }

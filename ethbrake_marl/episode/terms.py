@@ -55,7 +55,7 @@ class Term(NamedTuple):
         """Return the value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns something else."""
         what = f"term {self.name!r}"
         try:
-            value = np.asarray(self.function(before, step, after))
+            value = np.asarray(self.function(before.read_only(), step, after.read_only()))
         except Exception as error:
             raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
         right = (after.n,), (after.n, after.vehicles)

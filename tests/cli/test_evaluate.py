@@ -60,8 +60,13 @@ def test_a_team__goes_behind_the_step_shield_and_no_other(ethbrake: Command) -> 
     words = ("evaluate", "--scenario", "cooperation-3-pair", "--episodes", "10", "--json", "--agents")
     alone, shielded = told_json(ethbrake(*words, "pair.py:make,pair.py:make+step"))
     assert shielded["agent"] == "pair.py:make+step" and shielded["total_harm"] < alone["total_harm"]
-    check_refused(ethbrake(*words, "pair.py:make+episode"), "agent 'pair.py:make+episode': +episode works for one learner")
-    check_refused(ethbrake("evaluate", "--agents", "pair.py:make"), "team 'pair': drives vehicle_2, vehicle_3; must drive exactly vehicle_2")
+    check_refused(
+        ethbrake(*words, "pair.py:make+episode"), "agent 'pair.py:make+episode': +episode works for one learner"
+    )
+    check_refused(
+        ethbrake("evaluate", "--agents", "pair.py:make"),
+        "team 'pair': drives vehicle_2, vehicle_3; must drive exactly vehicle_2",
+    )
 
 
 @pytest.mark.long
