@@ -28,8 +28,8 @@ class Held(NamedTuple):
         if len(beyond):
             k, numbers = beyond[0], alert.clock[:, NUMBER].astype(int)
             raise InvalidInput(
-                f"agent {self.name!r}: vehicle_{body} can decelerate by at most {braking[k]:g} m/s2 and accelerate by at"
-                f" most {driving[k]:g} m/s2 in world {numbers[k] if numbers[k] >= 0 else k}"
+                f"agent {self.name!r}: vehicle_{body} can decelerate by at most {braking[k]:g} m/s2 and accelerate by"
+                f" at most {driving[k]:g} m/s2 in world {numbers[k] if numbers[k] >= 0 else k}"
             )
         return command
 

@@ -181,7 +181,8 @@ def scenario_new(
 ) -> None:
     """Write a new scenario file with comments.
 
-    The file NAME.yaml has every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the same folder.
+    The file NAME.yaml has every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the
+    same folder.
     """
     from ethbrake_marl.worlds.catalogue import load_scenario
     from ethbrake_marl.worlds.explain import new_scenario_text

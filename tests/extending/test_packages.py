@@ -204,7 +204,7 @@ def test_register__is_the_way_of_both_and_refuses_another_of_that_name(install: 
 
     eb.register_agent("gentle", hills.make_gentle)
     eb.register_measure("worst", hills.worst, unit="m/s")
-    with pytest.raises(AlreadyExists, match="agent 'gentle' is registered already.*entry point of the package hills"):
+    with pytest.raises(AlreadyExists, match=r"agent 'gentle' is registered already.*entry point of the package hills"):
         eb.register_agent("gentle", hills.softer)
     with pytest.raises(AlreadyExists, match="measure 'worst' is registered already"):
         eb.register_measure("worst", hills.worst, unit="km/h")
