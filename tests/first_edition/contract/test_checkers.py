@@ -19,7 +19,7 @@ from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.first_edition.envs.pettingzoo import env, parallel_env
 from ethbrake_marl.first_edition.envs.rendering import HEIGHT, WIDTH
 from ethbrake_marl.first_edition.envs.viewer import Viewer
-from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
+from tests.first_edition.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 pytestmark = pytest.mark.filterwarnings(
     "error",
