@@ -39,7 +39,15 @@ Driver = Agent | Team
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """What a function that makes an agent may want to know, beside the argument in the agent's name."""
+    """What a function that makes an agent may want to know, beside the argument in the agent's name.
+
+    >>> import ethbrake_marl as eb
+    >>> def make_mine(argument, settings):
+    ...     return eb.make_agent("e_v2x_bm", scenario=settings.needed_scenario(), harm_count=settings.harm_count)
+    >>> make_mine(None, eb.AgentSettings("mine", scenario=eb.load_scenario("paper-random"))).name
+    'e_v2x_bm'
+
+    """
 
     spec: str  # as the user has written it
     policy: str | None = None  # path after the @
@@ -110,8 +118,7 @@ def _add(table: Registry[Entry], name: str, make: Any, about: str, knows: str, f
         raise InvalidInput(
             f"{table.kind} {name!r:.80}: the name must have the characters a-z, 0-9, _ and -, beginning with a letter"
         )
-    sign = "+" if table is WRAPPERS else ""
-    table.add(name, Entry(make, about, knows, form or f"{sign}{name}[:ARGUMENT]"), lambda other: other.make == make)
+    table.add(name, Entry(make, about, knows, form or f"{name}[:ARGUMENT]"), lambda other: other.make == make)
 
 
 AGENTS: Registry[Entry] = Registry("agent", "second.agents", register_agent)
@@ -235,7 +242,8 @@ def _split(spec: object) -> tuple[str, list[str]]:
     while True:
         before, plus, last = core.rpartition("+")
         path = core.partition("@")[2] or (core.partition(":")[0] if ".py:" in core else "")
-        if not plus or os.path.lexists(os.path.expanduser(path)):
+        may_be_in_path = "@" in core or ".py:" in last
+        if not plus or (may_be_in_path and os.path.lexists(os.path.expanduser(path))):
             return core, wrappers
         word = last.partition(":")[0]
         if word not in WRAPPERS:
@@ -279,9 +287,9 @@ def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | Non
         raise table.unknown(name)
     entry = table[name]
     if argument and ":" not in entry.form:
-        raise InvalidInput(f"{table.kind} {name}:{argument}: {name} takes no argument")
+        raise InvalidInput(f"{table.kind} {f'{name}:{argument}'!r}: {name} takes no argument")
     if policy is not None and "@" not in entry.form:
-        raise InvalidInput(f"agent {name}@{policy}: {name} uses no policy; leave out @ and what follows")
+        raise InvalidInput(f"agent {f'{name}@{policy}'!r}: {name} uses no policy; leave out @ and what follows")
     return entry, argument or None
 
 
@@ -348,8 +356,9 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[Entry]:
-    """Return the entries of all agents and wrappers that can be loaded, without groups."""
-    return [entry for table in (AGENTS, WRAPPERS) for entry in table.usable().values() if callable(entry.make)]
+    """Return the entries of all agents and wrappers that can be loaded, without groups; a wrapper's form has its +."""
+    agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
+    return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 
 
 def why_not_listed() -> list[str]:

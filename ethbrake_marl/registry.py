@@ -44,7 +44,7 @@ class Part:
     ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
-    >>> def closing(episodes):
+    >>> def closing(game, alert, last):
     ...     '''Largest closing speed of an impact in the line.'''
     >>> part = eb.Part(closing, unit="m/s")
     """
@@ -174,9 +174,10 @@ class Registry(Mapping[str, T]):
         ``is_same`` is called with the object that is registered under ``name``, and returns whether it equals ``part``;
         an equal object is not added again.
         """
+        names_others = False  # whether an entry point of this name defines parts with other names
         if name not in self.loaded and name in self and name not in self._loading:
-            self.load(name)
-        if not is_same(self.loaded.setdefault(name, part)):
+            names_others = name not in self.load(name)
+        if names_others or not is_same(self.loaded.setdefault(name, part)):
             package = next((giver(point) for point in points(self.group).get(name, ()) if giver(point) != OURS), None)
             raise AlreadyExists(
                 f"{self.kind} {name!r} is registered already; give another name"

@@ -21,7 +21,7 @@ from ethbrake_marl.first_edition.physics.advance import advance
 from ethbrake_marl.first_edition.physics.forecast import forecast
 from ethbrake_marl.first_edition.physics.left_out import Impacts
 from ethbrake_marl.first_edition.physics.state import Floats, Worlds, make_worlds
-from tests.contract.interfaces import CRASH, REST
+from tests.first_edition.contract.interfaces import CRASH, REST
 from tests.first_edition.physics.random_worlds import driving_lines, line
 from tests.reference.tolerances import EPS
 

@@ -235,7 +235,13 @@ def test_agents__that_are_none_are_refused(agents: Any, message: str):
 def test_the_list__has_all_agents_and_no_group():
     register_agent("both", ["coast", "full_brake"])
     forms = {entry.form for entry in listed_agents()}
-    assert {"coast", "full_brake", "constant:A"} <= forms and "both[:ARGUMENT]" not in forms
+    assert {
+        "coast",
+        "full_brake",
+        "constant:A",
+        "+step",
+        "+episode[:pairwise]",
+    } <= forms and "both[:ARGUMENT]" not in forms
 
 
 def test_an_unknown_role__tells_its_place():

@@ -24,7 +24,19 @@ NOBODY = np.zeros(0, np.int64)
 
 
 class Agent(Protocol):
-    """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do."""
+    """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do.
+
+    >>> import ethbrake_marl as eb
+    >>> class Half:
+    ...     name, knows = "half", "own sensors"
+    ...     def begin(self, alert, body):
+    ...         return None
+    ...     def act(self, state, memory, body):
+    ...         return -0.5 * state.braking_capacity_mps2[:, body - 1], memory
+    >>> eb.evaluate("paper-random", {"half": Half()}, episodes=2)["half"]["total_harm"].round(1)
+    array([43.5, 54.7])
+
+    """
 
     @property
     def name(self) -> str:
@@ -44,7 +56,14 @@ class Agent(Protocol):
 
 
 class Team(NamedTuple):
-    """Who drives the learners of a game."""
+    """Who drives the learners of a game.
+
+    >>> import ethbrake_marl as eb
+    >>> team = eb.Team.of({"vehicle_2": eb.make_agent("coast"), "vehicle_3": eb.make_agent("full_brake")}, "both")
+    >>> eb.evaluate("cooperation-3-pair", {"both": team}, episodes=2)["both"]["total_harm"].round(1)
+    array([81.3, 64.9])
+
+    """
 
     name: str  # in tables and messages
     drivers: Mapping[int, Agent]  # body -> agent

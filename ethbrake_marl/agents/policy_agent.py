@@ -42,9 +42,8 @@ from ethbrake_marl.worlds.scenario import Scenario
 class LearnedAgent:
     """Drives with the deterministic actions of a policy of ours.
 
-    >>> from ethbrake_marl.agents.policy_agent import LearnedAgent
-    >>> from ethbrake_marl.policies.bundle import load_shipped
-    >>> LearnedAgent(load_shipped("ppo"), name="mine").name
+    >>> import ethbrake_marl as eb
+    >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
     'mine'
 
     """
@@ -198,8 +197,8 @@ def policy_agent(
 
     Raises ``InvalidInput`` for another kind of policy, and for what would not be as in training.
 
-    >>> from ethbrake_marl.agents.policy_agent import policy_agent
-    >>> agent = policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
+    >>> import ethbrake_marl as eb
+    >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
     >>> agent.observation.names[0]
     'own.speed'
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.drive import SENSORS
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 from ethbrake_marl.registry import Part
@@ -26,10 +26,10 @@ class Held(NamedTuple):
         command = first_command(self.name, braking)
         beyond = np.flatnonzero((command < -braking) | (command > driving))
         if len(beyond):
-            k = beyond[0]
+            k, numbers = beyond[0], alert.clock[:, NUMBER].astype(int)
             raise InvalidInput(
-                f"agent {self.name!r}: vehicle_{body} must decelerate at most {braking[k]:g} m/s2 and drive at most"
-                f" {driving[k]:g} m/s2 in row {k}"
+                f"agent {self.name!r}: vehicle_{body} can decelerate by at most {braking[k]:g} m/s2 and accelerate by"
+                f" at most {driving[k]:g} m/s2 in world {numbers[k] if numbers[k] >= 0 else k}"
             )
         return command
 

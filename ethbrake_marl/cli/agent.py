@@ -23,13 +23,13 @@ def agent_list(as_json: JsonOption = False) -> None:
     A name that begins with + is appended to the name of an agent, as in full_brake+step.
     """
     with Out(as_json=as_json) as out:
-        from ethbrake_marl.names import listed_agents, why_not_listed
+        from ethbrake_marl.names import group, listed_agents, why_not_listed
 
         entries = listed_agents()
         out.result(
             [{"agent": each.form, "about": each.about, "knows": each.knows} for each in entries],
             Sheet("", ("Agent", "Method", "Knows"), [(each.form, each.about, each.knows) for each in entries], gap=2),
-            "ladder stands for all agents from coast to best_harm. See docs/evaluate.md and docs/shield.md.",
+            f"ladder stands for {', '.join(group('ladder'))}. See docs/evaluate.md and docs/shield.md.",
         )
         for reason in why_not_listed():
             out.note(f"left out: {reason}")

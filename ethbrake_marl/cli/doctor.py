@@ -31,7 +31,7 @@ EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "notebook")
 
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=tried=16", "--set=evaluation.worlds=10")
 
-_LINEUP = "ladder,ppo,ppo+search+episode,full_brake+step"
+_LINEUP = "ladder,ppo,ppo+episode,full_brake+step"
 
 # Small calls of the usual commands, which compile the kernels that they use. The call with a single world compiles
 # kernels for another memory layout.
@@ -39,7 +39,6 @@ _DOORS = (
     ("run", "--steps", "128", "--episodes", "20", "--output", "run", *_TINY),
     ("evaluate", "--agents", _LINEUP, "--episodes", "20"),
     ("evaluate", "--agents", "full_brake,ppo+episode,full_brake+step", "--episodes", "1"),
-    ("shield", "--agents", "full_brake", "--episodes", "3"),
 )
 
 # A command that uses exactly the kernels of `ethbrake run`, except for three small kernels, but does not need torch.
@@ -54,8 +53,6 @@ for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PP
     env = eb.parallel_env(agents="learners", **given)
     env.reset(seed=0)
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
-robust = eb.make_agent("full_brake+robust", scenario="paper-random", uncertainty="gaps_m=0.5")
-eb.evaluate(agents={"robust": robust}, scenario="paper-random", episodes=20)
 """
 
 _PACKAGE = Path(__file__).resolve().parents[1]

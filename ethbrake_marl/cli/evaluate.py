@@ -58,9 +58,9 @@ def evaluate_command(
 ) -> None:
     """Compare agents on the same fixed list of worlds.
 
-    `ethbrake agent list` shows all agents; the name ladder is short for all agents from coast to best_harm in this
-    list. A name can be followed by +search and by one shield, +episode or +step; for instance full_brake+step or
-    ppo@PATH+step, where PATH is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
+    `ethbrake agent list` shows all agents; the name ladder is short for those that need no training, from bad to good.
+    A name can be followed by a shield, +episode or +step; for instance full_brake+step or policy@PATH+step, where PATH
+    is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
     total harm instead of first-impact harm. --set measures=injury,sampled_harm adds measures to the results.
     """
     with Out(as_json=as_json, force=force) as out:
@@ -117,7 +117,8 @@ def _show(out: Out, results: dict[str, Result], output: Path | None, per_world: 
                 out.note(f"results: {path}")
     if len(tables) > 1:
         sheet = summarise_lists(tables, results)
-        out.result(sheet.json(), sheet)
+        scenarios = (name for name, table in tables.items() for _ in table)
+        out.result([{"scenario": name, **row} for name, row in zip(scenarios, sheet.json(), strict=True)], sheet)
         return
     (table,) = tables.values()
     out.result(table.to_json(), *table.tables())

@@ -94,7 +94,7 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
     learners = ", ".join(trial.known) or "none"
     yield f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; tried in {n} worlds"
     for name, column in _kinds(trial).items():
-        counts = ", ".join(f"{kind} {count}" for kind, count in sorted(Counter(column.tolist()).items()))
+        counts = ", ".join(f"{kind or 'no type'} {count}" for kind, count in sorted(Counter(column.tolist()).items()))
         yield from _folded(f"{name}: {counts}", 2)
     drawn = {name: each for name, each in ranges.items() if each["least"] != each["largest"]}
     width = max(map(len, drawn), default=0)
@@ -181,7 +181,8 @@ def scenario_new(
 ) -> None:
     """Write a new scenario file with comments.
 
-    The file NAME.yaml has every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the same folder.
+    The file NAME.yaml has every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the
+    same folder.
     """
     from ethbrake_marl.worlds.catalogue import load_scenario
     from ethbrake_marl.worlds.explain import new_scenario_text
@@ -199,13 +200,15 @@ def scenario_new(
 
 @scenario_group.command("parts", epilog=example("scenario parts"))
 def scenario_parts(as_json: JsonOption = False) -> None:
-    """List the names that scenarios and recipes can use.
+    """List the names that scenarios, recipes and --set can use.
 
-    Lists features of observations, V2X presets, objectives, terms of rewards, training algorithms and recipes.
+    Lists features of observations, V2X presets, objectives, terms of rewards, measures beside the usual ones, training
+    algorithms and recipes.
     """
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
+    from ethbrake_marl.evaluation.named_measures import MEASURES, USUAL
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
     from ethbrake_marl.worlds.channel import CHANNELS
 
@@ -216,6 +219,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
         "V2X presets": [*CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Terms": [*BUILT_IN, *TERMS],
+        "Measures": [name for name in MEASURES if name not in USUAL],
         "Algorithms": [*ALGORITHMS],
         "Recipes": [*usable_recipes()],
     }

@@ -46,6 +46,15 @@ class Game(NamedTuple):
     """Worlds to draw, rules, scripts, what is observed and rewarded, and perhaps a shield.
 
     Environments, evaluation, search and shields share one game and its one step.
+
+    >>> import numpy as np
+    >>> import ethbrake_marl as eb
+    >>> scenario, game = eb.open_game("paper-random")
+    >>> state = game.begin(scenario.sample(2, seed=7))
+    >>> after, step = game.step(state, -np.ones((2, 1)))
+    >>> state.time_s, after.time_s, step.reward.shape
+    (array([0.5, 0.5]), array([0.6, 0.6]), (2, 3))
+
     """
 
     draw: Callable[[int, int, int], State]  # (n, seed, first) -> worlds of the training stream at the alert

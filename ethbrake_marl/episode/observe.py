@@ -26,7 +26,7 @@ from ethbrake_marl.episode.features import (
     side_of,
 )
 from ethbrake_marl.episode.state import TIME, State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import (
     BRAKING,
@@ -148,7 +148,13 @@ def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[n
     if offset and not known.any():
         value = np.full(state.n, own.unknown)
     else:
-        value = np.asarray(own.function(state, body, body + offset) if offset else own.function(state, body))
+        of = (body, body + offset) if offset else (body,)
+        try:
+            value = np.asarray(own.function(state.read_only(), *of))
+        except Exception as error:
+            raise InvalidInput(
+                f"feature {name!r}: its function fails for vehicle_{body}: {describe_error(error)}"
+            ) from error
         if value.shape != (state.n,) or value.dtype.kind not in "fiub":
             raise InvalidInput(
                 f"feature {name!r}: its function returned {value.dtype} values of shape {value.shape}; must return"

@@ -42,6 +42,12 @@ class State(NamedTuple):
     The arrays hold bodies 0 to N (``motion.layout``); the properties, which agents and terms read, hold vehicles:
     column i belongs to ``vehicle_{i + 1}``, in arrays of pairs to it and the vehicle behind. Properties are views: copy
     before you change them.
+
+    >>> import ethbrake_marl as eb
+    >>> worlds = eb.load_scenario("paper-random").sample(2, seed=7)
+    >>> worlds.n, worlds.vehicles, worlds.latency_s[0], worlds.take([1]).gaps_m.shape
+    (2, 3, array([0. , 0.5, 0.8]), (1, 2))
+
     """
 
     line: Floats  # [n, LINE_ROWS, N + 1] speeds, forces, gaps, harm

@@ -51,7 +51,16 @@ class Rules(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What a step did in n worlds. An episode that had ended before does nothing."""
+    """What a step did in n worlds. An episode that had ended before does nothing.
+
+    >>> import numpy as np
+    >>> import ethbrake_marl as eb
+    >>> scenario, game = eb.open_game("paper-random", reward={"harm": 1.0, "risk": 0.05})
+    >>> _, step = game.step(game.begin(scenario.sample(2, seed=7)), np.zeros((2, 1)))
+    >>> step.terminated, step.first_impact_harm, [*step.terms]
+    (array([False, False]), array([0., 0.]), ['harm', 'risk'])
+
+    """
 
     reward: Floats  # [n, N] reward of each vehicle
     out: Floats  # [OUT_ROWS, n] the properties below

@@ -11,8 +11,7 @@ risk        minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + sigm
 jerk        minus the squared rate of change of the vehicle's force
 terminal    1 at the end of an episode without any impact
 shaping     for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
-the
-            learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
+            the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
 harm_K      minus the harm that vehicle_K bears
 pair_J_K    minus the harm of the pair of vehicle_J and vehicle_K behind it
 obstacle    minus the harm of impacts with the obstacle
@@ -56,7 +55,7 @@ class Term(NamedTuple):
         """Return the value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns something else."""
         what = f"term {self.name!r}"
         try:
-            value = np.asarray(self.function(before, step, after))
+            value = np.asarray(self.function(before.read_only(), step, after.read_only()))
         except Exception as error:
             raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
         right = (after.n,), (after.n, after.vehicles)

@@ -169,5 +169,5 @@ def _recorded(saved: Saved, key: str) -> Any:
 
 
 def _noted(saved: Saved) -> dict[str, Any]:
-    parts = [each for key in NOTED if isinstance(each := saved.about.get(key), dict)]
+    parts = [each for key in NOTED if isinstance(each := _recorded(saved, key), dict)]
     return {"physics_digest": saved.about.get("physics_digest"), **{k: v for part in parts for k, v in part.items()}}

@@ -39,13 +39,7 @@ class Result:
     """What teams did in the same worlds: columns [n] of every team, and of the worlds. Row k is always the same world.
 
     >>> import ethbrake_marl as eb
-    >>> from ethbrake_marl.agents.drive import Team
-    >>> from ethbrake_marl.agents.scripts import Held
-    >>> from ethbrake_marl.evaluation.evaluate import evaluate
-    >>> from ethbrake_marl.worlds.game import game_of
-    >>> scenario, game = game_of("paper-random")
-    >>> teams = {name: Team(name, {2: Held(name)}) for name in ("full_brake", "coast")}
-    >>> result = evaluate(scenario.draw(3, seed=7), teams, game)
+    >>> result = eb.evaluate("paper-random", "full_brake,coast", episodes=3)
     >>> result["full_brake"]["total_harm"].round(2), result["coast"]["collided"]
     (array([33.79, 77.19,  0.  ]), array([ True,  True,  True]))
 

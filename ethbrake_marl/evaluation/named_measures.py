@@ -19,7 +19,7 @@ from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import TERMS, TermFunction
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
 from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Values, Watch
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Part, Registry
@@ -47,11 +47,10 @@ def register_measure(
         watch: in place of ``of``: ``watch(game, alert)`` returns a ``Watch``, which sees every step.
 
     >>> import ethbrake_marl as eb
-    >>> from ethbrake_marl.evaluation.named_measures import register_measure
-    >>> def hardest(game, alert, last):
+    >>> def rear_speed(game, alert, last):
     ...     '''Speed at which the rear vehicle ends, m/s.'''
     ...     return last.speeds_mps[:, -1]
-    >>> register_measure("rear_speed_mps", hardest, unit="m/s")
+    >>> eb.register_measure("rear_speed_mps", rear_speed, unit="m/s")
 
     """
     right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
@@ -62,7 +61,10 @@ def register_measure(
         )
     function = watch if of is None else of
     if (of is None) == (watch is None) or not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"measure {name!r}: give one function, of= or watch=, with a docstring that describes it")
+        raise InvalidInput(
+            f"measure {name!r}: give one function, of(game, alert, last) or watch(game, alert), with a docstring that"
+            " describes the measure"
+        )
     measure = Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
     if name in USUAL or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
@@ -98,7 +100,11 @@ def _called(name: str) -> list[Measure]:
         return [_summed(name, TERMS[name].value, TERMS[name].unit)]
     file, _, own = str(name).rpartition(":")
     if file.endswith(".py"):
-        register_measure(own, *_part(file, own).given, **_part(file, own).settings)
+        part = _part(file, own)
+        try:
+            register_measure(own, *part.given, **part.settings)
+        except EthBrakeError as error:
+            raise type(error)(f"file {file!r}: {error}") from None
         measure, called = MEASURES[own], cast(Any, FromFile(file, own))
         return [measure._replace(of=called) if measure.watch is None else measure._replace(watch=called)]
     kind = str(name).partition(":")[0]

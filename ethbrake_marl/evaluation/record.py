@@ -54,12 +54,10 @@ class Impacts:
 class EpisodeRecord:
     """Motion of one world at k times from the alert to the end of its episode.
 
-    >>> from ethbrake_marl.agents.drive import Team
-    >>> from ethbrake_marl.agents.scripts import Held
-    >>> from ethbrake_marl.evaluation.record import record_episode
-    >>> from ethbrake_marl.worlds.game import game_of
-    >>> scenario, game = game_of("paper-random")
-    >>> record = record_episode(scenario.sample(1, seed=7), Team("full_brake", {2: Held("full_brake")}), game)
+    >>> import ethbrake_marl as eb
+    >>> scenario, game = eb.open_game("paper-random")
+    >>> team = eb.Team.of({"vehicle_2": eb.make_agent("full_brake")}, "full_brake")
+    >>> record = eb.record_episode(scenario.sample(1, seed=7), team, game)
     >>> record.positions_m.shape, record.impacts.time_s.round(2), record.at_rest
     ((196, 3), array([2.17, 3.3 ]), True)
 

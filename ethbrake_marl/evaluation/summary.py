@@ -33,7 +33,14 @@ HEAD = {
 
 
 class SummaryTable(list[SummaryRow]):
-    """The rows of a table of results, which ``print`` and notebooks show."""
+    """The rows of a table of results, which ``print`` and notebooks show.
+
+    >>> import ethbrake_marl as eb
+    >>> table = eb.summarise(eb.evaluate("paper-random", "full_brake,coast", episodes=3))
+    >>> [row.agent for row in table], table.parameters["scenario"], table.to_json()[0]["collisions"]
+    (['full_brake', 'coast'], 'paper-random', 2)
+
+    """
 
     def __init__(
         self, rows: Iterable[SummaryRow], shown: Mapping[str, tuple[Measure, Statistic]], parameters: Mapping[str, Any]
@@ -239,7 +246,8 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
     A team has passed if no vehicle collides in any world.
     """
     columns: list[Column | str] = [
-        Column("Agent", text=True, whole=True), "Result", Column("Collisions", "collision_rate", **_PERCENT),
+        Column("Agent", "agent", text=True, whole=True), Column("Result", "result"),
+        Column("Collisions", "collision_rate", **_PERCENT),
         Column("Hardest, km/h", "hardest_impact_kmh", digits=1, short="Hardest,\nkm/h"),
         Column("First-impact harm", "first_impact_harm", short="First-impact\nharm"),
         Column("Total harm", "total_harm", short="Total\nharm"),

@@ -16,7 +16,14 @@ FAR_M, MOVING = 5.0, 0.05  # mean way of shoving, and share of worlds moving at 
 
 @dataclass(frozen=True)
 class SummaryRow:
-    """Results of one team. ``row["total_harm"]`` is an estimate by its key in JSON, None where it is not defined."""
+    """Results of one team. ``row["total_harm"]`` is an estimate by its key in JSON, None where it is not defined.
+
+    >>> import ethbrake_marl as eb
+    >>> (row,) = eb.summarise(eb.evaluate("paper-random", "full_brake", episodes=3))
+    >>> row.agent, row.knows, row.collisions, round(row["total_harm"].value, 2)
+    ('full_brake', 'own sensors', 2, 36.99)
+
+    """
 
     agent: str
     knows: str  # what the team has to know

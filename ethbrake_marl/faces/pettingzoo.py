@@ -15,7 +15,7 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.infos import dictionaries
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step
+from ethbrake_marl.episode.step import LARGEST_ACTION, Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number, unknown_name
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.rendering import make_renderer, render_metadata
@@ -240,7 +240,7 @@ class InTurns(parallel_to_aec_wrapper):  # type: ignore[misc]  # PettingZoo has 
                 raise InvalidInput(f"step: the episode of {agent} has ended; pass the action None, or call reset")
         elif agent in inner._learners and not (action is None and inner.game.shield is not None):
             number = checked_actions(np.nan if action is None else action, (), agent, inner.actions)
-            if not -1.0 <= number <= 1.0:
+            if not -LARGEST_ACTION <= number <= LARGEST_ACTION:
                 raise InvalidInput(
                     f"action of {agent} = {float(number)!r}: must be from -1 (full braking) to 1 (full driving)"
                 )

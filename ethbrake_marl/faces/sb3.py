@@ -238,7 +238,9 @@ class EthBrakeVecEnv(VecEnv):
 
     def _optional_worlds(self) -> State | None:
         """Return the worlds of ``set_options``; None: there are none."""
-        given = [checked_options(row, OPTIONS[:1]) for row in self._options]
+        each = {id(row): row for row in self._options}  # often one for all, of which to warn once
+        checked = {number: checked_options(row, OPTIONS[:1]) for number, row in each.items()}
+        given = [checked[id(row)] for row in self._options]
         options = [{name: row[name] for name in OPTIONS[:1] if name in row} for row in given]
         if not any(options):
             return None

@@ -91,7 +91,8 @@ def _names_in(folder: Path) -> set[str]:
     except (FileNotFoundError, NotADirectoryError):
         return set()
     except (OSError, ValueError) as error:
-        raise InvalidInput(f"{str(folder)!r:.120}: cannot be read ({error})") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InvalidInput(f"{str(folder)!r:.120}: cannot be read ({reason})") from None
 
 
 def shipped_policies() -> dict[str, Path]:

@@ -109,7 +109,12 @@ class EpisodeShield:
 
 
 def make_episode(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team ``TEAM+episode[:pairwise]``."""
+    """Return the team ``TEAM+episode[:pairwise]``. Raises ``InvalidInput`` for a team of several vehicles."""
+    if len(team.drivers) > 1:
+        raise InvalidInput(
+            f"agent {settings.spec!r}: +episode works for one learner, not for a team of {len(team.drivers)}; +step"
+            " guards several"
+        )
     bound = "coupled" if argument is None else argument
     return team._replace(shield=EpisodeShield(team.drivers, harm_count=settings.harm_count, bound=bound))
 

@@ -61,10 +61,8 @@ class TrainResult:
 
     @property
     def agent(self) -> str:
-        """Name of the trained agent for ``--agents``: ``ppo@runs/mine``."""
-        algorithm = self.training.recipe.algorithm
-        alone = algorithm if algorithm in AGENTS else "policy"
-        return f"{alone if len(self.training.learners) == 1 else 'team'}@{self.directory}"
+        """Name of the trained agent for ``--agents``: ``policy@runs/mine``."""
+        return agent_of(self.training, self.directory)
 
     @property
     def metrics(self) -> Mapping[str, float] | None:
@@ -156,7 +154,7 @@ def resume(
     folder = RunFolder(directory)
     training = folder.training()
     with _prepared(training, folder, measure, on_progress) as updates, folder.held():
-        _check_unfinished(folder)
+        _check_unfinished(folder, training)
         saved, damaged = checkpoint.newest(folder.checkpoints)
         if saved is not None:
             _check_same(folder, training, saved, other_versions)
@@ -164,6 +162,11 @@ def resume(
         folder.write_team(training)  # it may be damaged
         updates.notes += [f"deleted a damaged checkpoint: {reason}" for reason in damaged]
         return _learn(updates, saved)
+
+
+def agent_of(training: Training, directory: Path) -> str:
+    """Return the name of the trained agent for ``--agents``."""
+    return f"{'policy' if len(training.learners) == 1 else 'team'}@{directory}"
 
 
 def _only(policies: Policies) -> Policy:
@@ -257,12 +260,13 @@ def _cause(model: BaseAlgorithm, error: BaseException) -> BaseException:
     return error
 
 
-def _check_unfinished(folder: RunFolder) -> None:
+def _check_unfinished(folder: RunFolder, training: Training) -> None:
     """Raise ``InvalidInput`` if the training has finished, even if ``ethbrake run`` has not evaluated it yet."""
     status = read_object(folder.status)
     if status["status"] == "finished" or (status.get("stage") is not None and not any(folder.checkpoints.glob("*"))):
         raise InvalidInput(
-            f"{folder.path}: this training has finished and cannot be resumed; evaluate its policy (ethbrake evaluate)"
+            f"{folder.path}: this training has finished and cannot be resumed; evaluate its policy with: ethbrake"
+            f" evaluate --scenario {training.scenario.name} --agents full_brake,{agent_of(training, folder.path)}"
         )
 
 

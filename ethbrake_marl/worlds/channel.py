@@ -241,10 +241,11 @@ class V2X(Part):
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, value: Any) -> Any:
+        place = ("preset",) if isinstance(value, dict) else ()
         value = {"preset": value} if isinstance(value, str) else value
         name = value.get("preset", "paper") if isinstance(value, dict) else value
         right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
-        require(isinstance(value, V2X) or (isinstance(name, str) and name in CHANNELS), (), name, right)
+        require(isinstance(value, V2X) or (isinstance(name, str) and name in CHANNELS), place, name, right)
         if not isinstance(value, dict):
             return value
         known = cls.model_fields

@@ -14,6 +14,7 @@ from ethbrake_marl.files.model import suggestion
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.worlds.checks import LEAST_WEIGHT
 from ethbrake_marl.worlds.derived import obstacle_gap, world_values
+from ethbrake_marl.worlds.roles import deceleration_of
 from ethbrake_marl.worlds.rules import OPTIONAL, RECORDING, RULES, USUAL, Entry, table_columns
 from ethbrake_marl.worlds.sampling import state_of
 from ethbrake_marl.worlds.scenario import Scenario
@@ -166,6 +167,11 @@ def _worlds(
         require(latency < scenario.horizon_s, "latency_s", i, latency, right)
         right = f"must not be above speed_limit_mps of vehicle_{i + 1}, {limit[np.argmin(speed <= limit)]:g} m/s"
         require(speed <= limit, "speeds_mps", i, speed, right)
+        role = scenario.roles[f"vehicle_{i + 1}"]
+        deceleration = deceleration_of(role) or 0.0
+        key = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
+        right = f"must be at least {abs(deceleration):g} m/s2, because roles.vehicle_{i + 1} = {role}"
+        require(whole[key][:, i] >= abs(deceleration), key, i, whole[key][:, i], right)
     weights = whole.get("harm_weight", np.ones((n, 1)))
     right = f"the weight of at least one vehicle must be {LEAST_WEIGHT:g} or more"
     require(np.asarray((weights >= LEAST_WEIGHT).any(axis=1)), "harm_weight", 0, weights[:, 0], right)

@@ -165,7 +165,7 @@ def test_a_command_beyond_a_capacity__is_refused_with_world_and_time():
 
 @pytest.mark.parametrize("role", ["constant:20", "constant:-20"])
 def test_a_constant__beyond_the_capacity_is_refused(role: str):
-    with pytest.raises(InvalidInput, match=f"agent '{role}': vehicle_2 must decelerate at most"):
+    with pytest.raises(InvalidInput, match=f"agent '{role}': vehicle_2 can decelerate by at most"):
         drive(GAME, PAPER.sample(2, 7), Team(role, {2: Held(role)}))
 
 

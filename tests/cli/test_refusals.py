@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.first_edition.scenario.catalogue import new_scenario_text
+from ethbrake_marl.worlds.explain import new_scenario_text
 from tests.fixtures.commands import Refuse
 
 USAGE = [
@@ -101,7 +101,7 @@ def write_scenario(old: str, new: str) -> None:
             "\nrestitution: .nan",
             "mine.yaml, line 76: restitution = .nan: must be a finite number",
         ),
-        ("vehicle_3: full_brake\n", "vehicle_3: coast:4\n", "agent 'coast:4': coast takes no argument"),
+        ("vehicle_3: full_brake", "vehicle_3: coast:4", "agent 'coast:4': coast takes no argument"),
     ],
 )
 def test_validate__names_the_line_of_the_mistake(old: str, new: str, message: str, refuse: Refuse) -> None:
@@ -111,12 +111,12 @@ def test_validate__names_the_line_of_the_mistake(old: str, new: str, message: st
 
 @pytest.mark.parametrize("command", ["run --output new", "evaluate"])
 def test_role_that_cannot_drive__is_refused_before_anything_is_written(command: str, refuse: Refuse) -> None:
-    write_scenario("vehicle_1: full_brake\n", "vehicle_1: coast:4\n")
-    refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 80: roles.vehicle_1 = coast:4: agent 'coast:4'")
+    write_scenario("vehicle_1: full_brake", "vehicle_1: coast:4")
+    refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 79: roles.vehicle_1 = coast:4: agent 'coast:4'")
 
 
 def test_run__needs_a_learner(refuse: Refuse) -> None:
-    write_scenario("vehicle_2: learner\n", "vehicle_2: full_brake\n")
+    write_scenario("vehicle_2: learner", "vehicle_2: full_brake")
     refuse("run --output new --scenario mine.yaml", "has no learner that the agents could drive")
 
 
@@ -159,7 +159,7 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
         (
             "worst = 3\n",
             "--set measures=bad.py:worst",
-            "measure 'worst': must be a function with a docstring that describes the",
+            "file 'bad.py': measure 'worst': give one function, of(game, alert, last) or watch(game, alert), with a",
         ),
         (
             "worst = 3\n",

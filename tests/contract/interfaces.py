@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import ethbrake_marl.first_edition as eb
-from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv
-from ethbrake_marl.first_edition.envs.pettingzoo import EthBrakeParallelEnv, InTurns
-from ethbrake_marl.first_edition.envs.vector import EthBrakeVectorEnv
+import ethbrake_marl as eb
+from ethbrake_marl.motion.layout import LIMIT, RESTITUTION
 
 Array = NDArray[Any]
 Wrap = Callable[[Any], Any]
@@ -131,8 +129,8 @@ class Interface:
 
 class Parallel(Interface):
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
-        self.env = wrap(EthBrakeParallelEnv(scenario, **settings))
-        self.agent = self.env.possible_agents[self.env.unwrapped.engine.learners[0]]
+        self.env = wrap(eb.EthBrakeParallelEnv(scenario, **settings))
+        self.agent = self.env.possible_agents[self.env.unwrapped.game.rules.learners[0] - 1]
         self.space = self.env.observation_space(self.agent)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
@@ -146,8 +144,8 @@ class InTurn(Parallel):
     """PettingZoo's other interface: one agent after the other."""
 
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
-        super().__init__(scenario, n, wrap, **settings)
-        self.env = InTurns.around(self.env)
+        super().__init__(scenario, n, **settings)
+        self.env = wrap(eb.raw_env(scenario, **settings))
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
         self.env.reset(seed=seed, options=options)
@@ -164,7 +162,7 @@ class InTurn(Parallel):
 
 class Single(Interface):
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
-        self.env = wrap(EthBrakeEnv(scenario, **settings))
+        self.env = wrap(eb.EthBrakeEnv(scenario, **settings))
         self.space = self.env.observation_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
@@ -179,12 +177,13 @@ class Batch(Interface):
 
     def drawn(self) -> list[dict[str, Any]]:
         columns = self.env.unwrapped.describe_worlds()
-        return [{name: column[k].item() for name, column in columns.items()} for k in range(self.n)]
+        worlds = ({name: column[k].item() for name, column in columns.items()} for k in range(self.n))
+        return [{name: value for name, value in world.items() if value != ""} for world in worlds]  # of other worlds
 
 
 class Vector(Batch):
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
-        self.env, self.n = wrap(EthBrakeVectorEnv(n, scenario, autoreset_mode="SameStep", **settings)), n
+        self.env, self.n = wrap(eb.EthBrakeVectorEnv(n, scenario, autoreset_mode="SameStep", **settings)), n
         self.space = self.env.single_observation_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:
@@ -228,13 +227,9 @@ BARE: dict[str, Callable[..., Interface]] = {
     "sb3": Sb3,
 }
 STEP: dict[str, Callable[..., Interface]] = {
-    "shielded parallel": partial(Parallel, wrap=partial(eb.HybridShield, mode="step")),
-    "shielded in turn": partial(InTurn, wrap=partial(eb.HybridShield, mode="step")),
-    "shielded single": partial(Single, wrap=eb.ShieldedEnv),
-    "shielded vector": partial(Vector, wrap=eb.ShieldedVectorEnv),
-    "shielded sb3": partial(Sb3, wrap=eb.ShieldedVecEnv),
+    f"shielded {name}": partial(make, wrap=eb.shield) for name, make in BARE.items()
 }
-EPISODE = partial(eb.HybridShield, policy=eb.make_agent("full_brake"), mode="episode")  # what is proposed is not asked
+EPISODE = partial(eb.shield, policy="full_brake", mode="episode")  # what is proposed is not asked
 SHIELDED = {**STEP, "episode parallel": partial(Parallel, wrap=EPISODE)}
 INTERFACES = {**BARE, **SHIELDED}
 BATCHED = [name for name in INTERFACES if name.endswith(("vector", "sb3"))]
@@ -250,12 +245,11 @@ def actions(seed: int, steps: int, n: int) -> Array:
     return np.clip(np.random.default_rng(seed).normal(-0.8, 0.6, (steps, n, 1)), -1.0, 1.0).astype(np.float32)
 
 
-def initial_state(worlds: eb.Worlds, row: int) -> dict[str, Any]:
+def initial_state(worlds: eb.State, row: int) -> dict[str, Any]:
     """The option ``initial_state`` that describes one world at t = 0 completely."""
-    vehicles = worlds.vehicles
-    names = ("braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t", "speed_limit_mps", "restitution")
+    names = ("gaps_m", "speeds_mps", "braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")
     return {
-        "gaps_m": worlds.gaps_m[row],
-        "speeds_mps": worlds.speeds_mps[row],
-        **{name: getattr(vehicles, name)[row] for name in names},
+        **{name: getattr(worlds, name)[row] for name in names},
+        "speed_limit_mps": worlds.car[row, LIMIT, 1:],
+        "restitution": worlds.car[row, RESTITUTION, 1],
     }

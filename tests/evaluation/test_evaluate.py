@@ -114,7 +114,7 @@ def doc(function: Any) -> Any:
 REFUSED_MEASURES: dict[str, tuple[str, Any]] = {
     "must be 1 to 64 characters": ("x_1", doc(lambda g, a, last: last.time_s)),
     "nor in _interval, _low": ("x_interval", doc(lambda g, a, last: last.time_s)),
-    "with a docstring that describes it": ("x", lambda g, a, last: last.time_s),
+    "with a docstring that describes the measure": ("x", lambda g, a, last: last.time_s),
     "this name is already in use": ("total_harm", doc(lambda g, a, last: last.time_s)),
     "its function fails: ZeroDivisionError": ("x", doc(lambda g, a, last: 1 / 0)),
     "float64 of shape (2, 3); must return": ("x", doc(lambda g, a, last: np.zeros((2, 3)))),

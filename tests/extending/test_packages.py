@@ -6,12 +6,19 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-import ethbrake_marl.first_edition as eb
+import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.episode.features import FEATURES
+from ethbrake_marl.episode.objectives import OBJECTIVES
+from ethbrake_marl.episode.terms import TERMS
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
+from ethbrake_marl.evaluation.named_measures import MEASURES
+from ethbrake_marl.names import AGENTS, WRAPPERS
 from ethbrake_marl.registry import versions_used
+from ethbrake_marl.training.recipe import ALGORITHMS
 
 Install = Callable[..., None]
 
@@ -19,41 +26,44 @@ HILLS = '''
 import numpy as np
 import typer
 
-import ethbrake_marl.first_edition as eb
-from ethbrake_marl.first_edition.training.recipes import PpoRecipe
+import ethbrake_marl as eb
+from ethbrake_marl.training.recipe import PpoRecipe
 
 
 class Gentle:
-    name, knows, state_free = "gentle", "own sensors", True
+    name, knows = "gentle", "own sensors"
 
     def __init__(self, share):
         self.share = share
 
-    def act(self, worlds, vehicle):
-        return -self.share * worlds.vehicles.braking_capacity_mps2[:, vehicle]
+    def begin(self, alert, body):
+        return -self.share * alert.braking_capacity_mps2[:, body - 1]
+
+    def act(self, state, memory, body):
+        return memory, memory
 
 
 def make_gentle(argument, settings):
     return Gentle(float(argument or 0.5))
 
 
-def softer(agent, argument, settings):
-    return Gentle(agent.share / 2.0)
+def softer(team, argument, settings):
+    return team._replace(drivers={body: Gentle(agent.share / 2.0) for body, agent in team.drivers.items()})
 
 
-def worst(episodes):
-    """Largest change of speed in the line."""
-    return episodes.largest_speed_change_mps.max(axis=1)
+def worst(game, alert, last):
+    """Largest loss of speed in the line."""
+    return (alert.speeds_mps - last.speeds_mps).max(axis=1)
 
 
-def calm(step):
-    """Minus the square of the own command in force."""
-    return -(step.command_mps2**2)
+def calm(before, step, after):
+    """Minus the square of the command."""
+    return -(after.commands_mps2**2)
 
 
-def urgency(worlds, vehicle):
+def urgency(state, body):
     """Own speed."""
-    return worlds.speeds_mps[:, vehicle]
+    return state.speeds_mps[:, body - 1]
 
 
 def front_first(harm, vehicle):
@@ -65,10 +75,11 @@ class PatientRecipe(PpoRecipe):
     algorithm: str = "patient"
 
 
+GENTLE = eb.Part(make_gentle, about="brakes a little", knows="own sensors", form="gentle[:SHARE]")
 WORST = eb.Part(worst, unit="m/s")
-CALM = eb.Part(calm, unit="m/s2", by="step")
+CALM = eb.Part(calm, unit="m2/s4")
 URGENCY = eb.Part(urgency, unit="m/s", scale=10.0, low=0.0, high=4.0)
-PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.first_edition.training.ppo:Ppo")
+PATIENT = eb.Part(PatientRecipe, "ethbrake_marl.training.ppo:Ppo")
 
 
 def hello(name: str, loud: bool = False) -> None:
@@ -76,26 +87,50 @@ def hello(name: str, loud: bool = False) -> None:
     typer.echo(f"hello {name}{'!' * loud}")
 '''
 
-
-AGENTS = {"gentle": "hills:make_gentle"}
+GENTLE = {AGENTS.group: {"gentle": "hills:GENTLE"}}
 
 
 def test_entry_point__is_loaded_when_its_name_is_used(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
-    install(
-        "hills", HILLS, agents=AGENTS, objectives={"front-first": "hills:front_first"}, commands={"hi": "hills:hello"}
-    )
+    install("hills", HILLS, **GENTLE, objectives={"front-first": "hills:front_first"}, commands={"hi": "hills:hello"})
     assert run_command(["--help"]) == 0 and "Command of the installed package hills." in capsys.readouterr().out
-    assert "gentle" in eb.agent_names()
+    assert "gentle" in AGENTS
     assert eb.make_agent("full_brake").name == "full_brake" and "hills" not in sys.modules and not versions_used()
     assert eb.make_agent("gentle:0.8").share == 0.8  # type: ignore[union-attr]
     assert versions_used() == {"hills": "1.2"}
-    scenario = eb.load_scenario("paper-random").replace(objective="front-first", roles={"vehicle_2": "gentle"})
-    assert eb.make_engine(scenario, 3).scenario.objective == "front-first"
+    roles = {"vehicle_2": "learner", "vehicle_3": "gentle"}
+    scenario = eb.load_scenario("paper-random").replace(objective="front-first", roles=roles, early_impacts="keep")
+    assert eb.parallel_env(scenario=scenario).reset(seed=1)[0]
     assert run_command(["hi", "you"]) == 0 and capsys.readouterr().out == "hello you\n"
 
 
+def test_entry_points__of_every_kind_stand_beside_ours(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
+    parts = {
+        WRAPPERS.group: {"softer": "hills:softer"}, MEASURES.group: {"worst": "hills:WORST"},
+        TERMS.group: {"calm": "hills:CALM"}, FEATURES.group: {"urgency": "hills:URGENCY"},
+        OBJECTIVES.group: {"front-first": "hills:front_first"}, ALGORITHMS.group: {"patient": "hills:PATIENT"},
+    }  # fmt: skip
+    install("hills", HILLS, **GENTLE, **parts)
+    measures = ["worst", "calm", "front-first"]
+    found = eb.evaluate("paper-random", "gentle:0.8,gentle:0.8+softer,gentle:0.4", episodes=5, measures=measures)
+    soft, same = found["gentle:0.8+softer"], found["gentle:0.4"]
+    assert {"worst", "calm_2", "front-first_total_3"} < {*soft}
+    assert [soft[name].tolist() for name in soft] == [same[name].tolist() for name in soft]
+    (row, *_) = eb.summarise(found).to_json()
+    assert row["versions"]["hills"] == "1.2" and row["worst"] == pytest.approx(found["gentle:0.8"]["worst"].mean())
+    env = eb.parallel_env(scenario="paper-random", observation=["urgency"], reward={"harm": 0.0, "calm": 0.5})
+    assert env.reset(seed=1)[0]["vehicle_2"].shape == (1,)
+    assert env.step({"vehicle_2": [-1.0]})[1]["vehicle_2"] == -0.5 * 49.0
+    content = eb.load_recipe("ppo").model_dump(mode="json") | {"name": "mine", "algorithm": "patient"}
+    assert type(eb.load_recipe(content)).__name__ == "PatientRecipe"
+    for words, told in ((["agent", "list"], "gentle[:SHARE]"), (["agent", "list"], "+softer[:ARGUMENT]")):
+        assert run_command(words) == 0 and told in capsys.readouterr().out
+    assert run_command(["scenario", "parts"]) == 0
+    listed = capsys.readouterr().out
+    assert all(name in listed for name in ("worst", "calm", "urgency", "front-first", "patient"))
+
+
 def test_entry_point__is_loaded_once_by_several_threads(install: Install) -> None:
-    install("hills", f"import time\ntime.sleep(0.3)\n{HILLS}", agents=AGENTS)
+    install("hills", f"import time\ntime.sleep(0.3)\n{HILLS}", **GENTLE)
     with ThreadPoolExecutor(4) as pool:
         made = [pool.submit(eb.make_agent, "gentle:0.8") for _ in range(4)]
     assert [each.result().share for each in made] == [0.8] * 4  # type: ignore[union-attr]
@@ -104,29 +139,38 @@ def test_entry_point__is_loaded_once_by_several_threads(install: Install) -> Non
 def test_entry_point__that_fails_is_named_and_breaks_nothing_else(
     install: Install, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    groups = ("agents", "measures", "features", "objectives", "algorithms", "commands", "shields")
-    install("broken", "import nothing_of_this_name\n", **{group: {"hills": "broken:part"} for group in groups})
+    tables = (AGENTS, WRAPPERS, MEASURES, TERMS, FEATURES, OBJECTIVES, ALGORITHMS)
+    groups = {table.group: {f"hills{k}": "broken:part"} for k, table in enumerate(tables)}  # type: ignore[attr-defined]
+    install("broken", "import nothing_of_this_name\n", **groups, commands={"hills": "broken:part"})
     told = "broken:part of the installed package broken: cannot be imported: ModuleNotFoundError: No module named"
     for use in (
-        lambda: eb.make_agent("hills"),
-        lambda: eb.make_agent("coast+hills"),
-        lambda: eb.make_engine("paper-random", 1, reward={"harm": 1.0, "hills": 1.0}),
-        lambda: eb.choose_observation(["hills"]),
-        lambda: eb.load_scenario("paper-random").replace(objective="hills"),
-        lambda: eb.load_recipe("ppo").replace(algorithm="hills"),
+        lambda: eb.make_agent("hills0"),
+        lambda: eb.make_agent("coast+hills1", scenario="paper-random"),
+        lambda: eb.evaluate("paper-random", "coast", episodes=2, measures="hills2"),
+        lambda: eb.parallel_env(scenario="paper-random", reward={"harm": 1.0, "hills3": 1.0}),
+        lambda: eb.View(["hills4"]),
+        lambda: eb.load_scenario("paper-random").replace(objective="hills5"),
+        lambda: eb.load_recipe("ppo").replace(algorithm="hills6"),
     ):
         with pytest.raises(InvalidInput, match=told):
             use()
-    for words in (["hills"], ["evaluate", "--set", "measures=hills"]):
+    for words in (["hills"], ["evaluate", "--set", "measures=hills2"], ["evaluate", "--agents", "coast,hills0"]):
         assert run_command(words) == 2 and told in capsys.readouterr().err
-    for words in (["--help"], ["evaluate", "--help"], ["scenario", "schema"], ["train", "--schema"], ["agent", "list"]):
-        assert run_command(words) == 0
-    assert capsys.readouterr().err.count("left out: ") == 2
+    for words in (
+        ["--help"],
+        ["evaluate", "--help"],
+        ["scenario", "schema"],
+        ["train", "--schema"],
+        ["scenario", "parts"],
+    ):
+        assert run_command(words) == 0, words
+    capsys.readouterr()
+    assert run_command(["agent", "list"]) == 0 and capsys.readouterr().err.count("left out: ") == 2
 
 
 def test_entry_point__without_a_part_of_its_name_is_named(install: Install) -> None:
     more = "\nSEVERAL = {'other': make_gentle}\n"
-    install("hills", HILLS + more, agents={"hills": "hills:SEVERAL", "itself": "circle:make"})
+    install("hills", HILLS + more, **{AGENTS.group: {"hills": "hills:SEVERAL", "itself": "circle:make"}})
     install("circle", "import ethbrake_marl as eb\nmake = eb.make_agent('itself')\n")
     with pytest.raises(InvalidInput, match="agent 'hills' is an entry point that defines parts with other names"):
         eb.make_agent("hills")
@@ -136,35 +180,31 @@ def test_entry_point__without_a_part_of_its_name_is_named(install: Install) -> N
 
 
 def test_name__that_two_packages_give_is_told_with_both(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
-    install("hills", HILLS, agents=AGENTS, commands={"evaluate": "hills:hello", "hey": "hills:hello"})
-    agents = {"gentle": "valleys:make_gentle", "coast": "valleys:make_gentle"}
-    install("valleys", HILLS, agents=agents, commands={"hey": "valleys:hello"})
+    install("hills", HILLS, **GENTLE, commands={"evaluate": "hills:hello", "hey": "hills:hello"})
+    agents = {AGENTS.group: {"gentle": "valleys:make_gentle", "coast": "valleys:make_gentle"}}
+    install("valleys", HILLS, **agents, commands={"hey": "valleys:hello"})
     both = "several installed packages, hills and valleys; uninstall all but one"
     with pytest.raises(InvalidInput, match=f"agent 'gentle' is defined by {both}"):
         eb.make_agent("gentle")
     with pytest.raises(InvalidInput, match=r"agent 'coast' is defined by several .*, ethbrake-marl and valleys"):
         eb.make_agent("coast")
     assert eb.make_agent("full_brake").name == "full_brake"
-    assert (
-        run_command(["--help"]) == 0
-        and "Command of the installed packages hills and valleys." in capsys.readouterr().out
-    )
+    told = "Command of the installed packages hills and valleys."
+    assert run_command(["--help"]) == 0 and told in capsys.readouterr().out
     assert run_command(["evaluate", "--episodes", "3"]) == 2
-    assert (
-        "command 'evaluate' is defined by several installed packages, ethbrake-marl and hills"
-        in capsys.readouterr().err
-    )
+    told = "command 'evaluate' is defined by several installed packages, ethbrake-marl and hills"
+    assert told in capsys.readouterr().err
     with pytest.raises(UnknownName, match="unknown agent 'gentel'; did you mean 'gentle'"):
         eb.make_agent("gentel")
 
 
 def test_register__is_the_way_of_both_and_refuses_another_of_that_name(install: Install) -> None:
-    install("hills", HILLS, agents=AGENTS, measures={"worst": "hills:WORST"})
+    install("hills", HILLS, **{AGENTS.group: {"gentle": "hills:make_gentle"}, MEASURES.group: {"worst": "hills:WORST"}})
     import hills  # type: ignore[import-not-found]
 
     eb.register_agent("gentle", hills.make_gentle)
     eb.register_measure("worst", hills.worst, unit="m/s")
-    with pytest.raises(AlreadyExists, match="agent 'gentle' is registered already"):
+    with pytest.raises(AlreadyExists, match=r"agent 'gentle' is registered already.*entry point of the package hills"):
         eb.register_agent("gentle", hills.softer)
     with pytest.raises(AlreadyExists, match="measure 'worst' is registered already"):
         eb.register_measure("worst", hills.worst, unit="km/h")
@@ -176,11 +216,13 @@ def test_measures__of_a_file_are_told_where_it_is_named(tmp_path: Path, capsys: 
     measures = f"{tmp_path}/mine.py:worst,{tmp_path}/mine.py:part,injury"
     assert run_command([*words, "--set", f"measures={measures}"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
-    assert row["metric_worst"] == row["metric_part"] > 0.0 and row["metric_injury_lr4s"] > 0.0
-    assert row["metrics"]["part"] == "part (m/s)" and row["versions"]["mine.py"].startswith("SHA-256 ")
+    assert row["worst"] == row["part"] > 0.0 and row["injury_lr4s"] > 0.0
+    assert row["versions"]["mine.py"].startswith("SHA-256 ")
+    found = eb.evaluate("paper-random", "full_brake", episodes=5, measures=[f"{tmp_path}/mine.py:worst"])
+    assert np.mean(found["full_brake"]["worst"]) == row["worst"]
 
 
-def test_scenario_recipe_and_bundle__run_no_file_that_they_name(tmp_path: Path) -> None:
+def test_scenario_recipe_and_observation__run_no_file_that_they_name(tmp_path: Path) -> None:
     (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n")
     evil = f"{tmp_path}/evil.py:make"
     paper, ppo = eb.load_scenario("paper-random"), eb.load_recipe("ppo")

@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl.first_edition as eb
-from ethbrake_marl.errors import AlreadyExists, UnknownName
-from ethbrake_marl.first_edition.game.features import FEATURES
-from ethbrake_marl.first_edition.game.rewards import reward_params
-from tests.fixtures.policies import make_policy
+import ethbrake_marl as eb
+from ethbrake_marl.episode.features import FEATURES
+from ethbrake_marl.errors import AgentFailed, AlreadyExists, InvalidInput, UnknownName
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
@@ -19,50 +17,38 @@ SCALED: dict[str, Any] = {"unit": "1", "scale": 2.0, "low": -1.0, "high": 1.0}
 
 
 def gives(value: Any) -> Callable[..., Any]:
-    """A function that gives this, or what this makes of its first argument."""
+    """A function that gives this, or what this makes of its arguments."""
 
     def given(*arguments: Any) -> Any:
         """For a test."""
-        return value(arguments[0]) if callable(value) else value
+        return value(*arguments) if callable(value) else value
 
     return given
 
 
-TIME = gives(lambda worlds: worlds.time_s)
-NOTHING = gives(lambda episodes: np.zeros(episodes.worlds.n))
-
-
 PARTS: dict[str, Callable[[], object]] = {
-    "feature 'front_1.gap': the name must be": lambda: eb.register_feature("front_1.gap", TIME, **SCALED),
-    "feature 'mine': must be a function with": lambda: eb.register_feature("mine", 3, **SCALED),
-    "feature 'mine': scale = 0: must be": lambda: eb.register_feature("mine", TIME, **SCALED | {"scale": 0.0}),
-    "feature 'mine': low = 1: must be below": lambda: eb.register_feature("mine", TIME, **SCALED | {"low": 1.0}),
-    "feature 'mine': its function returned": lambda: eb.register_feature("mine", gives(1.0), **SCALED),
-    "feature 'mine': its value is nan for": lambda: eb.register_feature(
-        "mine", gives(lambda worlds: np.full(worlds.n, np.nan)), **SCALED
+    "feature 'front_1.gap': the name must be": lambda: eb.register_feature("front_1.gap", gives(0.0), **SCALED),
+    "feature 'own': this is the name of a group": lambda: eb.register_feature("own", gives(0.0), **SCALED),
+    "feature 'mine': must be a function with a docstring": lambda: eb.register_feature("mine", 3, **SCALED),
+    "feature 'mine': scale = 0": lambda: eb.register_feature("mine", gives(0.0), **SCALED | {"scale": 0.0}),
+    "low = 1, high = 1: scale must be above 0": lambda: eb.register_feature("mine", gives(0.0), **SCALED | {"low": 1}),
+    "feature 'mine': unknown = nan: must be": lambda: eb.register_feature(
+        "mine", gives(0.0), **SCALED, unknown=float("nan")
     ),
-    "feature 'mine': its function fails for": lambda: eb.register_feature(
-        "mine", gives(lambda worlds: worlds.speeds_mps.fill(0.0)), **SCALED
-    ),
-    "observation: own.speed is listed twice": lambda: eb.choose_observation(["own", "own.speed"]),
-    "observation: must be a list of groups": lambda: eb.choose_observation([]),
-    "feature 'age' describes a neighbour;": lambda: eb.choose_observation(["age"]),
-    "observation: 5: must be the name of a": lambda: eb.choose_observation([5]),
-    "recipe 'ppo': observation =": lambda: eb.load_recipe("ppo").replace(observation=["front_1.gp"]),
+    "feature 'mine': of = 'both': must be": lambda: eb.register_feature("mine", gives(0.0), **SCALED, of="both"),
     "preset 'My preset': the name must be 1": lambda: eb.register_preset("My preset", {}),
-    "must be a preset: paper, clear,": lambda: eb.register_preset("mine", {"preset": "ruarl"}),
+    "preset 'mine': preset = ruarl: must be a preset (paper, clear,": lambda: eb.register_preset(
+        "mine", {"preset": "ruarl"}
+    ),
     "objective 'Mine': the name must be 1 to": lambda: eb.register_objective("Mine", gives(0.0)),
     "objective 'mine': must be a function": lambda: eb.register_objective("mine", 3),
-    "measure 'Squared': the name must be 1": lambda: eb.register_measure("Squared", NOTHING, unit="1"),
-    "measure 'mine': must be a function with": lambda: eb.register_measure("mine", 3, unit="1"),
-    "its function returned float64 of shape": lambda: eb.register_measure("mine", gives(1.0), unit="1"),
-    "measure 'mine': its value is nan in": lambda: eb.register_measure(
-        "mine", gives(lambda episodes: np.full(episodes.worlds.n, np.nan)), unit="1"
-    ),
-    "measure 'mine': its function fails:": lambda: eb.register_measure(
-        "mine", gives(lambda episodes: episodes.rows.closing_speed_mps.fill(0.0)), unit="1"
-    ),
-    "scenarios 'nowhere': is not an existing": lambda: eb.register_scenarios("nowhere"),
+    "term 'Mine': the name must be 1 to": lambda: eb.register_term("Mine", gives(0.0)),
+    "term 'calm_2': the name must be 1 to": lambda: eb.register_term("calm_2", gives(0.0)),
+    "term 'mine': must be a function with a": lambda: eb.register_term("mine", lambda before, step, after: 0.0),
+    "measure 'Mine': the name must be 1 to": lambda: eb.register_measure("Mine", gives(0.0)),
+    "measure 'mine': give one function, of": lambda: eb.register_measure("mine", lambda game, alert, last: 0.0),
+    "agent 'My agent': the name must have": lambda: eb.register_agent("My agent", gives(0.0)),
+    "scenarios 'nowhere': has no file that": lambda: eb.register_scenarios("nowhere"),
 }
 
 
@@ -73,9 +59,15 @@ def test_part__is_refused(message: str) -> None:
 
 
 THERE: dict[str, Callable[[], object]] = {
-    "feature 'own': this name is already in": lambda: eb.register_feature("own", TIME, **SCALED),
+    "feature 'place' is registered already;": lambda: eb.register_feature("place", gives(0.0), **SCALED),
     "objective 'own' is registered already;": lambda: eb.register_objective("own", gives(0.0)),
-    "agent 'ladder': is the name of a group": lambda: eb.register_agent("ladder", gives(None)),
+    "term 'harm': this name is already in": lambda: eb.register_term("harm", gives(0.0)),
+    "term 'intervention' is registered already;": lambda: eb.register_term("intervention", gives(0.0)),
+    "measure 'total_harm': this name is": lambda: eb.register_measure("total_harm", gives(0.0)),
+    "measure 'injury' is registered already;": lambda: eb.register_measure("injury", gives(0.0)),
+    "agent 'coast' is registered already;": lambda: eb.register_agent("coast", gives(0.0)),
+    "shield or search 'step' is registered already;": lambda: eb.register_shield("step", gives(0.0)),
+    "preset 'paper': another channel is already registered": lambda: eb.register_preset("paper", {"preset": "nominal"}),
 }
 
 
@@ -86,91 +78,123 @@ def test_part__of_a_name_that_is_there_is_refused(message: str) -> None:
 
 
 NAMES: dict[str, Callable[[], object]] = {
-    "unknown feature 'zzz'": lambda: eb.choose_observation(["own", "zzz"]),
-    "unknown setting of a reward 'jrek'; did": lambda: reward_params({"jrek": 1.0}),
+    "unknown feature 'zzz'; known: ": lambda: eb.View(["own", "zzz"]),
+    "unknown setting of a reward 'jrek'; did you": lambda: eb.parallel_env(scenario=PAPER, reward={"jrek": 1.0}),
+    "unknown objective 'onw'; did you mean": lambda: PAPER.replace(objective="onw"),
+    "unknown measure 'injur'; did you mean": lambda: eb.evaluate(PAPER, "coast", episodes=2, measures="injur"),
+    "unknown agent 'caost'; did you mean": lambda: eb.make_agent("caost"),
 }
 
 
 @pytest.mark.parametrize("message", NAMES)
 def test_name__is_unknown(message: str) -> None:
-    with refused(message, UnknownName):
+    with pytest.raises(InvalidInput) as caught:
         NAMES[message]()
-
-
-@pytest.mark.parametrize(
-    "register",
-    [
-        lambda value: eb.register_feature("mine", value, **SCALED),
-        lambda value: eb.register_measure("mine", value, unit="1"),
-    ],
-)
-def test_part__needs_a_docstring_and_a_name_that_no_other_part_has(register: Callable[[Any], None]) -> None:
-    with refused(" 'mine': must be a function with a docstring that describes the"):
-        register(lambda *given: given[0])
-    ours = gives(lambda first: np.zeros(len(first.time_s) if hasattr(first, "time_s") else first.worlds.n))
-    register(ours)
-    register(ours)
-    with refused(" 'mine' is registered already; give another name", AlreadyExists):
-        register(gives(lambda first: np.zeros(len(first.time_s) if hasattr(first, "time_s") else first.worlds.n)))
-
-
-def started(reward: dict[str, Any]) -> Any:
-    """An environment with this reward, at the beginning of an episode."""
-    env = eb.parallel_env("paper-random", reward=reward)
-    env.reset(seed=1)
-    return env
+    assert message in str(caught.value)
+    assert isinstance(caught.value, UnknownName) or "objective" in message  # a scenario names its key
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (lambda step: step.speeds_mps[:, :1], "its function returned float64 of shape"),
-        (lambda step: np.full(len(step.time_s), np.nan), "its value is nan in world 0; must be"),
-        (lambda step: step.speeds_mps.fill(0.0), "its function fails: ValueError:"),
+        (1.0, "returned float64"),
+        (lambda state, body: np.full(state.n, np.nan), "nan"),
+        (lambda state, body: state.speed_mps, "its function fails"),
+        (lambda state, body: state.speeds_mps.fill(0.0), "read-only"),
     ],
+    ids=["shape", "nan", "error", "in place"],
 )
-def test_measure_by_step__gives_a_finite_number_per_vehicle(given: Any, message: str) -> None:
-    with refused(f"measure 'mine': {message}"):
-        eb.register_measure("mine", gives(given), by="step")
+def test_feature__gives_a_finite_number_per_world(given: Any, message: str) -> None:
+    eb.register_feature("mine", gives(given), **SCALED)
+    with pytest.raises(InvalidInput, match=f"feature 'mine': .*{message}"):
+        eb.parallel_env(scenario=PAPER, observation=["mine"]).reset(seed=1)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (1.0, "its function returned float64 values of"),
-        (lambda harm: np.full(len(harm.whole), np.nan), "its function returned nan for vehicle_1"),
+        (1.0, "its function returned float64 values of shape () for vehicle_1; must return finite numbers"),
+        (lambda harm, vehicle: np.full(len(harm.whole), np.nan), "its function returned float64 values"),
+        (lambda harm, vehicle: harm.pears, "its function fails for vehicle_1: AttributeError"),
     ],
+    ids=["shape", "nan", "error"],
 )
-def test_objective__gives_a_finite_number_per_world_and_changes_nothing(given: Any, message: str) -> None:
+def test_objective__gives_a_finite_number_per_world(given: Any, message: str) -> None:
     eb.register_objective("mine", gives(given))
+    env = eb.parallel_env(scenario=PAPER, reward={"harm": 1.0, "objective": "mine"})
+    env.reset(seed=1)
     with refused(f"objective 'mine': {message}"):
-        started({"harm": 1.0, "objective": "mine"}).step({"vehicle_2": [0.0]})
+        env.step({"vehicle_2": [0.0]})
+
+
+class Wrong:
+    """Answers with what it was made of."""
+
+    name, knows = "wrong", "own sensors"
+
+    def __init__(self, answer: Callable[[eb.State], Any]) -> None:
+        self.answer = answer
+
+    def begin(self, alert: eb.State, body: int) -> None:
+        return None
+
+    def act(self, state: eb.State, memory: None, body: int) -> Any:
+        return self.answer(state)
 
 
 @pytest.mark.parametrize(
-    ("urgency", "message"),
-    [(None, "observes the feature 'urgency', which"), ((1.0, 3.0), "observes the feature 'urgency', whose")],
+    ("answer", "message"),
+    [
+        (lambda state: np.zeros(state.n), "vehicle_2: act returned array([0., 0.]); must return commands and memory"),
+        (lambda state: (np.zeros((state.n, 1)), None), "must be numbers of the shape (2,)"),
+        (
+            lambda state: (np.full(state.n, -99.0), None),
+            "world 0, vehicle_2 at 0.50 s: command -99 m/s2; must be in [-7",
+        ),
+        (lambda state: (np.full(state.n, np.nan), None), "command nan m/s2; must be in [-7, 7] m/s2"),
+        (lambda state: state.speed, "vehicle_2: act fails: AttributeError"),
+        (lambda state: state.line.fill(0.0), "read-only"),
+    ],
+    ids=["no memory", "shape", "beyond", "nan", "error", "in place"],
 )
-def test_policy__observes_the_features_that_it_was_trained_on(urgency: Any, message: str, empty_folder: Path) -> None:
-    eb.register_feature("urgency", gives(lambda worlds: worlds.speeds_mps[:, 0] / 40.0), **SCALED)
-    make_policy(eb.choose_observation(["own", "urgency"]), {"name": "paper-random"}).save(Path("kept"))
-    eb.load_policy("kept")
+def test_agent__that_answers_wrongly_is_named_once_as_the_user_calls_it(answer: Any, message: str) -> None:
+    with pytest.raises(AgentFailed) as caught:
+        eb.evaluate(PAPER, {"mine": Wrong(answer)}, episodes=2)
+    assert str(caught.value).startswith("agent 'mine'") and message in str(caught.value)
+    assert str(caught.value).count("agent") == 1
+
+
+@pytest.mark.parametrize(
+    ("agent", "message"),
+    [
+        (object(), "has no name and no knows and no begin and no act; must be an agent"),
+        ({"vehicle_2": "coast", "vehicle_9": "coast"}, "drives vehicle_2, vehicle_9; must drive exactly vehicle_2"),
+        ({1: "coast"}, "team 'mine': 1: must be the name of a vehicle, such as vehicle_2"),
+        ("coats", "unknown agent 'coats'; did you mean 'coast'"),
+    ],
+    ids=["nothing", "too many", "a number", "unknown"],
+)
+def test_agent__that_is_none_is_refused(agent: Any, message: str) -> None:
+    with refused(message):
+        eb.evaluate(PAPER, {"mine": agent}, episodes=2)
+
+
+@pytest.mark.parametrize(
+    ("again", "message"),
+    [(None, "observes the feature 'urgency', which is not"), ((1.0, 3.0), "observes the feature 'urgency', ")],
+    ids=["gone", "another scale"],
+)
+def test_policy__observes_the_features_that_it_was_trained_on(again: Any, message: str, empty_folder: Path) -> None:
+    from tests.training.tiny import TINY
+
+    eb.register_feature("urgency", gives(lambda state, body: state.speeds_mps[:, 0] / 40.0), **SCALED)
+    recipe = TINY.replace(observation=["own", "urgency"], total_steps=128)
+    kept = eb.train(recipe, PAPER, "run", measure=None, on_progress=None).directory
+    eb.load_policy(kept)
     del FEATURES.loaded["urgency"]
-    if urgency is not None:
-        factor, scale = urgency
-        other = gives(lambda worlds: factor * worlds.speeds_mps[:, 0] / 40.0)
+    if again is not None:
+        factor, scale = again
+        other = gives(lambda state, body: factor * state.speeds_mps[:, 0] / 40.0)
         eb.register_feature("urgency", other, **SCALED | {"scale": scale})
-    with refused(f"kept/manifest.json: the policy {message}"):
-        eb.load_policy("kept")
-
-
-@pytest.mark.parametrize(
-    ("few", "kind"),
-    [(lambda n: np.zeros(n, bool), "truth value per world"), (lambda n: np.zeros((n, 3)), "number per vehicle")],
-    ids=["truth", "number per vehicle"],
-)
-def test_measure__always_gives_what_it_gave_when_it_was_registered(few: Any, kind: str) -> None:
-    changes = gives(lambda episodes: few(episodes.worlds.n) if episodes.worlds.n < 10 else np.zeros(episodes.worlds.n))
-    eb.register_measure("mine", changes, unit="1")
-    with refused(f"measure 'mine': its function returned a number per world, but a {kind} when it was registered"):
-        eb.evaluate(PAPER.sample(40, 7), {"full_brake": eb.make_agent("full_brake")}, scenario=PAPER)
+    with refused(f"manifest.json: the policy {message}"):
+        eb.load_policy(kept)

@@ -3,10 +3,21 @@
 import re
 from pathlib import Path
 
-from tests.cli.test_scenarios import ROOT, TUTORIAL, change_lines
 from tests.fixtures.commands import Command
 
+ROOT = Path(__file__).resolve().parents[2]
+TUTORIAL = (ROOT / "docs" / "first-ten-minutes.md").read_text("utf-8")
 ADD = (ROOT / "docs" / "scenarios.md").read_text("utf-8").partition("\n## From Python\n")[0]
+
+
+def change_lines(path: str, page: str) -> None:
+    """The lines of a scenario that the page's first YAML block changes."""
+    block = re.search(r"```yaml\n(.*?)```", page, re.DOTALL)
+    text = Path(path).read_text()
+    for line in block[1].splitlines():
+        text, count = re.subn(rf"(?m)^{line.partition(':')[0]}: .*$", line, text)
+        assert count == 1
+    Path(path).write_text(text)
 
 
 def test_tutorial__its_changed_scenario_is_valid_and_evaluates_to_the_printed_table(

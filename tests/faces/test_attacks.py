@@ -22,7 +22,7 @@ def test_role_of_an_agent__must_be_known(role: str) -> None:
     scenario = PAPER.replace(roles={"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": role})
     for face in (EthBrakeEnv, EthBrakeParallelEnv, lambda each: EthBrakeVectorEnv(2, each)):
         with pytest.raises(
-            InvalidInput, match=rf"roles.vehicle_3 = {role}: (unknown agent|agent coast@x: coast uses no policy)"
+            InvalidInput, match=rf"roles.vehicle_3 = {role}: (unknown agent|agent 'coast@x': coast uses no policy)"
         ):
             face(scenario)
 

@@ -392,7 +392,7 @@ FOLDERS: dict[str, Callable[[], Any]] = {
     "policy = None: must be the path of a training run or of a policy bundle": lambda: load_policy(None),  # type: ignore[arg-type]
     "policy = 3: must be the path": lambda: load_policy(3),  # type: ignore[arg-type]
     "cannot be read (embedded null byte)": lambda: load_policy("a\0b"),
-    "cannot be read ([Errno 36] File name too long": lambda: load_policy("a" * 5000),
+    "cannot be read (File name too long)": lambda: load_policy("a" * 5000),
     "unknown shipped policy 'universel'; did you mean 'universal'?": lambda: load_shipped("universel"),
     "'shipped/ppo' is now written ppo": lambda: load_named_policy("shipped/ppo"),
 }

@@ -9,7 +9,7 @@ import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.extensions import datasets
 from ethbrake_marl.extensions.datasets import to_parquet
-from tests.contract.interfaces import PAPER
+from tests.first_edition.contract.interfaces import PAPER
 
 PAIR = eb.load_scenario("cooperation-3-pair")
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "extensions" / "datasets.md"

@@ -1,11 +1,11 @@
 """Pictures, pages and films of commands."""
 
+import sys
 from pathlib import Path
 
 import pytest
 
 from ethbrake_marl.errors import _EXTRA_OF
-from tests.cli.test_watch import check_extra
 from tests.files.test_files import check_target
 from tests.fixtures.commands import Command, Refuse, check_refused
 from tests.test_imports import ended
@@ -43,7 +43,12 @@ def test_report__is_imported_where_no_package_of_an_extra_can_be() -> None:
 
 
 def test_film__of_an_extra_that_is_missing_says_the_line_that_installs_it(ethbrake: Command, monkeypatch) -> None:
-    check_extra(ethbrake, "imageio_ffmpeg", "render", "watch --agents coast --output film.mp4", monkeypatch)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    missing = f"needs the package imageio_ffmpeg, which is not installed; install it with: {sys.executable} -m pip"
+    check_refused(
+        ethbrake("watch", "--agents", "coast", "--output", "film.mp4"), f"{missing} install 'ethbrake-marl[render]'\n"
+    )
+    assert list(Path().iterdir()) == []
 
 
 def test_film__is_refused(refuse: Refuse) -> None:

@@ -8,11 +8,13 @@ import pytest
 
 import ethbrake_marl.first_edition as eb
 from ethbrake_marl.cli.app import app, run_command
-from tests.extending.test_extending import changed
 
 
 def test_measure__stands_in_the_page_of_an_evaluation(empty_folder: Path) -> None:
-    rear = changed(lambda episodes: episodes.largest_speed_change_mps[:, 2])
+    def rear(episodes: Any) -> Any:
+        """Largest change of speed of the rear vehicle."""
+        return episodes.largest_speed_change_mps[:, 2]
+
     eb.register_measure("change_of_rear", rear, unit="m/s")
     words = [
         "evaluate",

@@ -11,7 +11,7 @@ import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.report.film import film, film_scenes
 from ethbrake_marl.first_edition.agents.making import make_agent
 from ethbrake_marl.first_edition.evaluation.record import record_episode
-from tests.contract.interfaces import CRASH
+from tests.first_edition.contract.interfaces import CRASH
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 

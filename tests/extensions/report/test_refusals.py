@@ -12,7 +12,7 @@ from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
 from ethbrake_marl.extensions.report.seed_curves import SeedCurve
 from ethbrake_marl.extensions.report.style import picture_ending
 from ethbrake_marl.first_edition.scenario.task import Task
-from tests.contract.interfaces import CRASH
+from tests.first_edition.contract.interfaces import CRASH
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")

@@ -18,7 +18,7 @@ def test_validate__trying_a_search_has_a_budget(ethbrake: Command, scenario_file
     searched = Mock(side_effect=search_profiles)
     monkeypatch.setattr(recall, "search_profiles", searched)
     monkeypatch.setattr(module, "TRIED_WORLDS", 5)
-    path = scenario_file("\n  vehicle_3: full_brake\n", f"\n  vehicle_3: {script}\n")
+    path = scenario_file("vehicle_3: full_brake", f"vehicle_3: {script}")
     path.write_text(path.read_text().replace("early_impacts: reject", "early_impacts: keep"))
     assert ethbrake("scenario", "validate", path).out.startswith("OK  mine: 3 vehicles, learners: vehicle_2;")
     budgets = [call.kwargs["budget"] for call in searched.call_args_list]

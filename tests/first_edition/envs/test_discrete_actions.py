@@ -14,7 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.game.discrete_actions import index_to_action
-from tests.contract.interfaces import BARE, CRASH, INTERFACES, PAPER, rows_of
+from tests.first_edition.contract.interfaces import BARE, CRASH, INTERFACES, PAPER, rows_of
 
 PAIR = eb.load_scenario("cooperation-3-pair")
 

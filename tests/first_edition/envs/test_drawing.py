@@ -11,7 +11,7 @@ import pytest
 import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.envs.rendering import BODY_M
 from ethbrake_marl.first_edition.envs.trace import Trace
-from tests.contract.interfaces import CRASH
+from tests.first_edition.contract.interfaces import CRASH
 
 near = pytest.approx
 FLASH = (255, 214, 10)

@@ -1,4 +1,4 @@
-"""What is special to one interface; what all promise: ``tests/contract``."""
+"""What is special to one interface; what all promise: ``tests/first_edition/contract``."""
 
 import re
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ from ethbrake_marl.first_edition.envs.registration import GYMNASIUM_ID, PETTINGZ
 from ethbrake_marl.first_edition.envs.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.first_edition.game.features import Feature
 from ethbrake_marl.first_edition.game.full_state import full_state, state_features
-from tests.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
+from tests.first_edition.contract.interfaces import CRASH, FIVE, PAPER, REST, actions, initial_state, line
 
 near = pytest.approx
 ROOT = Path(__file__).resolve().parents[3]

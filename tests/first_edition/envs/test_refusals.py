@@ -9,7 +9,7 @@ import pytest
 import ethbrake_marl.first_edition as eb
 from ethbrake_marl import parallel_env
 from ethbrake_marl.errors import UnknownName
-from tests.contract.interfaces import CRASH, FIVE, PAPER
+from tests.first_edition.contract.interfaces import CRASH, FIVE, PAPER
 from tests.refused import refused
 
 PAIR = ["vehicle_2", "vehicle_3"]

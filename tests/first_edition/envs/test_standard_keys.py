@@ -12,7 +12,7 @@ import ethbrake_marl.first_edition as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.envs.making import UnknownResetOption
 from ethbrake_marl.first_edition.scenario.schema import Scenario
-from tests.contract.interfaces import PAPER, REST, actions
+from tests.first_edition.contract.interfaces import PAPER, REST, actions
 from tests.first_edition.envs.test_interfaces import SHORT, FromOneStream, assert_same_infos, initial_state
 
 MASK = np.array([False, True, True, False])

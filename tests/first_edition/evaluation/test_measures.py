@@ -26,7 +26,7 @@ from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 from ethbrake_marl.first_edition.scenario.schema import Scenario
 from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
 from ethbrake_marl.first_edition.training.experiment import results_csv
-from tests.contract.interfaces import CRASH
+from tests.first_edition.contract.interfaces import CRASH
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 

@@ -31,7 +31,7 @@ from ethbrake_marl.first_edition.scenario.fields import QUANTITY
 from ethbrake_marl.first_edition.scenario.mixtures import changed_content
 from ethbrake_marl.first_edition.scenario.roles import ScriptSpec
 from ethbrake_marl.first_edition.scenario.schema import scenario_json_schema
-from tests.contract.interfaces import LEVELS
+from tests.first_edition.contract.interfaces import LEVELS
 
 GIVEN = {
     "name": "given",

@@ -5,21 +5,18 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import gymnasium
 import pytest
 from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, render_test, seed_test
 from pettingzoo.test.state_test import state_test
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.env_util import make_vec_env
 
 import ethbrake_marl.first_edition as eb
 from ethbrake_marl.first_edition.envs.gymnasium import EthBrakeEnv
 from ethbrake_marl.first_edition.envs.pettingzoo import env, parallel_env
-from ethbrake_marl.first_edition.envs.rendering import HEIGHT, WIDTH
 from ethbrake_marl.first_edition.envs.viewer import Viewer
-from tests.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
+from tests.first_edition.contract.interfaces import FIVE, LEVELS, PAPER, REST, SCENARIOS, line
 
 pytestmark = pytest.mark.filterwarnings(
     "error",
@@ -65,14 +62,6 @@ def test_pettingzoo__checkers_pass(name: str) -> None:
         seed_test(in_turn, num_cycles=20)
 
 
-@pytest.mark.parametrize("actions", [None, 9])
-@pytest.mark.parametrize("scenario", [*SCENARIOS.values(), REST], ids=lambda scenario: scenario.name)
-def test_gymnasium_and_stable_baselines3__checkers_pass(scenario: Any, actions: int | None) -> None:
-    plain = gymnasium.make("EthBrake-v1", scenario=scenario, actions=actions).unwrapped
-    check_env(plain)
-    sb3_check_env(plain)
-
-
 def test_gymnasium_and_stable_baselines3__checkers_pass_behind_the_shield() -> None:
     for actions in (None, 9):
         check_env(eb.ShieldedEnv(EthBrakeEnv(actions=actions)), skip_render_check=True)
@@ -89,16 +78,3 @@ def test_stable_baselines3__learns_on_the_vec_env() -> None:
     vec_env = eb.make_sb3_vec_env(FIVE, 4, learners=["vehicle_2", "vehicle_3"])
     model = PPO("MlpPolicy", vec_env, n_steps=32, batch_size=32, n_epochs=1, seed=3, device="cpu").learn(768)
     assert model.ep_info_buffer[0]["l"] > 0
-
-
-def test_stable_baselines3__makes_it_by_its_id() -> None:
-    assert make_vec_env("EthBrake-v1", n_envs=2).reset().shape[0] == 2
-    model = PPO("MlpPolicy", "EthBrake-v1", n_steps=16, batch_size=16, n_epochs=1, device="cpu").learn(16)
-    assert model.get_env().render(mode="rgb_array").shape == (HEIGHT, WIDTH, 3)
-
-
-def test_old_gymnasium_spec__is_made():
-    spec = gymnasium.make("EthBrake-v1", scenario="paper-random").spec
-    old = spec.to_json().replace("ethbrake_marl.first_edition.envs.gymnasium:", "ethbrake_marl.first_edition.envs:")
-    assert old != spec.to_json()
-    assert gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(old)).reset(seed=1)[0].shape

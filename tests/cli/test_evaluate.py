@@ -1,0 +1,103 @@
+"""``ethbrake evaluate``: what its options change, what it leaves, and what it needs."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+import ethbrake_marl as eb
+from tests.fixtures.commands import Command, check_refused, rows_of, told_json
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def test_harm_count__is_what_agents_lower(ethbrake: Command) -> None:
+    arguments = ("evaluate", "--episodes", "200", "--agents", "e_v2x_bm", "--json", "--set")
+    (first,), (total,) = (told_json(ethbrake(*arguments, f"harm_count={count}")) for count in ("first", "total"))
+    assert total["total_harm"] < first["total_harm"] and total["first_impact_harm"] > first["first_impact_harm"]
+
+
+def test_a_world_by_hand__in_table_and_rows(tmp_path: Path) -> None:
+    # Vehicle 2 at 10 m/s coasts 5 m in its 0.5 s and brakes the last 3 m with 7 m/s2 towards a standing Vehicle 1:
+    # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.
+    scenario, own, out = eb.load_scenario("paper-random"), tmp_path / "mine.csv", tmp_path / "worlds.csv"
+    own.write_text("gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps,restitution\n8,5000,0,10,0,0\n8,5000,0,0,0,0\n")
+    found = eb.evaluate(eb.read_worlds(scenario, own), "full_brake", scenario=scenario)
+    (row,) = eb.summarise(found).to_json()
+    told = row["episodes"], row["collision_rate"], row["first_impact_harm"]
+    assert told == (2, 0.5, pytest.approx(29.0, rel=1e-12))
+    eb.write_rows(out, found)
+    hit, still = ([float(each[name]) for name in ("total_harm", "impacts")] for each in rows_of(out))
+    assert hit == [pytest.approx(58.0, rel=1e-12), 1.0] and still == [0.0, 0.0]
+
+
+def test_standards__every_row_names_its_scenario_and_full_braking_passes_as_published(ethbrake: Command) -> None:
+    words = ("evaluate", "--scenario", "standards", "--agents", "full_brake,coast", "--episodes", "20", "--json")
+    rows = told_json(ethbrake(*words))
+    assert len(rows) == 14 and len({row["scenario"] for row in rows}) == 7
+    for row in rows:
+        passes = row["agent"] == "full_brake"
+        assert row["result"] == ("passed" if passes else "failed")
+        assert (row["collision_rate"] == row["hardest_impact_kmh"] == row["total_harm"] == 0.0) == passes
+    refused = ethbrake(*words, "--per-world", "csv", "--output", "new")
+    check_refused(refused, "--per-world: cannot be used with standards, a group of 7 scenarios; name one scenario")
+
+
+TEAM = """
+import ethbrake_marl as eb
+
+
+def make():
+    return eb.Team.of({"vehicle_2": eb.make_agent("coast"), "vehicle_3": eb.make_agent("full_brake")}, "pair")
+"""
+
+
+def test_a_team__goes_behind_the_step_shield_and_no_other(ethbrake: Command) -> None:
+    Path("pair.py").write_text(TEAM)
+    words = ("evaluate", "--scenario", "cooperation-3-pair", "--episodes", "10", "--json", "--agents")
+    alone, shielded = told_json(ethbrake(*words, "pair.py:make,pair.py:make+step"))
+    assert shielded["agent"] == "pair.py:make+step" and shielded["total_harm"] < alone["total_harm"]
+    check_refused(
+        ethbrake(*words, "pair.py:make+episode"), "agent 'pair.py:make+episode': +episode works for one learner"
+    )
+    check_refused(
+        ethbrake("evaluate", "--agents", "pair.py:make"),
+        "team 'pair': drives vehicle_2, vehicle_3; must drive exactly vehicle_2",
+    )
+
+
+@pytest.mark.long
+def test_on_ray_and_in_processes__it_prints_the_same(ethbrake: Command, tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    line = ("evaluate", "--agents", "full_brake,e_v2x_bm:pairwise", "--episodes", "6000", "--json")
+    here = ethbrake(*line)
+    for more in (("--jobs", "2"), ("--ray", "local", "--jobs", "2")):
+        found = ethbrake(*line, *more, "--output", tmp_path / more[0])
+        assert found.status == 0 and found.out == here.out == (tmp_path / more[0] / "results.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "line"),
+    [
+        ("pyarrow", "data", "evaluate --agents coast --episodes 2 --output new --per-world parquet"),
+        ("onnx", "export", "agent export ppo --onnx policy.onnx"),
+    ],
+)
+def test_file__of_an_extra_that_is_missing_says_the_line_that_installs_it(
+    ethbrake: Command, package: str, extra: str, line: str, monkeypatch
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    missing = f"needs the package {package}, which is not installed; install it with: {sys.executable} -m pip install"
+    check_refused(ethbrake(*line.split()), f"{missing} 'ethbrake-marl[{extra}]'\n")
+    assert list(Path().iterdir()) == []
+
+
+def test_output__deletes_the_files_of_earlier_results_and_nothing_else(ethbrake: Command, tmp_path: Path) -> None:
+    line = ("evaluate", "--agents", "coast", "--episodes", "2", "--output", tmp_path / "out", "--force")
+    assert ethbrake(*line, "--per-world", "csv").status == 0
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    assert ethbrake(*line).status == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"results.json", "notes.txt"}

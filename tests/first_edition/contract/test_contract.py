@@ -1,0 +1,340 @@
+"""What every interface promises, bare and behind the shield, stricter than the libraries' own checkers."""
+
+import copy
+import json
+import multiprocessing
+import pickle
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.first_edition.envs.making import UnknownResetOption
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.first_edition.scenario.fields import QUANTITY
+from ethbrake_marl.first_edition.scenario.schema import Scenario
+from tests.first_edition.contract.interfaces import (
+    BARE,
+    BATCHED,
+    FIVE,
+    INTERFACES,
+    LEVELS,
+    PAPER,
+    REST,
+    SCENARIOS,
+    SHIELDED,
+    STEP,
+    Interface,
+    Turn,
+    actions,
+    initial_state,
+    line,
+    rows_of,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.first_edition.shields.MovingAtHorizon")
+each_interface = pytest.mark.parametrize("name", INTERFACES)
+each_bare = pytest.mark.parametrize("name", BARE)
+each_scenario = pytest.mark.parametrize(
+    ("name", "scenario"),
+    [*((name, scenario) for name in BARE for scenario in SCENARIOS.values()), *((name, PAPER) for name in SHIELDED)],
+    ids=lambda value: value if isinstance(value, str) else value.name,
+)
+
+
+def make(name: str, scenario: Scenario = PAPER, **settings: Any) -> Interface:
+    return INTERFACES[name](scenario, rows_of(name), **settings)
+
+
+def play(interface: Interface, seed: int | None, steps: int = 160) -> Iterator[Turn]:
+    interface.reset(seed)
+    for action in actions(3, steps, interface.n):
+        yield interface.step(action)
+
+
+def bits(turns: Iterator[Turn] | list[Turn]) -> list[bytes]:
+    return [turn.bits() for turn in turns]
+
+
+@each_scenario
+def test_seed__repeats_whole_episodes_bit_for_bit_whatever_happened_before(name: str, scenario: Scenario) -> None:
+    first, used = list(play(make(name, scenario), 11)), make(name, scenario)
+    list(play(used, 99, steps=7))
+    assert bits(play(used, 11)) == bits(first) and sum(turn.ended.sum() for turn in first) >= 2 * rows_of(name) - 1
+
+
+@each_interface
+def test_seed__others_differ_and_without_one_the_stream_goes_on_or_is_fresh(name: str) -> None:
+    interface = make(name)
+    first, second = interface.reset(1), interface.reset()
+    starts = [first, second, interface.reset(2), make(name).reset(), make(name).reset()]
+    assert len({start.tobytes() for start in starts}) == 5
+    assert np.array_equal(interface.reset(1), first) and np.array_equal(interface.reset(), second)
+
+
+@each_scenario
+def test_observation__lies_in_its_finite_float32_space_at_every_step(name: str, scenario: Scenario) -> None:
+    interface = make(name, scenario)
+    assert np.isfinite(interface.space.low).all() and np.isfinite(interface.space.high).all()
+    seen = [interface.reset(5)]
+    for turn in play(interface, 5):
+        seen += [turn.observation, *(final[np.newaxis] for final in turn.final.values())]
+        assert np.isfinite(turn.reward).all() and len(turn.final) == turn.ended.sum()
+    assert {batch.dtype for batch in seen} == {interface.space.dtype} == {np.dtype(np.float32)}
+    assert all(np.isfinite(row).all() and row in interface.space for batch in seen for row in batch)
+
+
+@each_interface
+def test_arrays__what_was_returned_never_changes_and_what_was_given_is_left_alone(name: str) -> None:
+    untouched, abused = make(name), make(name)
+    kept: list[tuple[np.ndarray, np.ndarray]] = []
+    untouched.reset(5), abused.reset(5).fill(np.nan)
+    for given in actions(3, 120, abused.n):
+        action = given.copy()
+        expected, turn = untouched.step(given.copy()), abused.step(action)
+        assert turn.bits() == expected.bits() and np.array_equal(action, given)
+        kept += [(array, array.copy()) for array in expected.arrays()]
+        action.fill(np.nan)
+        for array in turn.arrays():
+            array.fill(True if array.dtype == np.bool_ else np.nan)
+    assert all(np.array_equal(array, copy_) for array, copy_ in kept)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
+@pytest.mark.parametrize("name", [name for name in BATCHED if name in BARE])
+def test_batch__its_worlds_differ_from_each_other_in_every_episode(name: str, scenario: Scenario) -> None:
+    interface = make(name, scenario)
+    starts = [row.tobytes() for row in interface.reset(5)]
+    for turn in play(interface, 5):
+        starts += [turn.observation[row].tobytes() for row in turn.final]
+    assert len(set(starts)) == len(starts) >= 2 * interface.n
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario", "driven", "ends"),
+    [
+        # From 0.5 s to the horizon at 0.95 s: four steps of 0.1 s and one of 0.05 s.
+        *((name, PAPER.replace(horizon_s=0.95), [0.3] * 15, "....c" * 3) for name in INTERFACES),
+        *((name, REST, [-1.0] * 20, ".........r" * 2) for name in INTERFACES),
+        *((name, REST.replace(horizon_s=1.5), [-1.0] * 10, ".........r") for name in INTERFACES),
+        # Driving from 1.45 s on: the vehicle rests for an instant only, and the horizon ends the episode.
+        *((name, REST.replace(horizon_s=2.0), [-1.0] * 9 + [1.0] * 6, "." * 14 + "c") for name in BARE),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_end__is_terminated_where_all_rest_and_else_cut_off_at_the_horizon(
+    name: str, scenario: Scenario, driven: list[float], ends: str
+) -> None:
+    interface, told = make(name, scenario), ""
+    interface.reset(0)
+    for value in driven:
+        turn = interface.step(np.full((interface.n, 1), value, np.float32))
+        assert (turn.terminated == turn.terminated[0]).all() and (turn.truncated == turn.truncated[0]).all()
+        told += {(False, False): ".", (True, False): "r", (False, True): "c"}[turn.terminated[0], turn.truncated[0]]
+    assert told == ends
+
+
+@each_scenario
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))], ids=["copy", "pickle"])
+def test_clone__in_mid_episode_goes_on_alike_and_apart(name: str, scenario: Scenario, clone: Any) -> None:
+    interface = make(name, scenario)
+    list(play(interface, 5, steps=10))
+    twin = copy.copy(interface)
+    twin.env = clone(interface.env)
+    twin_turns = bits([twin.step(action) for action in actions(8, 90, interface.n)])
+    assert bits([interface.step(action) for action in actions(8, 90, interface.n)]) == twin_turns
+
+
+def bits_here() -> list[list[bytes]]:
+    """Of each interface and scenario, for another process to compare."""
+    return [bits(play(make(name, scenario), 11)) for name in BARE for scenario in SCENARIOS.values()]
+
+
+@pytest.mark.slow
+def test_spawn__another_process_sees_the_same_bits() -> None:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        assert pool.apply(bits_here) == bits_here()
+
+
+@pytest.mark.parametrize(
+    ("scenario", "reward"),
+    [
+        *((scenario, reward) for scenario in SCENARIOS.values() for reward in ("harm", "total-harm", "paper")),
+        *((scenario, "harm") for scenario in LEVELS.values() if len(scenario.learners) == 1),
+        *((line(2).with_learners([learner]), "harm") for learner in (0, 1)),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value.name,
+)
+def test_interfaces__agree_on_every_episode(scenario: Scenario, reward: str) -> None:
+    runs = {name: list(play(BARE[name](scenario, 1, reward=reward), 7)) for name in BARE}
+    assert sum(turn.ended.sum() for turn in runs["single"]) >= 2
+    assert any(turn.reward[0] != 0.0 for turn in runs["single"]) or scenario not in SCENARIOS.values()
+    assert {name: bits(turns) for name, turns in runs.items()} == dict.fromkeys(BARE, bits(runs["single"]))
+
+
+def test_interfaces__agree_behind_the_shield_and_differ_from_the_bare_ones() -> None:
+    runs = {name: bits(play(STEP[name](PAPER, 1), 7)) for name in STEP}
+    assert runs == dict.fromkeys(STEP, runs["shielded single"])
+    assert bits(play(BARE["single"](PAPER, 1), 7)) != runs["shielded single"]
+
+
+NEWS = {"preset": "nominal", "link_latency_s": 0.6, "hears": "front", "sensing_s": [0.9, 0.9]}  # without chance
+
+
+@each_bare
+@pytest.mark.parametrize(
+    "scenario", [*SCENARIOS.values(), PAPER.replace(v2x=NEWS, objective="own", early_impacts="keep")]
+)
+def test_batch__row_k_is_the_world_alone(name: str, scenario: Scenario) -> None:
+    n, seed = 5, 7
+    worlds = scenario.sample(n, seed, channel="training").worlds
+    batch = BARE["vector"](scenario, n)
+    start, columns = batch.reset(seed), actions(3, 80, n)
+    turns = [batch.step(action) for action in columns]
+    for k in range(n):
+        alone = BARE[name](scenario, 1)
+        assert np.array_equal(alone.reset(options={"initial_state": initial_state(worlds, k)})[0], start[k])
+        for turn, action in zip(turns, columns, strict=True):
+            mine = alone.step(action[k : k + 1])
+            assert np.float32(mine.reward[0]) == np.float32(turn.reward[k])
+            assert (mine.terminated[0], mine.truncated[0]) == (turn.terminated[k], turn.truncated[k])
+            if mine.ended[0]:
+                assert np.array_equal(mine.final[0], turn.final[k]) and mine.harm[0] == turn.harm[k]
+                break
+            assert np.array_equal(mine.observation[0], turn.observation[k])
+        else:
+            pytest.fail("the episode did not end")
+
+
+def acts(value: Any, shape: tuple[int, ...] = (1,)) -> Callable[[Interface], Any]:
+    """A step in which the last world's learner does this."""
+
+    def step(interface: Interface) -> None:
+        given = np.zeros((interface.n, *shape), object)
+        given[-1] = value
+        interface.step(given)
+
+    return step
+
+
+def starts(state: Any) -> Callable[[Interface], Any]:
+    """A reset to this state."""
+
+    def reset(interface: Interface) -> None:  # Stable-Baselines3 keeps a seed until a reset succeeds
+        interface.reset(3 if not hasattr(interface.env, "reset_infos") else None, {"initial_state": state})
+
+    return reset
+
+
+REFUSED: list[tuple[Callable[[Interface], Any], str]] = [
+    *((acts(value), r"(nan|1\.001|-inf): must be from -1 \(full braking\) to 1") for value in (np.nan, 1.001, -np.inf)),
+    (acts("full"), r"'full'.* is not a number"),
+    (acts(0.5, (2,)), "shape"),
+    *((lambda given, seed=seed: given.reset(seed), "seed = .*must be None or a") for seed in (-1, 1.5, True, "1")),
+    *((starts(state), "initial_state") for state in ({"gaps_m": [7, -1]}, {"gap_m": 7}, {"speeds_mps": [1]}, [7], 0)),
+    (starts({"gaps_m": 3, "speeds_mps": 20, "braking_capacity_mps2": 4}), "constant:5"),  # of the script of Vehicle 3
+]
+
+
+# Everything is refused in one interface, and one thing in each of the others.
+OTHERS = [name for name in INTERFACES if name != "vector"]
+ASKED = [*(("vector", *each) for each in REFUSED), *((name, *REFUSED[k]) for k, name in enumerate(OTHERS))]
+
+
+@pytest.mark.parametrize(("name", "ask", "message"), ASKED, ids=range(len(ASKED)))
+def test_refusal__changes_nothing(name: str, ask: Callable[[Interface], Any], message: str) -> None:
+    roles = {"vehicle_1": "full_brake", "vehicle_2": "learner", "vehicle_3": "constant:5"}
+    interface, untouched = (make(name, PAPER.replace(roles=roles)) for _ in range(2))
+    list(play(interface, 5, steps=10)), list(play(untouched, 5, steps=10))
+    with pytest.raises(InvalidInput, match=message):
+        ask(interface)
+    assert all(interface.step(action).bits() == untouched.step(action).bits() for action in actions(8, 5, interface.n))
+    assert np.array_equal(interface.reset(), untouched.reset())
+
+
+@pytest.mark.parametrize("name", [name for name in INTERFACES if not name.endswith("in turn")])  # PettingZoo's own
+def test_step__before_the_first_reset_is_refused(name: str) -> None:
+    interface = make(name)
+    with pytest.raises(InvalidInput, match="step: no episode is running; call reset first"):
+        interface.step(np.zeros((interface.n, 1), np.float32))
+
+
+@each_bare
+def test_action__as_a_number_or_one_float32_step_beyond_1_is_the_same(name: str) -> None:
+    interfaces = [make(name) for _ in range(3)]
+    beyond = np.nextafter(np.float32(1), np.float32(2))
+    for interface in interfaces:
+        interface.reset(3)
+    for value, other in ((-0.5, -0.5), (1.0, beyond)):
+        column = np.full((interfaces[0].n, 1), value, np.float32)
+        given = (column, column.reshape(-1), np.full_like(column, other))
+        turns = [interface.step(action) for interface, action in zip(interfaces, given, strict=True)]
+        assert bits(turns) == [turns[0].bits()] * 3
+
+
+@each_interface
+def test_options__an_unknown_one_warns_and_is_ignored(name: str) -> None:
+    interface = make(name)
+    expected = interface.reset(5)
+    with pytest.warns(
+        UnknownResetOption, match="unknown keys colour, which are ignored; known keys: initial_state"
+    ) as seen:
+        given = interface.reset(5, {"colour": "red"})
+    assert len(seen) == 1 and np.array_equal(given, expected)
+
+
+@each_interface
+def test_options__an_initial_state_serves_one_episode_in_every_world(name: str) -> None:
+    interface = make(name)
+    state = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
+    start = interface.reset(5, {"initial_state": state})
+    assert (start == start[0]).all() and start[0, 0] == np.float32(18.0 / 20.0)  # the own speed
+    assert np.array_equal(start, interface.reset(6, {"initial_state": state}))
+    assert not np.array_equal(interface.reset(), start)
+
+
+@pytest.mark.parametrize("name", [name for name in INTERFACES if not name.endswith("sb3")])  # whose rows do not know it
+def test_options__a_listed_world_and_those_that_follow_serve_one_episode(name: str) -> None:
+    interface, stream = make(name), make(name)
+    start = interface.reset(5, {"listed_world": {"seed": 7, "number": np.int64(40)}})
+    worlds, alone = PAPER.sample(interface.n, 7, first=40).worlds, BARE["single"](PAPER, 1)
+    for k, row in enumerate(start):
+        assert np.array_equal(alone.reset(options={"initial_state": initial_state(worlds, k)})[0], row)
+    assert np.array_equal(interface.reset(), stream.reset(5))
+
+
+@each_bare
+@pytest.mark.parametrize("learner", ["vehicle_1", "vehicle_3", "vehicle_5"])
+def test_learners__any_vehicle_may_be_the_one(name: str, learner: str) -> None:
+    five = FIVE.replace(obstacle_gap_m=30) if learner == "vehicle_1" else FIVE
+    given = [learner], [int(learner[-1]) - 1], ["vehicle_4"]
+    runs = [bits(play(make(name, five, learners=learners), 5, steps=30)) for learners in given]
+    assert runs[0] == runs[1] != runs[2]
+
+
+DRAWN = load_scenario(
+    {"name": "both", "mixture": [{"scenario": "realistic-mixed"}, {"scenario": "realistic-truck"}]}
+)  # types in one of the two
+
+
+def drawn(seed: int, world: int) -> dict[str, Any]:
+    """World ``world`` as its sample says."""
+    sample = DRAWN.sample(1, seed, first=world, channel="training")
+    kinds = {name: column[0].item() for name, column in sample.kinds.items()}
+    assert {"scenario", "vehicle_2_type"} <= set(kinds)
+    named = {"world_seed": seed, "world": world}
+    return named | kinds | {name: column[0].item() for name, column in QUANTITY.columns(sample.worlds).items()}
+
+
+@each_interface
+def test_describe_world__tells_the_numbers_of_its_sample_for_every_world_that_has_begun(name: str) -> None:
+    interface = make(name, DRAWN)
+    interface.reset(3)
+    assert interface.drawn() == [drawn(3, world) for world in range(interface.n)]
+    for _ in range(60):
+        interface.step(np.full((interface.n, 1), -1.0, np.float32))
+    told = interface.drawn()
+    assert told == [drawn(3, world["world"]) for world in told] and json.dumps(told)
+    assert min(world["world"] for world in told) > 0
