@@ -235,7 +235,8 @@ def _split(spec: object) -> tuple[str, list[str]]:
     while True:
         before, plus, last = core.rpartition("+")
         path = core.partition("@")[2] or (core.partition(":")[0] if ".py:" in core else "")
-        if not plus or os.path.lexists(os.path.expanduser(path)):
+        inside = "+" in path and "+" not in core.partition(path)[2]  # whether the last + is in the path
+        if not plus or (inside and os.path.lexists(os.path.expanduser(path))):
             return core, wrappers
         word = last.partition(":")[0]
         if word not in WRAPPERS:

@@ -201,11 +201,12 @@ def scenario_new(
 def scenario_parts(as_json: JsonOption = False) -> None:
     """List the names that scenarios and recipes can use.
 
-    Lists features of observations, V2X presets, objectives, terms of rewards, training algorithms and recipes.
+    Lists features of observations, V2X presets, objectives, terms of rewards, measures, training algorithms and recipes.
     """
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
+    from ethbrake_marl.evaluation.named_measures import MEASURES
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
     from ethbrake_marl.worlds.channel import CHANNELS
 
@@ -216,6 +217,7 @@ def scenario_parts(as_json: JsonOption = False) -> None:
         "V2X presets": [*CHANNELS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Terms": [*BUILT_IN, *TERMS],
+        "Measures": [*MEASURES],
         "Algorithms": [*ALGORITHMS],
         "Recipes": [*usable_recipes()],
     }
