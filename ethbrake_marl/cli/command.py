@@ -62,16 +62,15 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing fil
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on stdout as JSON.")]
 
 
-def schema_option(module: str, model: str, kind: str) -> Any:
+def schema_option(module: str, function: str, kind: str) -> Any:
     """Return the type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
 
-    The method ``json_schema`` of the class ``model`` returns the schema; its ``module`` is imported only when the
-    option is used. ``kind`` names the kind of file in the help text.
+    The ``function`` returns the schema; its ``module`` is imported only when the option is used. ``kind`` names the kind of file in the help text.
     """
 
     def show_schema(asked: bool) -> None:
         if asked:
-            Out().print_json(getattr(import_module(module), model).json_schema())
+            Out().print_json(getattr(import_module(module), function)())
             raise typer.Exit
 
     text = f"Print the JSON Schema of {kind} files, and exit."

@@ -59,7 +59,7 @@ def train_command(
             help="With --resume: continue even if the run used other package versions; numbers may differ.",
         ),
     ] = False,
-    schema: schema_option("ethbrake_marl.training.recipe", "TrainingRecipe", "recipe") = False,  # type: ignore[valid-type]  # built by a function
+    schema: schema_option("ethbrake_marl.training.recipe_file", "recipe_schema", "recipe") = False,  # type: ignore[valid-type]  # built by a function
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:

@@ -153,6 +153,8 @@ def evaluate(
             on_done(min(len(parts) * CHUNK, n))
     learners = game.rules.learners.tolist()
     columns = columns_of(drawn)
+    if (columns["world"] < 0).all():  # the user has made these worlds
+        columns["world"] = np.arange(n)
     return Result(
         {team: _joined([part[team] for part in parts]) for team in agents},
         {**columns, "hidden": hidden_from(alert, learners)},
