@@ -81,4 +81,6 @@ def evaluate(
         given = loaded.draw(int(episodes), seed)
     teams = teams_of(agents, loaded, harm_count=harm_count)
     about["agent_settings"] = {"harm_count": harm_count}
-    return evaluate_teams(given, teams, game, measures_called(measures or ()), jobs, ray=ray, about=about, on_done=on_done)
+    return evaluate_teams(
+        given, teams, game, measures_called(measures or ()), jobs, ray=ray, about=about, on_done=on_done
+    )

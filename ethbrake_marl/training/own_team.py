@@ -19,6 +19,7 @@ from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.algorithm import ACTIVATIONS
+from ethbrake_marl.training.run import RunFolder
 
 
 def save_team(
@@ -41,6 +42,8 @@ def save_team(
     views = [base.game.views[body] for body in base.game.rules.learners]
     if shared and len(set(views)) > 1:
         raise InvalidInput(f"save_team: {', '.join(learners)} share an actor, but observe different features")
+    scheme = "shared" if shared else "independent" if len(learners) > 1 else "single"
+    drivers = {name: f"policy/{name}" if scheme == "independent" else "policy" for name in learners}
     for k, name in enumerate(learners[:1] if shared else learners):
         network, tensors = _perceptron(name, actors[name])
         policy = Policy.make(
@@ -54,7 +57,8 @@ def save_team(
             seeds={"training": seed},
             steps=steps,
         )
-        policy.save(Path(folder) / "policy" if shared or len(learners) == 1 else Path(folder) / "policy" / name)
+        policy.save(Path(folder) / drivers[name])
+    RunFolder(folder).write_team(scheme, base.scenario.vehicles, drivers)
 
 
 def _perceptron(name: str, actor: Any) -> tuple[NetworkSpec, dict[str, Float32s]]:
