@@ -93,6 +93,11 @@ def test_programs__of_a_page_run_and_print_what_stands_below_them(
         assert capsys.readouterr().out == printed or not printed
 
 
+def test_codes_of_the_shield__stand_in_its_page() -> None:
+    page = (DOCS / "shield.md").read_text("utf-8")
+    assert [each.name for each in eb.ShieldReason if f"| {each.value} | `{each.name}` |" not in page] == []
+
+
 @pytest.mark.slow
 def test_programs_of_train__run_and_beat_full_braking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(
