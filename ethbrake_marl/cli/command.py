@@ -65,7 +65,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on s
 def schema_option(module: str, function: str, kind: str) -> Any:
     """Return the type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
 
-    The ``function`` returns the schema; its ``module`` is imported only when the option is used. ``kind`` names the kind of file in the help text.
+    The ``function`` of ``module``, which is imported only when the option is used, returns the schema. ``kind`` names
+    the kind of file in the help text.
     """
 
     def show_schema(asked: bool) -> None:

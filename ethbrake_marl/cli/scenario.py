@@ -181,7 +181,8 @@ def scenario_new(
 ) -> None:
     """Write a new scenario file with comments.
 
-    The file NAME.yaml has every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the same folder.
+    The file NAME.yaml has every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the
+    same folder.
     """
     from ethbrake_marl.worlds.catalogue import load_scenario
     from ethbrake_marl.worlds.explain import new_scenario_text
@@ -201,7 +202,7 @@ def scenario_new(
 def scenario_parts(as_json: JsonOption = False) -> None:
     """List the names that scenarios and recipes can use.
 
-    Lists features of observations, V2X presets, objectives, terms of rewards, measures, training algorithms and recipes.
+    Lists features of observations, V2X presets, objectives, terms of rewards, measures, algorithms and recipes.
     """
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES

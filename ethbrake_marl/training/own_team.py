@@ -63,7 +63,7 @@ def save_team(
 
 def _perceptron(name: str, actor: Any) -> tuple[NetworkSpec, dict[str, Float32s]]:
     mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
-    layers = list(mean) if isinstance(mean, nn.Sequential) else []
+    layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
     linear, between = layers[::2], {type(layer) for layer in layers[1::2]}
     known = {kind: activation for activation, kind in ACTIVATIONS.items()}
     is_perceptron = len(linear) > 1 and all(isinstance(layer, nn.Linear) for layer in linear)

@@ -28,12 +28,12 @@ A module imports only from its own folder or from folders that this page lists b
 | How does one step of an episode go? | `episode/game.py`, `Game.step`; `episode/step.py`; [the game](../game.md) |
 | What does one impact cost? | `motion/impact.py`; who bears it: `episode/state.py`, `split_harm` |
 | What would happen? | `episode/play.py`: `price` (a plan), `hold` (constant commands) |
-| Where does a number in a table come from? | `evaluation/`: `measures.py` (columns), `statistics.py` (intervals), `summary.py` (tables) |
+| Where does a number in a table come from? | `evaluation/`: `measures.py`, `statistics.py`, `summary.py` |
 | Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/decision.py` |
 | What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
 | Which agents are there? | `pyproject.toml`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
 | Who lets agents drive? | `agents/drive.py`: `play`, `drive` |
-| What can a scenario file say? | `worlds/scenario.py` (keys), `worlds/rules.py` (values); [scenarios](../scenarios.md) |
+| What can a scenario file say? | `worlds/`: `scenario.py`, `rules.py`; [scenarios](../scenarios.md) |
 | How does a training run? | `training/train.py`, `train`; algorithms in `ppo.py` and `sac.py` |
 | How do I add a column to an evaluation? | [a measure](../extend.md#a-measure) |
 """
