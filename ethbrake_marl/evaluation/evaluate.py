@@ -152,7 +152,7 @@ def evaluate(
         if on_done is not None:
             on_done(min(len(parts) * CHUNK, n))
     learners = game.rules.learners.tolist()
-    columns = columns_of(drawn)
+    columns: Columns = {**columns_of(drawn)}
     if (columns["world"] < 0).all():  # the user has made these worlds
         columns["world"] = np.arange(n)
     return Result(
