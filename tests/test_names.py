@@ -167,6 +167,16 @@ def test_an_argument__may_be_a_line_of_its_own():
     assert make_agent("coast+around:other", scenario=PAPER).drivers == {}
 
 
+def test_a_function_of_a_file__takes_an_argument_and_wrappers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    register_shield("around", around)
+    text = "import ethbrake_marl as eb\ndef make(argument, settings):\n    return eb.make_agent('constant:' + argument)"
+    for name in ("mine.py", "a+b.py"):
+        (tmp_path / name).write_text(text)
+        team = make_agent(f"{name}:make:3+around", scenario=PAPER)
+        assert team.name == f"{name}:make:3+around" and team.drivers[2].name == "constant:3"
+
+
 def test_a_path__keeps_its_plus_and_commas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a+around,b").mkdir()

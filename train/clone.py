@@ -25,8 +25,8 @@ from torch import Tensor, nn
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec
-from ethbrake_marl.first_edition.policies.policy import Policy
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
 
 HIDDEN = (128, 128)
 EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3
@@ -78,7 +78,7 @@ def clone(seen: Tensor, actions: Tensor, seed: int) -> nn.Sequential:
 
 def as_policy(network: nn.Sequential, metadata: dict[str, Any], seed: int) -> Policy:
     """Return the network as a policy, with the scenario and the seeds of its dataset."""
-    scenario, spec = eb.Scenario(**metadata["scenario"]), eb.choose_observation(metadata["observation"])
+    scenario, view = eb.Scenario(**metadata["scenario"]), eb.View(metadata["observation"])
     linear = [layer for layer in network if isinstance(layer, nn.Linear)]
     names = [*(f"policy.{k}" for k in range(len(HIDDEN))), "policy.output"]
     tensors: dict[str, NDArray[np.float32]] = {"policy.log_std": np.zeros(1, np.float32)}
@@ -89,16 +89,16 @@ def as_policy(network: nn.Sequential, metadata: dict[str, Any], seed: int) -> Po
         tensors,
         algorithm="clone",
         network=NetworkSpec(
-            observation_size=spec.size,
+            observation_size=len(view.names),
             action_size=1,
             policy_hidden=HIDDEN,
             value_hidden=(),
             activation="relu",
             output="clip",
         ),
-        observation=spec,
+        observation=view,
         learners=tuple(metadata["learners"]),
-        scenario=scenario.model_dump(mode="json"),
+        scenario=scenario.content(),
         reward=metadata["reward"],
         seeds={"training": seed, "list": metadata["seed"]},
         steps=0,

@@ -23,7 +23,7 @@ from torch.distributions import Normal
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, check_whole_number
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.first_edition.training.own_team import save_team
+from ethbrake_marl.training.own_team import save_team
 
 # 1. Settings. Each is also an option of the command.
 

@@ -59,23 +59,24 @@ class Recurrent(nn.Module):
 def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespace) -> Recurrent:
     """Return the trained network. Print its harm every ten updates."""
     torch.manual_seed(args.seed)
-    engine = eb.make_engine(scenario, args.worlds, observation=observation, seed=args.seed)
-    learners, shape = list(engine.learners), (engine.n, len(engine.learners))
-    network = Recurrent(engine.observation.size, not args.memoryless)
+    _, game = eb.open_game(scenario, observation=observation)
+    learners = game.rules.learners
+    n, shape = args.worlds, (args.worlds, len(learners))
+    network = Recurrent(len(eb.View(observation).names), not args.memoryless)
     optimiser = torch.optim.Adam(network.parameters(), lr=RATE)
     for update in range(args.updates):
         optimiser.param_groups[0]["lr"] = RATE * (1 - update / args.updates)
-        engine.reset()
-        memory, chosen, gained = torch.zeros(engine.n * len(learners), HIDDEN), [], []
-        while not engine.ended.all():
-            running = torch.from_numpy(~engine.ended)[:, None]
-            seen = torch.from_numpy(engine.observe_all()).flatten(0, 1)
+        state = game.start(n, args.seed, first=n * update)
+        memory, chosen, gained = torch.zeros(n * len(learners), HIDDEN), [], []
+        while not state.ended.all():
+            running = torch.from_numpy(~state.ended)[:, None]
+            seen = torch.from_numpy(game.observe_alike(state, learners)).flatten(0, 1)
             mean, memory = network(seen, memory)
             policy: Any = torch.distributions.Normal(mean.view(shape), NOISE)  # torch's distributions are untyped
             actions = policy.sample()
-            step = engine.step(actions.clamp(-1, 1).numpy())
+            state, step = game.step(state, actions.clamp(-1, 1).numpy())
             chosen.append(policy.log_prob(actions) * running)
-            gained.append(torch.from_numpy(step.reward[:, learners]))
+            gained.append(torch.from_numpy(step.reward[:, learners - 1]))
         to_go = torch.stack(gained).flip(0).cumsum(0).flip(0)
         advantage = (to_go - to_go.mean(1, keepdim=True)) / (to_go.std() + 1e-8)
         loss: Any = -(torch.stack(chosen) * advantage).sum() / sum(shape)
@@ -84,7 +85,7 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
         nn.utils.clip_grad_norm_(network.parameters(), 0.5)
         optimiser.step()
         if update % 10 == 9:
-            print(f"update {update + 1}: harm {engine.ledger.world_harm('first').mean():.2f} m2/s2", flush=True)
+            print(f"update {update + 1}: harm {state.harm('first').mean():.2f} m2/s2", flush=True)
     return network
 
 

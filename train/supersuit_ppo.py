@@ -24,11 +24,10 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
-from ethbrake_marl.first_edition.game.rewards import reward_params
-from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec
-from ethbrake_marl.first_edition.policies.policy import Policy
-from ethbrake_marl.first_edition.training.networks import tensors_of
-from ethbrake_marl.first_edition.training.training import Training
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.ppo import Ppo
+from ethbrake_marl.training.training import Training
 
 # 1. What to train: as in train/ppo.yaml, with smaller networks.
 
@@ -115,7 +114,7 @@ class SeededAndTruncated(VecEnvWrapper):
 
 def make_worlds(scenario: eb.Scenario) -> SeededAndTruncated:
     """Return `COPIES` worlds of a scenario as rows for Stable-Baselines3: row k * L + l is learner l of L in copy k."""
-    names = [scenario.vehicle_names[i] for i in scenario.learners]
+    names = [scenario.vehicle_names[body - 1] for body in scenario.learners]
     learners = LearnersOnly(eb.parallel_env(scenario=scenario, reward=REWARD), names)
     rows = supersuit.pettingzoo_env_to_vec_env_v1(learners)
     # num_cpus=0: all copies in this process (trap: with more processes, SuperSuit uses seeds twice).
@@ -155,9 +154,10 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
         device="cpu",
     )
     model.learn(steps)
-    observation = eb.parallel_env(scenario=scenario).engine.observation
+    scenario, game = eb.open_game(scenario, reward=REWARD)
+    view = game.views[scenario.learners[0]]
     network = NetworkSpec(
-        observation_size=observation.size,
+        observation_size=len(view.names),
         action_size=1,
         policy_hidden=tuple(HIDDEN),
         value_hidden=tuple(HIDDEN),
@@ -165,13 +165,13 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
         output="clip",
     )
     return Policy.make(
-        tensors_of(model.policy, network),
+        Ppo().tensors(model.policy, network),
         algorithm="ppo",
         network=network,
-        observation=observation,
-        learners=tuple(scenario.vehicle_names[i] for i in scenario.learners),
-        scenario=scenario.model_dump(mode="json"),
-        reward=reward_params(REWARD).model_dump(mode="json"),
+        observation=view,
+        learners=tuple(scenario.vehicle_names[body - 1] for body in scenario.learners),
+        scenario=scenario.content(),
+        reward=game.rewarding.params.model_dump(mode="json"),
         seeds={"training": seed},
         steps=model.num_timesteps,
     )

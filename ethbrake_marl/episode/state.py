@@ -19,6 +19,7 @@ from ethbrake_marl.motion.layout import (
     HIT,
     LATENCY,
     MASS,
+    RESTITUTION,
     SPEED,
     TOTAL,
     Bools,
@@ -166,6 +167,11 @@ class State(NamedTuple):
         return self.car[:, MASS, 1:]
 
     @property
+    def restitution(self) -> Floats:
+        """Coefficient of restitution of all impacts of the world, [n]."""
+        return self.car[:, RESTITUTION, 0]
+
+    @property
     def latency_s(self) -> Floats:
         """Time from the alert until commands take effect, [n, N] s."""
         return self.car[:, LATENCY, 1:]
@@ -180,6 +186,10 @@ class State(NamedTuple):
         out = np.empty(self.n)
         _harm(self.line, count == "total", out)
         return out
+
+    def pair_harm(self, count: str = "first") -> Floats:
+        """Return the harm of each pair of neighbours so far, [n, N - 1] m2/s2."""
+        return self.line[:, TOTAL if count == "total" else FIRST, 1:-1]
 
     def borne_harm(self, count: str = "first") -> Floats:
         """Return the harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""

@@ -146,7 +146,9 @@ def evaluate(
         if on_done is not None:
             on_done(min(len(parts) * CHUNK, n))
     learners = game.rules.learners.tolist()
-    columns = columns_of(drawn)
+    columns: Columns = {**columns_of(drawn)}
+    if (columns["world"] < 0).all():  # the user has made these worlds
+        columns["world"] = np.arange(n)
     return Result(
         {team: _joined([part[team] for part in parts]) for team in agents},
         {**columns, "hidden": hidden_from(alert, learners)},

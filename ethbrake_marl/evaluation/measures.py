@@ -12,9 +12,11 @@ of a state                               what it is (``episode.state.State``)
 ``obstacle_gap_m``                       [n] m; infinite without an obstacle
 ``harm("first")``, ``harm("total")``     [n] m2/s2 of the line so far: first impact of each pair, all impacts
 ``borne_harm(...)``                      [n, N] m2/s2, what each vehicle bears of it
+``pair_harm(...)``                       [n, N - 1] m2/s2, of each pair
 ``collided``, ``pair_hit``               [n]; [n, N - 1] whether there was an impact
 ``commands_mps2``, ``forces_mps2``       [n, N] m/s2: last commands; what brakes and engines cause
 ``mass_t``, ``latency_s``                [n, N] t; s
+``restitution``                          [n] of all impacts
 ``braking_capacity_mps2``, ``driving_``  [n, N] m/s2 on this road
 ``time_s``, ``steps``, ``ended``         [n] s since the alert; steps taken; whether the episode has ended
 ``memories``                             body -> memory of its agent; ``"shield"`` -> memory of the shield

@@ -58,16 +58,16 @@ class RunFolder:
         with self.held() if replace and is_run else nullcontext(), new_folder(path, replace=replace) as partial:
             new = RunFolder(partial)
             write_json(new.config, config)
-            new.write_team(training)
+            new.write_team(training.scheme, training.scenario.vehicles, training.drivers)
             new.write_status("running")
 
     def held(self) -> Any:
         """Return the context in which no other process can train here. It raises ``InvalidInput`` if one does."""
         return hold_lock(self.lock, "another process is training in this folder")
 
-    def write_team(self, training: Training) -> None:
-        """Write ``team.json``."""
-        team = {"scheme": training.scheme, "vehicles": training.scenario.vehicles, "drivers": training.drivers}
+    def write_team(self, scheme: str, vehicles: int, drivers: Mapping[str, str]) -> None:
+        """Write ``team.json``; ``drivers`` has the folder of each learner's policy."""
+        team = {"scheme": scheme, "vehicles": vehicles, "drivers": drivers}
         write_json(self.team, {"format": "ethbrake-team", "format_version": 1, **team})
 
     def write_status(self, status: Status, **more: Any) -> None:

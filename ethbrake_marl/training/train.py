@@ -159,7 +159,7 @@ def resume(
         if saved is not None:
             _check_same(folder, training, saved, other_versions)
         folder.clear()
-        folder.write_team(training)  # it may be damaged
+        folder.write_team(training.scheme, training.scenario.vehicles, training.drivers)  # it may be damaged
         updates.notes += [f"deleted a damaged checkpoint: {reason}" for reason in damaged]
         return _learn(updates, saved)
 

@@ -21,19 +21,21 @@ A module imports only from its own folder or from folders that this page lists b
 `make lint` checks this. The following command makes this page from the code:
 `python -m tests.docs.layout`.
 
-## Where to look (paths in `first_edition/`)
+## Where to look
 
 | question | file |
 |---|---|
-| How does one step of an episode go? | `engine/engine.py`, `step`; [the game](../game.md) |
-| What does one impact cost? | `physics/impact.py`, `record_impacts`; summed in `game/harm.py` |
-| Where does a number in a table come from? | `evaluation/`: `measure_sets.py` (columns), `outcome.py`, `rollout.py` |
-| Why did the shield replace an action? | `shields/certify.py`, `decide_world`; the proof is in `shields/step.py` |
-| What is a reward term? | `game/`: `step_outcome.py` (formulas), `rewards.py` (weights), `measures.py` (names) |
-| Which agents are there? | `pyproject.toml`, `first_edition/agents/scripts.py`; [add one](../extend.md#an-agent) |
-| What can a scenario file say? | `scenario/declared.py` (keys), `fields.py` (values); [scenarios](../scenarios.md) |
-| How does a training run? | `training/session.py`, `train`; algorithms in `ppo.py` and `sac.py` |
-| How do I add a column to every evaluation? | [a set of measures](../extend.md#a-set-of-measures) |
+| How does one step of an episode go? | `episode/game.py`, `Game.step`; `episode/step.py`; [the game](../game.md) |
+| What does one impact cost? | `motion/impact.py`; who bears it: `episode/state.py`, `split_harm` |
+| What would happen? | `episode/play.py`: `price` (a plan), `hold` (constant commands) |
+| Where does a number in a table come from? | `evaluation/`: `measures.py`, `statistics.py`, `summary.py` |
+| Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/decision.py` |
+| What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
+| Which agents are there? | `pyproject.toml`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
+| Who lets agents drive? | `agents/drive.py`: `play`, `drive` |
+| What can a scenario file say? | `worlds/`: `scenario.py`, `rules.py`; [scenarios](../scenarios.md) |
+| How does a training run? | `training/train.py`, `train`; algorithms in `ppo.py` and `sac.py` |
+| How do I add a column to an evaluation? | [a measure](../extend.md#a-measure) |
 """
 END = """
 The folder `scenarios/` contains one YAML file for each scenario, and the folder `train/` one YAML

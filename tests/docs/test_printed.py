@@ -13,8 +13,10 @@ import yaml
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario, new_scenario_text
+from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
+from ethbrake_marl.training.recipe_file import new_recipe_text
+from ethbrake_marl.worlds.explain import new_scenario_text
 from tests.docs.printed import BLOCK, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load
 from tests.programmes.libraries import harm_of_programs
@@ -69,7 +71,10 @@ def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: 
     assert missing_figures(table, printed) == missing
 
 
-PROGRAM_PAGES = ("environments", pytest.param("../README", marks=pytest.mark.slow))
+PROGRAM_PAGES = (
+    *("cooperation", "environments", "evaluate", "shield", "reference/README"),
+    pytest.param("../README", marks=pytest.mark.slow),
+)
 
 
 PROGRAM = re.compile(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", re.DOTALL)
@@ -86,6 +91,11 @@ def test_programs__of_a_page_run_and_print_what_stands_below_them(
     for code, printed in programs:
         exec(compile(code, f"{page}.md", "exec"), names)
         assert capsys.readouterr().out == printed or not printed
+
+
+def test_codes_of_the_shield__stand_in_its_page() -> None:
+    page = (DOCS / "shield.md").read_text("utf-8")
+    assert [each.name for each in eb.ShieldReason if f"| {each.value} | `{each.name}` |" not in page] == []
 
 
 @pytest.mark.slow
@@ -149,7 +159,7 @@ def test_version__is_the_same_wherever_it_stands() -> None:
     ("command", "file", "template"),
     [
         ("scenario schema", "scenarios/scenario", lambda: new_scenario_text("mine")),
-        ("train --schema", "train/recipe", lambda: eb.load_recipe("ppo").new_text("mine")),
+        ("train --schema", "train/recipe", lambda: new_recipe_text("mine", eb.load_recipe("ppo"))),
     ],
 )
 def test_schema__that_ships_is_printed_by_the_command_and_named_by_templates(

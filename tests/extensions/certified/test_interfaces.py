@@ -1,13 +1,11 @@
 """Every interface in the modes of this extension: what the core's tests ask of its own modes."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl.first_edition as eb
-from ethbrake_marl.extensions.certified.guards import RobustMode
 from ethbrake_marl.extensions.certified.robust_step import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.first_edition.agents.driving import episode_engine
@@ -34,11 +32,6 @@ def test_infos__of_the_first_moment_and_of_the_last_belong_to_their_episode(inte
     code, options = MODES[mode]
     for first, last in belonging(interface, code, options):
         assert first["shield_reason"] == eb.ShieldReason.NO_DECISION != last["shield_reason"]
-
-
-def test_codes__are_those_of_the_documented_table() -> None:
-    table = (Path(__file__).parents[3] / "docs" / "shield.md").read_text("utf-8")
-    assert [f"{mode.value} `{mode.name}`" in table for mode in RobustMode] == [True]
 
 
 @pytest.mark.parametrize("interface", [*wrappers.MAKERS, eb.shield])

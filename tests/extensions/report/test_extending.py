@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+import ethbrake_marl as second
 import ethbrake_marl.first_edition as eb
 from ethbrake_marl.cli.app import app, run_command
 
@@ -47,12 +48,12 @@ def test_page__its_code_runs_from_the_top_down(
     code = "\n".join(re.findall("```python\n(.*?)```", PAGE, re.DOTALL))
     names: dict[str, Any] = {"__name__": "my_file"}
     exec(compile(code, "extend.md", "exec"), names)
-    assert names["status"] == 0 and (names["harm"] <= names["bounded"].predicted_harm).all()
-    assert "6.08 7.43 0\n" in capsys.readouterr().out
+    assert names["status"] == 0
+    assert "6.31\n" in capsys.readouterr().out
     assert run_command(["scenario", "parts"]) == 0
     told = capsys.readouterr().out
     assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient", "absorbed"))
-    policy = eb.load_policy(tmp_path / "runs" / "again")
+    policy = second.load_policy(tmp_path / "runs" / "again")
     assert policy.manifest.algorithm == "patient" and "comfort" in policy.manifest.reward["terms"]
     assert policy.manifest.observation.features[-1] == "rear_1.mass_ratio"
     assert (tmp_path / "runs" / "again" / "harm.png").stat().st_size > 1000

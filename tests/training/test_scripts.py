@@ -1,19 +1,19 @@
-"""The scripts below train/: IPPO and MAPPO in one file each, SuperSuit with PPO, and a clone of a dataset."""
+"""The programs in train/: IPPO and MAPPO in one file each, a GRU, SuperSuit with PPO; and teams of one's own."""
 
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-import ethbrake_marl.first_edition as eb
-from ethbrake_marl.first_edition.policies.bundle import load_policy
-from ethbrake_marl.first_edition.training.own_team import save_team
-from ethbrake_marl.first_edition.training.team import load_team
+import ethbrake_marl as eb
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.bundle import load_drivers, load_policy
+from ethbrake_marl.training.own_team import save_team
 from tests.docs.site import load
-from tests.first_edition.learning.tiny import harm_beside_full_braking
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
 PAIR = eb.load_scenario("cooperation-3-pair")
@@ -52,15 +52,14 @@ def test_single_file__leaves_a_team_that_evaluates_and_is_the_same_twice(
     for folder, seed in (("one", 1), ("again", 1), ("other", 2)):
         module.train(module.Settings(scenario=name, seed=seed, **FEW), tmp_path / folder)
     assert "decisions: mean harm of an episode" in capsys.readouterr().out
-    teams = [load_team(tmp_path / folder, line) for folder in ("one", "again", "other")]
-    assert sorted(teams[0].drivers) == list(line.learners)
-    for vehicle in line.learners:
-        one, again, other = (team.drivers[vehicle].policy for team in teams)
+    names = [f"vehicle_{body}" for body in line.learners]
+    for vehicle in names:
+        place = "policy" if len(names) == 1 else f"policy/{vehicle}"
+        one, again, other = (load_policy(tmp_path / folder / place) for folder in ("one", "again", "other"))
         assert one.manifest == again.manifest and one.manifest.weights_sha256 != other.manifest.weights_sha256
-        assert one.manifest.learners == (line.vehicle_names[vehicle],) and one.manifest.reward["harm"] == 0.05
-    agents = {each: eb.make_agent(each, scenario=line) for each in ("full_brake", f"team@{tmp_path / 'one'}")}
-    found = eb.evaluate(line.sample(20, 7), agents, scenario=line)
-    assert all(np.isfinite(found.outcome(each).first_impact_harm).all() for each in agents)
+        assert one.manifest.learners == (vehicle,) and one.manifest.reward["harm"] == 0.05
+    result = eb.evaluate(line, {"braking": "full_brake", "mine": f"team@{tmp_path / 'one'}"}, episodes=20)
+    assert (result["mine"]["first_impact_harm"] != result["braking"]["first_impact_harm"]).any()
 
 
 @SINGLE_FILES
@@ -86,14 +85,16 @@ def test_single_file__advantages_by_hand(script: str) -> None:
 def test_single_file__learns_to_beat_full_braking(script: str, tmp_path: Path) -> None:
     module = load(f"../../train/{script}")
     module.train(module.Settings(steps=500_000), tmp_path)
-    assert harm_beside_full_braking(f"team@{tmp_path}") < 0.6
+    result = eb.evaluate(PAIR, {"braking": "full_brake", "mine": f"team@{tmp_path}"}, episodes=1000)
+    braking, mine = (result[name]["first_impact_harm"].mean() for name in ("braking", "mine"))
+    assert mine < 0.6 * braking
 
 
 class OwnActor:
     """One hidden layer, whose mean is often out of [-1, 1]."""
 
     def __init__(self, between: torch.nn.Module) -> None:
-        features = eb.observation_for(PAIR).size
+        features = len(eb.View().names)
         self.mean = torch.nn.Sequential(torch.nn.Linear(features, 4), between, torch.nn.Linear(4, 1))
         torch.nn.init.normal_(self.mean[-1].weight, std=30.0)
         self.log_std = torch.nn.Parameter(torch.full((1,), -0.5))
@@ -114,4 +115,38 @@ def test_save_team__acts_as_the_actors_do(between: torch.nn.Module, shared: bool
         assert np.abs(theirs).max() == 1.0 and policy.tensors["policy.log_std"] == np.float32(-0.5)
         assert policy.manifest.learners == (tuple(actors) if shared else (name,))
         assert (policy.manifest.seeds, policy.manifest.steps) == ({"training": 3}, 5)
-    assert sorted(load_team(tmp_path, PAIR).drivers) == [1, 2]
+    if not shared:
+        assert sorted(load_drivers(tmp_path / "policy")) == ["vehicle_2", "vehicle_3"]
+    result = eb.evaluate(
+        PAIR, {"saved": f"team@{tmp_path}", "mine": {n: agent_of(a) for n, a in actors.items()}}, episodes=5
+    )
+    np.testing.assert_allclose(result["saved"]["total_harm"], result["mine"]["total_harm"], rtol=1e-4)
+
+
+def agent_of(actor: OwnActor) -> eb.Agent:
+    return eb.policy_agent(actor.mean, clip=True)
+
+
+@pytest.mark.parametrize(
+    ("actors", "message"),
+    [
+        (
+            {"vehicle_2": torch.nn.Linear(27, 1)},
+            r"actor of vehicle_2 = Linear: must have mean, .*policy_agent\(network\)",
+        ),
+        ({"vehicle_2": OwnActor(torch.nn.Sigmoid())}, "must have mean, an nn.Sequential of linear layers with ReLU"),
+        ({"vehicle_3": OwnActor(torch.nn.ReLU())}, "actors of vehicle_3; must be those of vehicle_2"),
+        ({}, "must be those of vehicle_2"),
+    ],
+)
+def test_save_team__names_what_an_actor_must_be(actors: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=message):
+        save_team(tmp_path, actors, eb.parallel_env("paper-random"), seed=0, steps=0)
+
+
+def test_recurrent__leaves_a_network_that_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    script, folder = load("../../train/recurrent"), tmp_path / "gru"
+    monkeypatch.setattr(sys, "argv", ["recurrent.py", "--output", str(folder), "--updates", "2", "--worlds", "8"])
+    script.main()
+    result = eb.evaluate("cooperation-3-congested", f"{script.__file__}:make_agent:{folder}", episodes=5)
+    assert result.n == 5
