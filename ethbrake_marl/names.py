@@ -22,7 +22,7 @@ from typing import Any
 
 from ethbrake_marl.agents.drive import Agent, Team, check_agent
 from ethbrake_marl.episode.game import Game, Script
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error, refuse_shipped_path
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, describe_error, refuse_shipped_path
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -154,7 +154,7 @@ def team_of(driver: Driver, scenario: Scenario) -> Team:
     """Return a team for all learners of a scenario. A single agent drives each of them, with memories of their own."""
     if isinstance(driver, Team):
         return driver
-    return Team(driver.name, dict.fromkeys((body for body in scenario.learners), driver))
+    return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
@@ -345,7 +345,8 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
             try:
                 agent = make_agent(role, scenario=scenario)
             except InvalidInput as error:
-                raise type(error)(f"{where}: {error}") from None
+                kind = UnknownName if isinstance(error, UnknownName) else InvalidInput
+                raise kind(f"{where}: {error}") from None
             if isinstance(agent, Team):
                 raise InvalidInput(
                     f"{where}: is a team, or has a shield or a search; a vehicle that does not learn must be driven by"

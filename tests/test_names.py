@@ -106,6 +106,13 @@ def test_an_agent_in_a_file__is_made_by_its_function_which_may_import_its_neighb
     assert make_agent(f"{file}:make_with", scenario=PAPER).share == 0.8
 
 
+def test_an_agent_in_a_file__may_have_a_wrapper(file: str):
+    register_shield("around", around)
+    for spec in (f"{file}:make+around", f"{file}:make_with:0.5+around:x"):
+        team = make_agent(spec, scenario=PAPER)
+        assert isinstance(team, Team) and team.name == spec
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [

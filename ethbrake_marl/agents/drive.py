@@ -86,6 +86,8 @@ class Team(NamedTuple):
         if driven != wanted:
             theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
             raise InvalidInput(f"team {self.name!r}: drives {theirs}; must drive exactly {right}")
+        if game.shield not in (None, self.shield):
+            raise InvalidInput(f"team {self.name!r}: the game has a shield of its own; put it around the team instead")
         for body, agent in self.drivers.items():
             if hasattr(agent, "check"):
                 agent.check(game, body)

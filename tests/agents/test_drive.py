@@ -15,6 +15,7 @@ from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 from ethbrake_marl.names import open_game
+from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.game import game_of
 
 PAPER, GAME = game_of("paper-random")
@@ -191,3 +192,9 @@ def test_an_episode__that_has_ended_changes_no_more_while_others_go_on():
             assert all((a[k] == b).all() for a, b in zip(state[:5], last, strict=True))
         ended |= {k: [array[k].copy() for array in state[:5]] for k in np.flatnonzero(state.ended) if k not in ended}
     assert len(ended) == 20
+
+
+def test_a_shield_of_the_game__is_never_dropped():
+    game = GAME._replace(shield=StepShield())
+    with pytest.raises(InvalidInput, match="the game has a shield of its own; put it around the team instead"):
+        drive(game, PAPER.sample(2, 7), Team("coast", {2: Held("coast")}))
