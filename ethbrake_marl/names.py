@@ -82,7 +82,7 @@ def register_agent(
     knows: str = "not stated",
     form: str | None = None,
 ) -> None:
-    """Give an agent a name, for every place that takes names. Entry points: ``ethbrake_marl.second.agents``.
+    """Give an agent a name, for every place that takes names. Entry points: ``ethbrake_marl.agents``.
 
     Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad one.
 
@@ -106,7 +106,7 @@ def register_shield(
     knows: str = "",
     form: str | None = None,
 ) -> None:
-    """Give a shield, or a search, a name that can stand after a ``+``. Entry points: ``ethbrake_marl.second.shields``.
+    """Give a shield, or a search, a name that can stand after a ``+``. Entry points: ``ethbrake_marl.shields``.
 
     ``make(team, argument, settings)`` returns the wrapped team; the rest is as in ``register_agent``.
     """
@@ -121,8 +121,8 @@ def _add(table: Registry[Entry], name: str, make: Any, about: str, knows: str, f
     table.add(name, Entry(make, about, knows, form or f"{name}[:ARGUMENT]"), lambda other: other.make == make)
 
 
-AGENTS: Registry[Entry] = Registry("agent", "second.agents", register_agent)
-WRAPPERS: Registry[Entry] = Registry("shield or search", "second.shields", register_shield)
+AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
+WRAPPERS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:

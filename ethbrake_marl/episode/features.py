@@ -125,7 +125,7 @@ def register_feature(
     of: Of = "own",
     unknown: float = 0.0,
 ) -> None:
-    """Register a feature, which an ``observation:`` list can then name. Entry points: ``ethbrake_marl.state_features``.
+    """Register a feature, which an ``observation:`` list can then name. Entry points: ``ethbrake_marl.features``.
 
     The docstring of ``function`` is the meaning of the feature. Raises ``AlreadyExists`` for a name in use, and
     ``InvalidInput`` for a bad argument.
@@ -187,7 +187,7 @@ def _place(state: State, body: int) -> Floats:
 
 FEATURES: Registry[Own] = Registry(
     "feature",
-    "state_features",
+    "features",
     register_feature,
     {
         "place": Own(Feature("place", "1", 1.0, 0.0, 63.0, "number of vehicles ahead in the line"), "own", _place),

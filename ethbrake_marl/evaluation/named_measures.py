@@ -33,7 +33,7 @@ def register_measure(
     shown: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> None:
-    """Register a measure, for ``measures_called``. Entry points: ``ethbrake_marl.episode_measures``.
+    """Register a measure, for ``measures_called``. Entry points: ``ethbrake_marl.measures``.
 
     Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring,
     which says what the measure means.
@@ -74,7 +74,7 @@ def register_measure(
 USUAL = tuple(measure.name for measure in DEFAULT)
 
 MEASURES: Registry[Measure] = Registry(
-    "measure", "episode_measures", register_measure, {measure.name: measure for measure in DEFAULT}
+    "measure", "measures", register_measure, {measure.name: measure for measure in DEFAULT}
 )
 
 _REWARDED = ("collision", "risk", "jerk")  # built-in terms of a step, with the constants of a usual reward

@@ -332,7 +332,7 @@ class _RecipeWording(Wording):
 def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
     """Register a learning algorithm, which recipes select with ``algorithm: NAME``.
 
-    A package declares an entry point of the group ``ethbrake_marl.learning_algorithms`` instead: a ``Part`` with recipe
+    A package declares an entry point of the group ``ethbrake_marl.algorithms`` instead: a ``Part`` with recipe
     class and algorithm.
 
     Args:
@@ -362,7 +362,7 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
 
 ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
     "algorithm",
-    "learning_algorithms",
+    "algorithms",
     register_algorithm,
     {"ppo": (PpoRecipe, "ethbrake_marl.training.ppo:Ppo"), "sac": (SacRecipe, "ethbrake_marl.training.sac:Sac")},
 )

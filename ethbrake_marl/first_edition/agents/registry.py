@@ -199,7 +199,7 @@ def register_agent(
 ) -> None:
     """Register an agent, so that ``make_agent`` and every command accept ``name`` and ``name:argument``.
 
-    An installed package registers an agent with an entry point of the group ``ethbrake_marl.agents``. The entry point
+    An installed package registers an agent with an entry point of the group ``ethbrake_marl.first_edition.agents``. The entry point
     refers to the factory, or to a ``Part(factory, about=...)``, which can have further arguments of ``register_agent``.
 
     Args:
@@ -240,7 +240,7 @@ def register_shield(
 ) -> None:
     """Register a shield or search, so that ``+name`` may follow every agent in a specification.
 
-    An installed package registers a shield with an entry point of the group ``ethbrake_marl.shields``. The entry point
+    An installed package registers a shield with an entry point of the group ``ethbrake_marl.first_edition.shields``. The entry point
     refers to the wrapper, or to a ``Part(wrapper, about=...)``, which can have further arguments of
     ``register_shield``.
 
@@ -276,7 +276,7 @@ def register_shield(
 def register_variant(key: str, make: Factory | Wrapper, *, about: str = "a variant of your own") -> None:
     """Register a variant of an agent or shield, for the specifications ``name:variant`` and ``name:argument:variant``.
 
-    An installed package registers a variant with an entry point of the group ``ethbrake_marl.variants``.
+    An installed package registers a variant with an entry point of the group ``ethbrake_marl.first_edition.variants``.
 
     Args:
         key: ``name.variant``; for example, ``step.mine`` registers ``step:mine``, a variant of the shield ``step``.
@@ -294,15 +294,15 @@ _PLAIN = re.compile(r"[a-z][a-z0-9_.-]*")
 
 PROFILE = "profile"  # allowed only as a role in a scenario
 
-AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
+AGENTS: Registry[Entry] = Registry("agent", "first_edition.agents", register_agent)
 
-SHIELDS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
+SHIELDS: Registry[Entry] = Registry("shield or search", "first_edition.shields", register_shield)
 
-VARIANTS: Registry[Variant] = Registry("variant of an agent", "variants", register_variant)
+VARIANTS: Registry[Variant] = Registry("variant of an agent", "first_edition.variants", register_variant)
 
 
 def _register_group(name: str, specs: tuple[str, ...]) -> None:
     GROUPS.add(name, specs, lambda other: other == specs)
 
 
-GROUPS: Registry[tuple[str, ...]] = Registry("group of agents", "agent_groups", _register_group)
+GROUPS: Registry[tuple[str, ...]] = Registry("group of agents", "first_edition.agent_groups", _register_group)

@@ -1,7 +1,7 @@
 """Measures of an agent, and sets of measures: the base class, the registry, and the set of the core package.
 
 A measure computes one value per world from an agent's outcome. Measures that need the same information about the worlds
-form a set. Extensions add sets by declaring entry points of the group ``ethbrake_marl.measure_sets``. Results tables,
+form a set. Extensions add sets by declaring entry points of the group ``ethbrake_marl.first_edition.measure_sets``. Results tables,
 JSON results and files with one row per world show the measures of every installed set.
 """
 
@@ -213,7 +213,7 @@ EPISODE = EpisodeMeasures()
 def register_measure_set(name: str, measures: MeasureSet) -> None:
     """Add a set of measures to every later evaluation of this process.
 
-    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.measure_sets``.
+    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.first_edition.measure_sets``.
     Raises ``InvalidInput`` if ``measures`` is not a ``MeasureSet``, and ``AlreadyExists`` if another set has the same
     name, or if a measure of another set has the same name as a measure of this set.
     """
@@ -229,7 +229,7 @@ def register_measure_set(name: str, measures: MeasureSet) -> None:
     MEASURE_SETS.add(name, measures, lambda other: other is measures)
 
 
-MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "measure_sets", register_measure_set)
+MEASURE_SETS: Registry[MeasureSet] = Registry("set of measures", "first_edition.measure_sets", register_measure_set)
 
 
 def contexts_of(evaluation: Any, *, long_list: bool = False) -> dict[str, Any]:

@@ -472,7 +472,7 @@ def register_feature(
 
     The docstring of ``function`` is shown as the meaning of the feature.
 
-    An installed package registers a feature with an entry point of the group ``ethbrake_marl.features``. The entry
+    An installed package registers a feature with an entry point of the group ``ethbrake_marl.first_edition.features``. The entry
     point names a ``Part``, which contains all arguments of this function except ``name``.
 
     A feature with ``of="own"`` can read data that no message contained. Registering the same feature again changes
@@ -560,4 +560,4 @@ def _tried(entry: RegisteredFeature) -> tuple[float, ...]:
     return tuple(float(value) for each in values for value in each)
 
 
-FEATURES: Registry[RegisteredFeature] = Registry("feature", "features", register_feature, _BUILT_IN)
+FEATURES: Registry[RegisteredFeature] = Registry("feature", "first_edition.features", register_feature, _BUILT_IN)

@@ -125,7 +125,7 @@ class NamedMeasure:
 def register_measure(name: str, function: MeasureFunction, *, unit: str = "1", by: By = "impacts") -> None:
     """Register a measure: rewards can give it a weight under ``name``, and later evaluations show it.
 
-    An installed package registers a measure with an entry point of the group ``ethbrake_marl.measures``. The entry
+    An installed package registers a measure with an entry point of the group ``ethbrake_marl.first_edition.measures``. The entry
     point names the function, a ``Part`` that contains it, or a mapping from names to functions or parts. Evaluations
     show measures from entry points only on request.
 
@@ -228,6 +228,6 @@ BUILT_IN = {
 # Keys of a reward that are not measures.
 SETTINGS = ("harm_count", "objective", "shaping_discount", "k_energy", *_OF_RISK, "terms")
 
-MEASURES: Registry[NamedMeasure] = Registry("measure", "measures", _add, BUILT_IN)
+MEASURES: Registry[NamedMeasure] = Registry("measure", "first_edition.measures", _add, BUILT_IN)
 
 REPORTED: dict[str, NamedMeasure] = {}  # measures that every evaluation shows, by name

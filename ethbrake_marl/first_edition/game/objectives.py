@@ -213,7 +213,7 @@ def standard_objectives() -> tuple[str, ...]:
 def register_objective(name: str, function: ObjectiveFunction) -> None:
     """Register an objective, so that scenarios, rewards and ``--objective`` can use it under ``name``.
 
-    An installed package registers an objective with an entry point of the group ``ethbrake_marl.objectives`` that names
+    An installed package registers an objective with an entry point of the group ``ethbrake_marl.first_edition.objectives`` that names
     the function.
 
     Registering the same function again under the same name changes nothing. Raises ``AlreadyExists`` if the name
@@ -387,4 +387,4 @@ _BUILT_IN: dict[str, Kind] = {
     ),
 }
 
-OBJECTIVES: Registry[Kind] = Registry("objective", "objectives", register_objective, _BUILT_IN)
+OBJECTIVES: Registry[Kind] = Registry("objective", "first_edition.objectives", register_objective, _BUILT_IN)

@@ -80,13 +80,13 @@ MakeReport = Callable[[Experiment, OnProgress], RunReport]  # writes a report, a
 def register_run_report(name: str, make: MakeReport) -> None:
     """Register a function that writes a report into the folder of every later ``ethbrake run``.
 
-    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.run_reports``.
+    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.first_edition.run_reports``.
     ``make`` writes the report about an ``Experiment``. Raises ``AlreadyExists`` if another report has the name.
     """
     RUN_REPORTS.add(name, make, lambda other: other is make)
 
 
-RUN_REPORTS: Registry[MakeReport] = Registry("report of a run", "run_reports", register_run_report)
+RUN_REPORTS: Registry[MakeReport] = Registry("report of a run", "first_edition.run_reports", register_run_report)
 
 
 @dataclass(frozen=True, slots=True)

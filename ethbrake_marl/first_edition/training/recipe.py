@@ -377,7 +377,7 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,63}")
 def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
     """Register a learning algorithm, which recipes select with ``algorithm: NAME``.
 
-    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.algorithms``: a
+    Instead of calling this function, a package can declare an entry point of the group ``ethbrake_marl.first_edition.algorithms``: a
     ``Part`` with the recipe class and the algorithm.
 
     Args:
@@ -411,7 +411,7 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
 
 
 ALGORITHMS: Registry[tuple[type[TrainingRecipe], type[Any] | str]] = Registry(
-    "algorithm", "algorithms", register_algorithm
+    "algorithm", "first_edition.algorithms", register_algorithm
 )
 
 
