@@ -283,4 +283,5 @@ def whole_command() -> Any:
         with_installed(whole.commands[name], name)
     installed = [name for name in points(COMMANDS.group) if "." not in name]
     whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
+    whole.commands["doctor"] = whole.commands.pop("doctor")  # the last one of the help
     return whole
