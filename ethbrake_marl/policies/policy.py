@@ -92,7 +92,7 @@ class Policy:
         With ``replace`` an existing folder is deleted once the new one is written.
         """
         manifest = self.manifest.model_copy(update={"manifest_sha256": _own_sha256(self.manifest)})
-        with new_folder(Path(folder), replace=replace) as partial:
+        with new_folder(Path(folder).expanduser(), replace=replace) as partial:
             write_file(partial / WEIGHTS, serialised(self.tensors))
             write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
 
