@@ -132,6 +132,9 @@ def prepare_streams() -> None:
     error. Output that bypasses Python's stdout, such as that of a library or child process, goes to stderr. Warnings of
     this package are printed in one line. A message is printed before the first compilation of kernels.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller: nobody reads it
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
         if sys.stdout is sys.__stdout__ and sys.stderr is not None:
