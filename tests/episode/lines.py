@@ -14,12 +14,11 @@ from tests.motion.lines import driven, lines
 
 
 def state_of(gaps_m: Any, speeds_mps: Any, **settings: Any) -> State:
-    """Return worlds at the alert in which everybody knows everybody at once; settings as for ``lines``."""
+    """Return worlds at the alert; a vehicle knows all others after its own latency; settings as for ``lines``."""
     line, car = lines(gaps_m, speeds_mps, **settings)
     car[:, at.OWN_LATENCY] = car[:, at.LATENCY]
-    bodies = line.shape[2]
-    know, wanted = np.zeros((len(line), bodies, bodies)), np.zeros((len(line), bodies))
-    return at_alert(line, car, know, wanted, np.arange(len(line)))
+    know = np.repeat(car[:, at.LATENCY, :, np.newaxis], line.shape[2], axis=2)
+    return at_alert(line, car, know, np.zeros((len(line), line.shape[2])), np.arange(len(line)))
 
 
 def later(state: State, commands_mps2: Any, until_s: float) -> State:
