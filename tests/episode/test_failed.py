@@ -33,7 +33,9 @@ def test_step__names_world_and_time_and_changes_nothing(game: Game) -> None:
     state, _ = game.step(game.start(N, 5, 10), np.zeros((N, 1)))
     state = planted(state)
     before = copy.deepcopy(state)
-    with pytest.raises(PhysicsError, match=r"^world 13: a check of the physics failed between 0.6 s and 0.7 s") as raised:
+    with pytest.raises(
+        PhysicsError, match=r"^world 13: a check of the physics failed between 0.6 s and 0.7 s"
+    ) as raised:
         game.step(state, np.zeros((N, 1)))
     assert [*raised.value.worlds] == [13]
     assert all(one.tobytes() == other.tobytes() for one, other in zip(state[:5], before[:5], strict=True))

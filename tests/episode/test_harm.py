@@ -136,7 +136,9 @@ def test_weights__of_a_weighted_sum_give_the_objective(objective: str) -> None:
 
 @pytest.mark.parametrize("objective", ["maximin", "injury:lr4s"])
 def test_weights__of_another_objective_are_refused(objective: str) -> None:
-    with pytest.raises(InvalidInput, match="is not a weighted sum of the vehicles' harm; use one of total, own, social"):
+    with pytest.raises(
+        InvalidInput, match="is not a weighted sum of the vehicles' harm; use one of total, own, social"
+    ):
         parse_objective(objective).weights(met().car, 0)
 
 
@@ -183,7 +185,10 @@ def test_probability__names_what_is_there() -> None:
 
 def test_injured__by_the_larger_change_of_each_vehicle() -> None:
     changes = np.array([[[0.0, 2.0, 3.0, 0.0], [4.0, 3.0, 3.0, 0.0]]])  # front, rear
-    front, rear = (lambda dv: 1000 / (1 + np.exp(4.457 - 0.177 * dv))), (lambda dv: 1000 / (1 + np.exp(4.888 - 0.177 * dv)))
+    front, rear = (
+        (lambda dv: 1000 / (1 + np.exp(4.457 - 0.177 * dv))),
+        (lambda dv: 1000 / (1 + np.exp(4.888 - 0.177 * dv))),
+    )
     assert injured(changes, "lr4s")[0] == pytest.approx([rear(4.0), rear(3.0), rear(3.0), 0.0])
     assert injured(changes[:, ::-1], "lr4s")[0] == pytest.approx([front(4.0), front(3.0), rear(3.0), 0.0])
 

@@ -67,7 +67,9 @@ def test_collision__counts_every_impact_whatever_the_harm_counts(count: str, har
     before, after = STRUCK
     line = after.line.copy()
     line[:, TOTAL, 1] = 130.0
-    step = paid({"harm": 1.0, "harm_count": count, "collision": 1.0, "k_energy": 0.5}, before, after._replace(line=line))
+    step = paid(
+        {"harm": 1.0, "harm_count": count, "collision": 1.0, "k_energy": 0.5}, before, after._replace(line=line)
+    )
     assert (step.terms["collision"].tolist(), step.terms["harm"].tolist()) == ([-65.0], [harm])
     assert step.reward[0].tolist() == [harm - 65.0] * 3
 
@@ -132,7 +134,9 @@ def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount: f
     scenario, game = game_of("paper-random", reward=reward)
     state = game.begin(scenario.sample(50, 7))
     tried = state.car[:, BRAKING, [2]] * -np.linspace(0.0, 1.0, 9)
-    least = hold(state, -state.car[:, BRAKING], [2], tried[:, :, np.newaxis], scenario.horizon_s, "first")[0].min(axis=1)
+    least = hold(state, -state.car[:, BRAKING], [2], tried[:, :, np.newaxis], scenario.horizon_s, "first")[0].min(
+        axis=1
+    )
     rng, total, factor = np.random.default_rng(5), np.zeros(50), 1.0
     while not state.ended.all():
         state, step = game.step(state, rng.uniform(-1.0, 0.0, (50, 1)))

@@ -3,7 +3,7 @@
 import math
 import os
 from pathlib import Path
-from typing import Any
+
 
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -14,7 +14,7 @@ from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, flow_text, parse_yaml
-from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.policies.policy import Policy
 
 
 def test_plain_file__is_read_up_to_the_limit(tmp_path: Path) -> None:
@@ -57,19 +57,10 @@ def test_write__replaces_a_plain_file_by_force_and_takes_the_longest_name(tmp_pa
 def test_target__that_cannot_be_replaced_is_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    check_target("agent export ppo --onnx", tmp_path / "mine.onnx", monkeypatch, capsys)
-
-
-def check_target(words: str, path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    one = Scenario.sample  # by which a scenario is tried
-
-    def sample(scenario: Scenario, n: int, *given: Any, **how: Any) -> Any:
-        assert n == 1, "worlds were drawn"
-        return one(scenario, n, *given, **how)
-
-    monkeypatch.setattr(Scenario, "sample", sample)
+    path = tmp_path / "mine.onnx"
+    monkeypatch.setattr(Policy, "to_onnx", lambda policy: pytest.fail("exported"))
     path.symlink_to("nowhere")
-    assert run_command([*words.split(), str(path), "--force"]) == 2
+    assert run_command(["agent", "export", "ppo", "--onnx", str(path), "--force"]) == 2
     assert (
         capsys.readouterr().err
         == f"ethbrake: error: {path}: is a symbolic link; give the path of the file to which it points\n"

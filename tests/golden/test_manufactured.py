@@ -44,9 +44,7 @@ def cases() -> list[Case]:
 def played(case: Case, steps: int) -> Floats:
     """Return the line at the end of intervals of equal length."""
     gaps, speeds, commands, latency, mass, limit = case.numbers
-    line, car = lines(
-        gaps, speeds, latency_s=latency, mass_t=mass, speed_limit_mps=limit, restitution=case.restitution
-    )
+    line, car = lines(gaps, speeds, latency_s=latency, mass_t=mass, speed_limit_mps=limit, restitution=case.restitution)
     for k in range(steps):
         line, _, _ = driven(line, car, commands, case.until * k / steps, case.until * (k + 1) / steps)
     return line[0]

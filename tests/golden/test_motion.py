@@ -45,9 +45,7 @@ def driving_lines(key: int, n: int, N: int) -> tuple[Floats, Floats]:
     draws = Draws(key)
     gaps = draws.uniform(0.2, 10.0, (n, N - 1)) * draws.choice([1.0] * 9 + [0.0], (n, N - 1))
     speeds = draws.uniform(5.0, 25.0, (n, N)) * draws.choice([1.0] * 19 + [0.0], (n, N))
-    latency, mass, limit = (
-        draws.uniform(low, high, (n, N)) for low, high in ((0.0, 1.0), (1.0, 8.0), (25.0, 30.0))
-    )
+    latency, mass, limit = (draws.uniform(low, high, (n, N)) for low, high in ((0.0, 1.0), (1.0, 8.0), (25.0, 30.0)))
     restitution = draws.choice([0.0, 0.1, 0.3, 0.7], (n,))
     return lines(gaps, speeds, latency_s=latency, mass_t=mass, speed_limit_mps=limit, restitution=restitution)
 
