@@ -240,11 +240,11 @@ def test_objective__without_a_weight_of_harm_has_no_effect_and_warns() -> None:
 
 
 def test_named_rewards__are_those_of_the_page() -> None:
-    assert REWARDS == {
+    assert {
         "harm": RewardParams(harm=1.0, harm_count="first"),
         "total-harm": RewardParams(harm=1.0, harm_count="total"),
         "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
-    }
+    } == REWARDS
     assert reward_params({"harm": 2, "jerk": 0.5}) == RewardParams(harm=2.0, jerk=0.5)
     assert reward_params("paper") is REWARDS["paper"]
 

@@ -4,7 +4,6 @@ import math
 import os
 from pathlib import Path
 
-
 import pytest
 from hypothesis import given, settings, strategies as st
 

@@ -1,4 +1,4 @@
-"""The step shield is as good as the first edition's was: recorded sums over 300 worlds of its harm, bound and decisions."""
+"""The step shield is as good as the first edition's was: recorded sums of harm, bounds and decisions of 300 worlds."""
 
 from __future__ import annotations
 
