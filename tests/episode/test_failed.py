@@ -1,4 +1,4 @@
-"""A world whose physics fails raises, with its number and time; what only asks what would happen says: infinite harm."""
+"""A world whose physics fails raises, with its number and time; whatever only asks what would happen says infinite."""
 
 from __future__ import annotations
 
