@@ -14,7 +14,7 @@ from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, Witho
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import potential, register_term
-from ethbrake_marl.motion.layout import BRAKING, GAP, SPEED, TOTAL
+from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import game_of
 from ethbrake_marl.worlds.scenario import Scenario
@@ -181,8 +181,9 @@ def test_potential__counts_only_what_is_still_to_come() -> None:
 def test_components__of_a_step_by_hand() -> None:
     before = state_of([1.0, 1.0], [10.0, 20.0, 20.0], mass_t=[1.0, 3.0, 1.0], obstacle_gap_m=3.0)
     after = later(before, 0.0, 2.0)
+    assert (after.line[0, FIRST, :3] > 0.0).all()
+    after.line[0, TOTAL, :3] += [1.0, 2.0, 3.0]  # later impacts
     p0, p1, p2 = (after.line[0, TOTAL, p] for p in range(3))
-    assert min(p0, p1, p2) > 0.0
     vector = ["harm_1", "harm_2", "harm_3", "obstacle", "pair_1_2", "pair_2_3", "jerk"]
     step = paid({"harm": 1.0, "harm_count": "total", "jerk": 1.0}, before, after, vector=vector)
     borne = [0.75 * p1 + p0, 0.25 * p1 + 0.25 * p2, 0.75 * p2]
