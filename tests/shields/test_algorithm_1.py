@@ -41,7 +41,7 @@ def test_the_harm_is_the_smaller_one_to_the_bit(agent: Agent, name: str, count: 
 @pytest.mark.parametrize(("spec", "bound"), [("ppo+episode", "coupled"), ("ppo+episode:pairwise", "pairwise")])
 def test_the_wrapper_has_the_bound_of_its_argument(spec: str, bound: str) -> None:
     scenario, game = open_game("paper-random")
-    named, (_, alert, team) = team_of(make_agent(spec), scenario), hybrid(PPO, n=20, bound=bound)
+    named, (_, alert, team) = team_of(make_agent(spec, scenario=scenario), scenario), hybrid(PPO, n=20, bound=bound)
     found, expected = (drive(game, alert, each).memories["shield"].bound_harm for each in (named, team))
     assert found.tolist() == expected.tolist()
 
