@@ -185,9 +185,8 @@ def _missing(package: str) -> MissingExtra:
 class PhysicsError(EthBrakeError, ArithmeticError):
     """Some worlds of a batch could not be simulated. The cause is a defect of the physics kernel, never of the input.
 
-    A caller may compute the batch again without the failed worlds, which do not affect the others
-    (``physics.left_out.leaving_out_failed``). ``worlds`` maps the row (in the batch) of each failed world to the
-    reason.
+    A caller may compute the batch again without the failed worlds, which do not affect the others. ``worlds`` maps the
+    number of each failed world in its list (a world that the caller has made: its row in the batch) to the reason.
     """
 
     def __init__(self, worlds: Mapping[int, str]) -> None:

@@ -305,5 +305,5 @@ def _check_actions(rules: Rules, actions: Floats) -> None:
 def failure(state: State, row: int, start_s: float, until_s: float) -> PhysicsError:
     """Return the error for a world in which a check of the physics failed: a defect of this package."""
     number = int(state.clock[row, NUMBER])
-    where = "a world of the caller" if number < 0 else f"world {number}"
-    return PhysicsError({row: f"{where}: a check of the physics failed between {start_s:g} s and {until_s:g} s"})
+    reason = f"a check of the physics failed between {start_s:g} s and {until_s:g} s"
+    return PhysicsError({row if number < 0 else number: reason})

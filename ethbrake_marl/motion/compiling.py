@@ -21,7 +21,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numba
-from numba.core import config
+from numba.core import config, event
+
+from ethbrake_marl.kernel_store import tell_compilation
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -29,6 +31,19 @@ PACKAGE = Path(__file__).parents[1]
 SOURCES = ("motion", "episode")  # folders with the core's kernels
 LEAST_FREE_BYTES = 50_000_000
 TEMPORARY = "ethbrake_marl-"
+
+
+class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
+    """Says so when this process compiles its first kernel; one that is loaded says nothing."""
+
+    def on_start(self, happened: event.Event) -> None:
+        tell_compilation(not any(cache_home().rglob("*.nbi")))
+
+    def on_end(self, happened: event.Event) -> None:
+        pass
+
+
+event.register("numba:compile", _Teller())
 
 
 def _compile(function: Function, **options: Any) -> Function:

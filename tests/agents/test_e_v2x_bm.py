@@ -234,6 +234,14 @@ def test_coupled__is_not_worse_than_a_grid(vehicles, body, count):
     assert (again[0] == best.harm).all()
 
 
+def test_coupled__of_vehicle_1_is_not_worse_than_a_grid_before_an_obstacle():
+    worlds = open_game("cooperation-4-all")[0].sample(40, 7)
+    worlds.wanted[:] = -worlds.car[:, BRAKING]
+    best, grid = coupled(worlds, 1, "total"), worlds.car[:, BRAKING, [1]] * np.linspace(0.0, 1.0, 401)
+    least = harms(worlds, 1, grid, "total", 8.0)[0].min(axis=1)
+    assert (best.harm <= least + e_v2x_bm.SMALL).all() and best.harm.any() and not best.harm.all()
+
+
 def test_coupled__decides_ties_by_the_other_count_then_takes_the_middle():
     worlds = open_game("paper-random-obstacle")[0].sample(300, 3)
     worlds.wanted[:, 2] = -worlds.car[:, BRAKING, 2]

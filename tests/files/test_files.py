@@ -1,20 +1,23 @@
 """Plain files that are read and replaced, and YAML; refusals: ``test_refusals``."""
 
+import io
 import math
 import os
+import zipfile
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.files.arrays import ArrayArchive
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.python_file import load_from_file
-from ethbrake_marl.files.store import write_output
+from ethbrake_marl.files.store import check_folder, write_output
 from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, flow_text, parse_yaml
-from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.policies.policy import Policy
 
 
 def test_plain_file__is_read_up_to_the_limit(tmp_path: Path) -> None:
@@ -57,24 +60,35 @@ def test_write__replaces_a_plain_file_by_force_and_takes_the_longest_name(tmp_pa
 def test_target__that_cannot_be_replaced_is_refused_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    check_target("agent export ppo --onnx", tmp_path / "mine.onnx", monkeypatch, capsys)
-
-
-def check_target(words: str, path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    one = Scenario.sample  # by which a scenario is tried
-
-    def sample(scenario: Scenario, n: int, *given: Any, **how: Any) -> Any:
-        assert n == 1, "worlds were drawn"
-        return one(scenario, n, *given, **how)
-
-    monkeypatch.setattr(Scenario, "sample", sample)
+    path = tmp_path / "mine.onnx"
+    monkeypatch.setattr(Policy, "to_onnx", lambda policy: pytest.fail("exported"))
     path.symlink_to("nowhere")
-    assert run_command([*words.split(), str(path), "--force"]) == 2
+    assert run_command(["agent", "export", "ppo", "--onnx", str(path), "--force"]) == 2
     assert (
         capsys.readouterr().err
         == f"ethbrake: error: {path}: is a symbolic link; give the path of the file to which it points\n"
     )
     assert not path.with_name("nowhere").exists()
+
+
+def test_folder__takes_files_that_are_new_or_replaced_by_force(tmp_path: Path) -> None:
+    (tmp_path / "old.csv").write_text("old")
+    check_folder(tmp_path, ("new.csv",))
+    check_folder(tmp_path / "new", ("old.csv",))
+    check_folder(tmp_path, ("new.csv", "old.csv"), force=True)
+    with pytest.raises(AlreadyExists, match=r"old\.csv: already exists"):
+        check_folder(tmp_path, ("new.csv", "old.csv"))
+    with pytest.raises(InvalidInput, match=r"old\.csv is not a folder; give a new folder"):
+        check_folder(tmp_path / "old.csv" / "new")
+
+
+def test_arrays__may_have_as_many_bytes_as_are_allowed() -> None:
+    stream = io.BytesIO()
+    np.savez(stream, a=np.arange(4.0), b=np.zeros(3, np.float32))
+    size = sum(member.file_size for member in zipfile.ZipFile(stream).infolist())
+    assert [*ArrayArchive(stream.getvalue(), size).headers] == ["a", "b"]
+    with pytest.raises(ValueError, match=f"would have {size:,} bytes when unpacked; at most {size - 1:,} are allowed"):
+        ArrayArchive(stream.getvalue(), size - 1)
 
 
 # ---------------------------------------------------------------- YAML
@@ -159,3 +173,9 @@ def test_python_file__is_run_once_and_refused_once_it_has_changed(tmp_path: Path
     file.write_text("made = [2]")
     with pytest.raises(InvalidInput, match="has changed since it was loaded"):
         load_from_file(str(file), "made")
+
+
+def test_python_file__is_compiled_as_it_stands(tmp_path: Path) -> None:
+    file = tmp_path / "noted.py"
+    file.write_text("def half(x: float): return x / 2\nkinds = half.__annotations__")
+    assert load_from_file(str(file), "kinds") == {"x": float}  # no text: this package's own __future__ is not inherited

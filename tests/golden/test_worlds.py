@@ -1,6 +1,8 @@
 """Worlds of the shipped scenarios, as digests: a seed gives the same worlds in every version and on every machine.
 
-``python -m tests.golden.test_worlds`` records them anew, which breaks every list of worlds that anybody has used.
+``worlds.json`` has the lists for evaluation, ``training_worlds.json`` the stream for training, whose worlds were equal
+to the first edition's, and its number of rejected draws. ``python -m tests.golden.test_worlds`` records them anew,
+which breaks every list of worlds that anybody has used.
 """
 
 import hashlib
@@ -10,30 +12,41 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
 from tests.fixtures.scenarios import SHIPPED
 
-FILE = Path(__file__).with_name("worlds.json")
-RECORDED = json.loads(FILE.read_text("utf-8")) if FILE.exists() else {}
+LISTS, TRAINING = (Path(__file__).with_name(f"{name}.json") for name in ("worlds", "training_worlds"))
+RECORDED, RECORDED_TRAINING = (json.loads(file.read_text("utf-8")) for file in (LISTS, TRAINING))
 
 
-def digest(name: str) -> str:
-    """SHA-256 of 1,500 worlds of seed 7: line, car, know, first commands, in this order."""
-    worlds, sha256 = load_scenario(name).sample(1500, 7), hashlib.sha256()
+def digest(worlds: State) -> str:
+    """SHA-256 of worlds: line, car, know, first commands, in this order."""
+    sha256 = hashlib.sha256()
     for array in (worlds.line, worlds.car, worlds.know, worlds.wanted):
         sha256.update(np.ascontiguousarray(array, "<f8").tobytes())
     return sha256.hexdigest()
 
 
+def listed(name: str) -> str:
+    return digest(load_scenario(name).sample(1500, 7))
+
+
+def trained_on(name: str) -> list[str | int]:
+    drawn = load_scenario(name).draw(1000, 0, first=0, channel="training")
+    return [digest(drawn.worlds)[:16], drawn.rejected]
+
+
 def test_every_shipped_scenario__is_recorded() -> None:
-    assert [*RECORDED] == [entry.name for entry in list_scenarios()]
+    assert [*RECORDED] == [*RECORDED_TRAINING] == [entry.name for entry in list_scenarios()]
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_worlds__are_those_of_the_record(name: str) -> None:
-    assert digest(name) == RECORDED[name]
+    assert listed(name) == RECORDED[name]
+    assert trained_on(name) == RECORDED_TRAINING[name]
 
 
 if __name__ == "__main__":
-    digests = {entry.name: digest(entry.name) for entry in list_scenarios()}
-    FILE.write_text(json.dumps(digests, indent=1) + "\n", "utf-8")
+    for file, record in ((LISTS, listed), (TRAINING, trained_on)):
+        file.write_text(json.dumps({entry.name: record(entry.name) for entry in list_scenarios()}, indent=1) + "\n")

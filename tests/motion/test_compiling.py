@@ -75,6 +75,15 @@ def test_machine_code__is_loaded_until_a_source_changes(place: Place) -> None:
     assert other != folder
 
 
+def test_first_compilation__is_told_once_and_a_load_is_not(place: Place) -> None:
+    told = "print('told', nothing_kept, file=sys.stderr)"
+    first = f"import sys, ethbrake_marl.kernel_store as k; k.on_first_compilation(lambda _, nothing_kept: {told}); "
+    assert place.ask(first)[2:] == (False, "told True\n")
+    assert place.ask(first)[2:] == (True, "")
+    place.write(3.0)
+    assert place.ask(first)[2:] == (False, "told False\n")
+
+
 def test_two_processes__may_compile_at_once(place: Place) -> None:
     together = [place.begin() for _ in range(3)]
     assert {told(each)[0] for each in together} == {42.0}

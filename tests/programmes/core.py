@@ -28,7 +28,7 @@ OPTIONS = {
 }
 COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefile", "README.md", "pyproject.toml")
 APART = ("docs", "programmes", "second")  # tests of the whole repository, not only of the core
-INSTALLATION = ("test_imports.py", "test_kernel_store.py")  # start many processes
+INSTALLATION = ("test_imports.py",)  # start many processes
 RUN = "runs/core"
 COMMANDS = {
     "trains PPO on paper-random": ("train", "--steps", "20000", "--output", RUN),

@@ -109,6 +109,12 @@ def test_ended_episodes_are_left_alone() -> None:
     assert (memory.replaced[ended] == replaced[ended]).all() and (memory.replaced[~ended] > replaced[~ended]).any()
 
 
+def test_one_learner__begins_with_the_plan_of_e_v2x_bm_alone() -> None:
+    scenario, game = open_game("paper-random")
+    alert = scenario.sample(3, 7)
+    assert len(first_plans(game, alert, game.begin(alert), "first")) == 1
+
+
 def test_at_the_alert_the_bound_is_the_cheapest_first_plan() -> None:
     scenario, game = open_game(LINES["pair"]())
     alert = scenario.sample(10, 7)

@@ -102,6 +102,12 @@ GIVEN: dict[str, Callable[[], object]] = {
         PAPER, COLUMNS | {"recording": ["a", "a", "b"]}
     ),
     "initial states: column obstacle_gap_m is missing; scenario": lambda: worlds_from_table(OBSTACLE, COLUMNS),
+    "initial_state: unknown key 'obstacle_gap_m'; known: gaps_m, speeds_mps": lambda: worlds_from_state(
+        PAPER, {"gaps_m": 7, "speeds_mps": 20, "obstacle_gap_m": 30}
+    ),
+    "initial_state: obstacle_gap_m = 0: must be finite and in (0, 10000] m": lambda: worlds_from_state(
+        OBSTACLE, {"gaps_m": 7, "speeds_mps": 20, "obstacle_gap_m": 0}
+    ),
     "initial_state: speeds_mps[0] is missing; scenario 'paper-random' has no fixed value": lambda: worlds_from_state(
         PAPER, {"gaps_m": [7, 7]}
     ),

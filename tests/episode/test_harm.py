@@ -1,0 +1,218 @@
+"""Harm: shares by mass, both counts, the obstacle, objectives and injuries, by hand and as properties."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from ethbrake_marl.episode.injury import injured, injury_probability, speed_changes
+from ethbrake_marl.episode.objectives import amounts, objectives_of, parse_objective
+from ethbrake_marl.episode.state import State, split_harm
+from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.motion import layout as at
+from ethbrake_marl.worlds.game import game_of
+from tests.episode.lines import later, state_of
+
+EPS = np.finfo(float).eps
+
+
+def split(pairs: Any, mass: Any) -> np.ndarray:
+    """Return the harm of each vehicle, [n, N], of pairs [n, N - 1] without an obstacle."""
+    pairs, mass = (np.concatenate([np.zeros((len(rows), 1)), rows], axis=1) for rows in (pairs, mass))
+    out = np.empty((len(mass), mass.shape[1] - 1))
+    split_harm(np.concatenate([pairs, np.zeros((len(pairs), 1))], axis=1), mass, out)
+    return out
+
+
+@settings(max_examples=100)
+@given(st.lists(st.floats(1e-2, 1e4), min_size=2, max_size=6), st.data())
+def test_shares__add_up_to_the_last_bit_and_are_inverse_to_the_masses(mass: list[float], data: st.DataObject) -> None:
+    value = st.just(0.0) | st.floats(1e-10, 2_000.0)
+    harm = data.draw(st.lists(value, min_size=len(mass) - 1, max_size=len(mass) - 1))
+    for p, squared in enumerate(harm):  # pair by pair: a vehicle between two pairs bears a sum of rounded numbers
+        front, rear = split([[squared]], [mass[p : p + 2]])[0]
+        assert Fraction(float(front)) + Fraction(float(rear)) == Fraction(squared)
+        assert min(front, rear) >= 0.0
+        assert front * mass[p] == pytest.approx(rear * mass[p + 1], rel=0, abs=4.0 * EPS * squared * max(mass))
+    assert split([harm], [mass]).sum() == pytest.approx(sum(harm), rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("harm", "mass", "expected"),
+    [  # the lighter one of a pair bears more
+        ([16, 0], [1, 3, 1], [12.0, 4.0, 0.0]),
+        ([16, 0], [3, 1, 1], [4.0, 12.0, 0.0]),
+        ([0, 16], [1, 3, 1], [0.0, 4.0, 12.0]),
+        ([16, 8], [1, 3, 1], [12.0, 6.0, 6.0]),
+    ],
+)
+def test_shares__by_hand(harm: list[float], mass: list[float], expected: list[float]) -> None:
+    assert split([harm], [mass])[0].tolist() == expected
+
+
+def test_counts__differ_by_the_later_impacts() -> None:
+    # 8, 4 and 2 m/s against a heavy wall whose brakes hold it, with e = 0.5, in two intervals
+    state = state_of([0.0], [0.0, 8.0], mass_t=[2.0**50, 1.0], restitution=0.5)
+    for until in (1.0, 3.25):
+        state = later(state, [-16.0, 4.0], until)
+    assert state.pair_harm("first").tolist() == [[64.0]]
+    assert np.round(state.pair_harm("total"), 9).tolist() == [[64.0 + 16.0 + 4.0]]
+    assert state.line[0, at.COUNT, 1] == 3.0 and state.collided.tolist() == state.pair_hit[:, 0].tolist() == [True]
+    assert state.harm("first").tolist() == [64.0] and state.borne_harm("first").sum() == 64.0
+
+
+def test_harm_of_the_obstacle__is_that_of_vehicle_1() -> None:
+    # 6 m/s into it, 8 and 10 m/s behind, all touching, e = 0: one round, then all are at rest
+    state = later(state_of([0.0, 0.0], [6.0, 8.0, 10.0], obstacle_gap_m=0.0), 0.0, 0.5)
+    assert state.line[0, at.FIRST, 0] == state.line[0, at.TOTAL, 0] == 36.0
+    assert state.pair_harm("total").tolist() == [[4.0, 4.0]] and state.harm("total").tolist() == [44.0]
+    assert state.borne_harm("first").tolist() == state.borne_harm("total").tolist() == [[38.0, 4.0, 2.0]]
+    assert state.obstacle_gap_m.tolist() == [0.0] and not state.speeds_mps.any()
+    alone = later(state_of([50.0], [20.0, 0.0], obstacle_gap_m=10.0), 0.0, 1.0)
+    assert alone.collided.tolist() == [True] and not alone.pair_hit.any()
+
+
+# ---------------------------------------------------------------- objectives
+
+
+def met(pairs: tuple[float, float] = (12.0, 9.0), total: tuple[float, float] = (12.0, 30.0)) -> State:
+    """Pair 1 met with 12 m2/s2 (masses 1, 2), pair 2 with 9 (masses 2, 1), then with 21 more; e = 0.5."""
+    state = state_of([0.0, 0.0], [0.0, 0.0, 0.0], mass_t=[1.0, 2.0, 1.0], restitution=0.5, harm_weight=[0.0, 1.0, 3.0])
+    state.line[0, at.FIRST, 1:3], state.line[0, at.TOTAL, 1:3], state.line[0, at.COUNT, 1:3] = pairs, total, (1, 2)
+    return state
+
+
+def of_objective(objective: Any, state: State, count: str = "first") -> list[float]:
+    """Return what each vehicle should minimise."""
+    found: list[float] = amounts(objectives_of(objective, 3), None, state, count)[0].tolist()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("objective", "harm"),
+    [  # pair 1 gives 8 and 4, pair 2 gives 3 and 6 of its first: the vehicles bear (8, 7, 6)
+        ("total", [21.0, 21.0, 21.0]),
+        ("own", [8.0, 7.0, 6.0]),
+        ("social:0", [8.0, 7.0, 6.0]),
+        ("social:90", [13.0, 14.0, 15.0]),
+        ("social:45", [21 / 2**0.5] * 3),
+        ("social:30", [x * 0.75**0.5 + (21 - x) / 2 for x in (8, 7, 6)]),
+        ("maximin", [8.0, 8.0, 8.0]),
+        ("preference", [18.75] * 3),  # 3 (7 + 3 x 6) / 4
+        ("weighted:0,1,3", [18.75] * 3),
+        ("mass-weighted", [21.0, 21.0, 21.0]),
+        ("weighted:1,4,2", [3 * (8 + 4 * 7 + 2 * 6) / 7] * 3),
+        ("weighted:1e6, 1e-6,1e6", [21.0, 21.0, 21.0]),
+        (("total", "own", "maximin"), [21.0, 7.0, 8.0]),
+    ],
+    ids=str,
+)
+def test_objective__by_hand(objective: Any, harm: list[float]) -> None:
+    assert of_objective(objective, met()) == pytest.approx(harm, abs=1e-8)
+
+
+def test_objective__of_total_harm() -> None:
+    assert of_objective(("total", "own", "maximin"), met(), "total") == [42.0, 14.0, 20.0]  # pair 2 gives 10 and 20
+
+
+@pytest.mark.parametrize("objective", ["own", "maximin", "social:30", "weighted:1,4,2", "injury:lr4s"])
+def test_objective__of_some_time_is_what_it_has_grown_by(objective: str) -> None:
+    before, after = met((12.0, 0.0)), met((12.0, 9.0))
+    grown = amounts(objectives_of(objective, 3), before, after, "first")[0]
+    expected = np.subtract(of_objective(objective, after), of_objective(objective, before))
+    assert grown == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("objective", ["total", "own", "social:30", "mass-weighted", "weighted:1,4,2", "preference"])
+def test_weights__of_a_weighted_sum_give_the_objective(objective: str) -> None:
+    state, parsed = met(), parse_objective(objective)
+    for vehicle, amount in enumerate(of_objective(objective, state)):
+        assert (parsed.weights(state.car, vehicle) * state.borne_harm()).sum() == pytest.approx(amount)
+
+
+@pytest.mark.parametrize("objective", ["maximin", "injury:lr4s"])
+def test_weights__of_another_objective_are_refused(objective: str) -> None:
+    with pytest.raises(
+        InvalidInput, match="is not a weighted sum of the vehicles' harm; use one of total, own, social"
+    ):
+        parse_objective(objective).weights(met().car, 0)
+
+
+# ---------------------------------------------------------------- injuries
+
+
+def test_injuries__by_hand() -> None:
+    # Vehicle 1's speed changes by 2 / 3 1.5 sqrt(12) at its rear, Vehicle 2's by 1 / 3 1.5 sqrt(12) at its front and by
+    # 1 / 3 1.5 3 at its rear, of which the front is worse, and Vehicle 3's by 2 / 3 1.5 3 at its front.
+    logits = np.array([4.888 - 0.177 * 12**0.5, 4.457 - 0.177 * 3**0.5, 4.457 - 0.177 * 3])
+    expected = (1000 / (1 + np.exp(logits))).sum()
+    assert of_objective("injury:lr4s", met()) == pytest.approx([expected] * 3, abs=1e-8)
+
+
+def test_injuries__grow_with_a_harder_impact() -> None:
+    # though a hit at the rear counts for less than one in front
+    each = [of_objective("injury:lr4s", met((400.0, w * w)))[0] for w in (19.9, 20.0, 20.1)]
+    assert each == sorted(set(each))
+
+
+@pytest.mark.parametrize(
+    ("curve", "side", "dv", "probability"),
+    [
+        ("lr4s", "front", 10.0, 1 / (1 + np.exp(4.457 - 1.77))),
+        ("lr4s", "rear", -10.0, 1 / (1 + np.exp(4.888 - 1.77))),
+        ("gidas", "front", 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
+        ("gidas", "rear", 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
+        ("reference", "front", 10.0, (10 / 51.287) ** 1.531),
+        ("reference", "rear", 10.0, (10 / 66.956) ** 1.531),
+        ("reference", "front", 60.0, 1.0),
+        ("reference", "rear", 0.0, 0.0),
+    ],
+)
+def test_probability__of_an_injury_by_hand(curve: str, side: Any, dv: float, probability: float) -> None:
+    assert injury_probability(np.array([dv]), side, curve)[0] == pytest.approx(probability, rel=1e-12)
+
+
+def test_probability__names_what_is_there() -> None:
+    with pytest.raises(UnknownName, match="lr4s"):
+        injury_probability(np.ones(1), "front", "lr4")
+    with pytest.raises(UnknownName, match="front"):
+        injury_probability(np.ones(1), "left")  # type: ignore[arg-type]
+
+
+def test_injured__by_the_larger_change_of_each_vehicle() -> None:
+    changes = np.array([[[0.0, 2.0, 3.0, 0.0], [4.0, 3.0, 3.0, 0.0]]])  # front, rear
+    front, rear = (
+        (lambda dv: 1000 / (1 + np.exp(4.457 - 0.177 * dv))),
+        (lambda dv: 1000 / (1 + np.exp(4.888 - 0.177 * dv))),
+    )
+    assert injured(changes, "lr4s")[0] == pytest.approx([rear(4.0), rear(3.0), rear(3.0), 0.0])
+    assert injured(changes[:, ::-1], "lr4s")[0] == pytest.approx([front(4.0), front(3.0), rear(3.0), 0.0])
+
+
+def test_changes_of_speed__between_two_states_by_hand() -> None:
+    # 10 m/s into a vehicle of three times the mass at rest, e = 0.2: 1.2 x 10 are shared 3 : 9; the other world is calm
+    before = state_of([[1.0], [500.0]], [[0.0, 10.0]] * 2, mass_t=[3.0, 1.0], restitution=0.2)
+    changes = speed_changes(before, later(before, 0.0, 0.5))
+    assert changes[0] == pytest.approx(np.array([[0.0, 9.0], [3.0, 0.0]])) and not changes[1].any()
+
+
+# ---------------------------------------------------------------- the harm of an episode
+
+OBJECTIVES = ["total", "own", "social:30", "maximin", "mass-weighted", "weighted:1,4,2", "injury:lr4s"]
+
+
+@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("objective", [*OBJECTIVES, ["total", "own", "social:45"]], ids=str)
+def test_rewards__add_up_to_minus_the_objective_of_the_last_state(objective: Any, count: str) -> None:
+    scenario, game = game_of("paper-random", reward={"harm": 1.0, "objective": objective, "harm_count": count})
+    state, total = game.begin(scenario.sample(40, 4)), np.zeros((40, 3))
+    actions = np.random.default_rng(2).uniform(-1.0, 0.0, (40, 1))
+    while not state.ended.all():
+        state, step = game.step(state, actions)
+        total += step.reward
+    assert state.collided.sum() > 15
+    assert total == pytest.approx(-amounts(objectives_of(objective, 3), None, state, count), abs=1e-9)

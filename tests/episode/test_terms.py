@@ -1,0 +1,272 @@
+"""Terms of a reward by hand, shaping as a difference of potentials, components of a vector, and what a reward says."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.episode.objectives import amounts, objectives_of
+from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import Step
+from ethbrake_marl.episode.terms import potential, register_term
+from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.worlds.scenario import Scenario
+from tests.contract.interfaces import CRASH, REST
+from tests.episode.lines import later, state_of, step_between
+
+near = pytest.approx
+LEARNERS = np.array([2])
+
+
+def moved(gaps: list[float], speeds: list[float], seconds: float, commands: Any = 0.0) -> tuple[State, State]:
+    """Return a line of equal masses before and after; e = 0.5."""
+    before = state_of(gaps, speeds, restitution=0.5)
+    return before, later(before, commands, seconds)
+
+
+def paid(reward: dict[str, Any], before: State, after: State, **settings: Any) -> Step:
+    """Return what the step between two states did, with its whole reward."""
+    rewarding, rules = Rewarding.of(reward, "total", after.vehicles, LEARNERS, (0.5, 8.0), settings.pop("vector", None))
+    step = step_between(before, after, **settings)
+    harm = step.total_harm if rules.total else step.first_impact_harm
+    compiled = (rules.terminal * step.safe_end - rules.harm * harm)[:, np.newaxis]
+    return rewarding.complete(before, step._replace(reward=np.repeat(compiled, after.vehicles, axis=1)), after)[1]
+
+
+# Vehicle 2 strikes Vehicle 1 at 10 m/s; Vehicle 3 falls back.
+STRUCK = moved([1.0, 5.0], [10.0, 20.0, 4.0], 0.5, [0.0, 0.0, -2.0])
+
+
+@pytest.mark.parametrize(
+    ("reward", "safe", "name", "value"),
+    [
+        ({"harm": 1.0}, False, "harm", [-100.0] * 3),
+        ({"harm": 0.0, "jerk": 1.0}, False, "jerk", [0.0, 0.0, -16.0]),  # (-2 / 0.5)^2
+        ({"harm": 0.0, "terminal": 3.0}, False, "terminal", [0.0] * 3),
+        ({"harm": 0.0, "terminal": 3.0}, True, "terminal", [1.0] * 3),
+        ({"harm": 0.0, "collision": 2.0, "k_energy": 0.5}, False, "collision", [-50.0] * 3),
+    ],
+)
+def test_term__of_a_step_by_hand(reward: dict[str, float], safe: bool, name: str, value: list[float]) -> None:
+    step = paid(reward, *STRUCK, safe=safe)
+    assert [*step.terms] == [name]
+    assert np.broadcast_to(step.terms[name].reshape(1, -1), (1, 3))[0].tolist() == value
+    weight = max(each for key, each in reward.items() if key != "k_energy")
+    assert step.reward[0].tolist() == [weight * each for each in value]
+
+
+@pytest.mark.parametrize(("count", "harm"), [("first", -100.0), ("total", -130.0)])
+def test_collision__counts_every_impact_whatever_the_harm_counts(count: str, harm: float) -> None:
+    before, after = STRUCK
+    line = after.line.copy()
+    line[:, TOTAL, 1] = 130.0
+    step = paid(
+        {"harm": 1.0, "harm_count": count, "collision": 1.0, "k_energy": 0.5}, before, after._replace(line=line)
+    )
+    assert (step.terms["collision"].tolist(), step.terms["harm"].tolist()) == ([-65.0], [harm])
+    assert step.reward[0].tolist() == [harm - 65.0] * 3
+
+
+def sigmoid(x: float) -> float:
+    return 1.0 / (1.0 + math.exp(-x))
+
+
+# After STRUCK gap 1 is 0 + 5 m/s * 0.4 s = 2 m, opening; gap 2 is 5 + 2 + 0.4 * 12.5 - (2 - 0.25) = 10.25 m, opening.
+OPENING = -sigmoid(0.5 * (3.0 - 2.0)), -sigmoid(0.5 * (3.0 - 10.25))
+
+
+@pytest.mark.parametrize(
+    ("states", "gaps", "settings", "value"),
+    [
+        (STRUCK, [2.0, 10.25], {"distance_slope_per_m": 0.5}, [OPENING[0], sum(OPENING), OPENING[1]]),
+        (  # pairs that close add the time to collision, to the safety buffer of 1 m: slow ones too
+            moved([7.0], [0.0, 4.0], 0.5), [5.0], {"ttc_scale_s": 2.0},
+            [-sigmoid(-((5.0 - 1.0) / 4.0) / 2.0) - sigmoid(3.0 - 5.0)] * 2,
+        ),
+        (
+            moved([7.0], [0.0, 0.5], 2.0), [6.0], {"ttc_scale_s": 10.0},
+            [-sigmoid(-((6.0 - 1.0) / 0.5) / 10.0) - sigmoid(3.0 - 6.0)] * 2,
+        ),
+        (moved([3.0], [0.0, 4.0], 0.625), [0.5], {}, [-0.5 - sigmoid(3.0 - 0.5)] * 2),  # within the buffer
+        (
+            moved([3.0], [0.0, 4.0], 0.625), [0.5], {"safety_buffer_m": 0.1, "target_gap_m": 2.0},
+            [-sigmoid(-((0.5 - 0.1) / 4.0)) - sigmoid(2.0 - 0.5)] * 2,
+        ),
+    ],
+)  # fmt: skip
+def test_risk__by_hand(
+    states: tuple[State, State], gaps: list[float], settings: dict[str, float], value: list[float]
+) -> None:
+    assert states[1].gaps_m[0] == near(gaps)
+    assert paid({"harm": 0.0, "risk": 1.0, **settings}, *states).terms["risk"][0] == near(value)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "action", "when", "truncated"),
+    [(CRASH, 0.0, None, 7), (CRASH, -1.0, 7, 7), (REST, -1.0, 9, None)],
+    ids=["crash", "safe at the horizon", "at rest"],
+)
+def test_terminal__is_paid_once_at_a_safe_end(
+    scenario: Scenario, action: float, when: int | None, truncated: int | None
+) -> None:
+    _, game = game_of(scenario, reward={"harm": 0.0, "terminal": 3.0})
+    state = game.start(1, 0, 0)
+    for k in range(11):
+        state, step = game.step(state, np.full((1, 1), action))
+        assert bool(step.truncated[0]) == (k == truncated)
+        assert step.reward[0].tolist() == [3.0 * (k == when)] * 2
+        assert bool(step.safe_end[0]) == (k == when)
+
+
+# ---------------------------------------------------------------- shaping
+
+
+@pytest.mark.parametrize("discount", [1.0, 0.9])
+def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount: float) -> None:
+    reward = {"harm": 0.0, "shaping": 1.0, "shaping_discount": discount}
+    scenario, game = game_of("paper-random", reward=reward)
+    state = game.begin(scenario.sample(50, 7))
+    tried = state.car[:, BRAKING, [2]] * -np.linspace(0.0, 1.0, 9)
+    least = hold(state, -state.car[:, BRAKING], [2], tried[:, :, np.newaxis], scenario.horizon_s, "first")[0].min(
+        axis=1
+    )
+    rng, total, factor = np.random.default_rng(5), np.zeros(50), 1.0
+    while not state.ended.all():
+        state, step = game.step(state, rng.uniform(-1.0, 0.0, (50, 1)))
+        total += factor * step.reward[:, 1]
+        factor *= discount
+        assert (step.reward[:, [0, 2]] == 0.0).all()
+    assert (least > 0).sum() > 20 and total == near(least, abs=1e-9)
+
+
+def best_in_rounds(state: State, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the harm if vehicles 1 and 2 choose one after the other, so often, and if vehicle 2 chooses alone."""
+    wanted, harms = -state.car[:, BRAKING], []
+    for body in (2, *(1, 2) * rounds):
+        tried = -state.car[:, BRAKING, [body]] * np.linspace(0.0, 1.0, 9)
+        harm = hold(state, wanted, [body], tried[:, :, np.newaxis], 8.0, "first")[0]
+        if harms:  # who chooses alone commands nothing
+            wanted[:, body] = tried[np.arange(state.n), harm.argmin(axis=1)]
+        harms.append(harm.min(axis=1))
+    return harms[-1], harms[0]
+
+
+def test_potential__of_two_learners_lets_each_choose_given_the_other_twice_round() -> None:
+    scenario, game = game_of("cooperation-3-pair")
+    state, rules = scenario.sample(300, seed=3), game.rules._replace(learners=np.array([1, 2]))
+    found, (twice, alone) = -potential(rules, state), best_in_rounds(state, 2)
+    assert found == near(twice, abs=1e-12)
+    assert (best_in_rounds(state, 1)[0] > found + 1.0).any()
+    assert -potential(rules._replace(learners=np.array([2])), state) == near(alone, abs=1e-12)
+    assert (found <= alone).all() and found.mean() < 0.1 * alone.mean()  # Vehicle 1 simply does not brake
+
+
+def test_potential__counts_only_what_is_still_to_come() -> None:
+    _, game = game_of("paper-random", reward={"harm": 1.0, "harm_count": "total"})
+    state = later(state_of([0.5, 60.0], [10.0, 20.0, 5.0]), -16.0, 8.0)
+    assert state.harm("total") > 0.0 and (state.line[:, SPEED, 1:] == 0.0).all()
+    assert potential(game.rules, state) == 0.0
+
+
+# ---------------------------------------------------------------- a vector of components
+
+
+def test_components__of_a_step_by_hand() -> None:
+    before = state_of([1.0, 1.0], [10.0, 20.0, 20.0], mass_t=[1.0, 3.0, 1.0], obstacle_gap_m=3.0)
+    after = later(before, 0.0, 2.0)
+    assert (after.line[0, FIRST, :3] > 0.0).all()
+    after.line[0, TOTAL, :3] += [1.0, 2.0, 3.0]  # later impacts
+    p0, p1, p2 = (after.line[0, TOTAL, p] for p in range(3))
+    vector = ["harm_1", "harm_2", "harm_3", "obstacle", "pair_1_2", "pair_2_3", "jerk"]
+    step = paid({"harm": 1.0, "harm_count": "total", "jerk": 1.0}, before, after, vector=vector)
+    borne = [0.75 * p1 + p0, 0.25 * p1 + 0.25 * p2, 0.75 * p2]
+    for vehicle in range(3):
+        expected = [*borne, p0, p1, p2, -step.terms["jerk"][0, vehicle]]
+        assert step.vector is not None and (-step.vector[0, vehicle]).tolist() == near(expected)
+
+
+def test_components__of_vehicles_add_up_to_the_reward() -> None:
+    _, game = game_of("cooperation-4-all", reward="harm", reward_vector="vehicles")
+    state = game.start(30, 1, 0)
+    while not state.ended.all():
+        state, step = game.step(state, np.full((30, len(game.rules.learners)), -0.2))
+        assert step.vector is not None and step.vector.shape == (30, 3, 3)
+        assert step.vector.sum(axis=2) == near(step.reward, abs=1e-9)
+    assert state.collided.any()
+
+
+# ---------------------------------------------------------------- what a reward says
+
+
+def rewards(reward: Any, scenario: Any = "paper-random", n: int = 40) -> tuple[np.ndarray, State]:
+    """Return the sum of rewards of each vehicle, and the last state."""
+    loaded, game = game_of(scenario, reward=reward)
+    state, total = game.begin(loaded.sample(n, 4)), np.zeros((n, 3))
+    actions = np.random.default_rng(2).uniform(-1.0, 0.0, (n, 1))
+    while not state.ended.all():
+        state, step = game.step(state, actions)
+        total += step.reward
+    return total, state
+
+
+def test_objective__is_the_scenarios_unless_the_reward_has_its_own() -> None:
+    own = load_scenario("paper-random").replace(objective="own")
+    plain = rewards("harm")[0]
+    assert rewards("harm", own)[0].tolist() == rewards({"harm": 1.0, "objective": "own"})[0].tolist() != plain.tolist()
+    assert rewards({"harm": 1.0, "objective": "total"}, own)[0].tobytes() == plain.tobytes()
+    assert rewards(RewardParams(objective=("total",) * 3))[0].tobytes() == plain.tobytes()
+
+
+def test_objective__changes_no_weight_and_no_other_term() -> None:
+    doubled, _ = rewards({"objective": "maximin", "harm": 2.0, "terminal": 3.0}, n=150)
+    single, state = rewards({"objective": "maximin", "harm": 1.0}, n=150)
+    safe = ~state.collided
+    assert safe.any() and single[:, 0] == near(-amounts(objectives_of("maximin", 3), None, state, "first")[:, 0])
+    assert doubled == near(2.0 * single + 3.0 * safe[:, np.newaxis])
+
+
+def test_objective__without_a_weight_of_harm_has_no_effect_and_warns() -> None:
+    own = load_scenario("cooperation-3-pair").replace(objective="own")
+    with pytest.warns(WithoutEffect, match="the scenario's objective, own, has no effect"):
+        _, game = game_of(own, reward="paper")
+    assert game.rules.harm == 0.0 and "harm" not in game.rewarding.counted
+    game_of(own, reward={"harm": 1.0, "risk": 0.1})
+
+
+def test_named_rewards__are_those_of_the_page() -> None:
+    assert {
+        "harm": RewardParams(harm=1.0, harm_count="first"),
+        "total-harm": RewardParams(harm=1.0, harm_count="total"),
+        "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
+    } == REWARDS
+    assert reward_params({"harm": 2, "jerk": 0.5}) == RewardParams(harm=2.0, jerk=0.5)
+    assert reward_params("paper") is REWARDS["paper"]
+
+
+def one(before: State, step: Step, after: State) -> np.ndarray:
+    """One for all."""
+    return np.ones(after.n)
+
+
+def gap(before: State, step: Step, after: State) -> np.ndarray:
+    """Gap ahead."""
+    return after.line[:, GAP, :-1] * [[0.0, 1.0, 1.0]]
+
+
+def test_terms_of_ones_own__count_where_a_reward_says_so() -> None:
+    for _ in range(2):  # registered twice it is one
+        register_term("one", one)
+    register_term("gap_ahead", gap, unit="m")
+    for reward in ({"harm": 1.0}, {"harm": 1.0, "one": 0.0}, "harm"):
+        assert [*paid(reward, *STRUCK).terms] == ["harm"]  # type: ignore[arg-type]
+    step = paid({"harm": 0.0, "one": 2.0, "gap_ahead": -1.0}, *STRUCK)
+    assert step.reward[0] == near([2.0, 2.0 - 2.0, 2.0 - 10.25])
+    settled = RewardParams(harm=1.0, terms={"one": 3.0})
+    assert RewardParams(**settled.model_dump()) == settled and settled.weights["one"] == 3.0
