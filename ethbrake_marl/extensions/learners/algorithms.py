@@ -49,9 +49,8 @@ class Vine(Algorithm):
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
         """Return the averaged weights."""
-        if network.networks > 1:
-            return dict(actor.tensors(network))
-        return actor.tensors("policy") | {"policy.log_std": np.full(1, -3.0, np.float32)}  # never used
+        one = {"policy.log_std": np.full(1, -3.0, np.float32)}  # which never counts, because vine does not explore
+        return dict(actor.tensors("policy") | one if network.networks == 1 else actor.tensors(network))
 
 
 class RolloutClassification(Algorithm):

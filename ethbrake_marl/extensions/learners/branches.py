@@ -84,8 +84,7 @@ def stands_for_good(before: State, after: State) -> Bools:
     stands &= (np.abs(after.line[:, FORCE] - before.line[:, FORCE]) < ROUNDING_MPS2).all(axis=1)
     stands &= ((late < time) | np.isinf(late)).all(axis=1)
     known = (after.know < time[:, np.newaxis]) | np.isinf(after.know)
-    stands &= known.all(axis=(1, 2))
-    return stands
+    return np.asarray(stands & known.all(axis=(1, 2)))
 
 
 def play_to_the_end(game: Game, state: State, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:

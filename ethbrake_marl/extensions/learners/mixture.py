@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import update_learning_rate
 from torch import nn
@@ -25,7 +23,7 @@ from ethbrake_marl.episode.play import played
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Moment, moving, other_count, play_on
-from ethbrake_marl.extensions.learners.networks import Averaged, Memory, Scout, choose_rows, perceptron, silent
+from ethbrake_marl.extensions.learners.networks import Averaged, Memory, drawn, perceptron, silent
 from ethbrake_marl.extensions.learners.recipes import ExpertsPlan, VineRecipe
 from ethbrake_marl.extensions.learners.vine import Actor, Tried, VineModel
 from ethbrake_marl.motion.layout import Floats, Ints
@@ -81,29 +79,20 @@ class Mixture(nn.Module):
         assert plan is not None
         self.actors: Any = nn.ModuleList([Actor(inputs, recipe) for _ in range(plan.networks)])
         average = silent(perceptron(inputs, plan.networks, plan.gating, recipe.network.activation))  # the first acts
-        scout = Scout(inputs) if recipe.focus > 0.0 else None
-        self.gate = Averaged(average, copy.deepcopy(average), rate, scout)
+        self.gate = Averaged(average, copy.deepcopy(average), rate)
         self.memory = Memory(plan.gating_memory, seen=torch.zeros(inputs), more=torch.zeros(plan.networks))
 
-    def chosen(self, observations: Float32s, ask: Callable[[Actor, Float32s], NDArray[Any]]) -> Floats:
-        """Return what the chosen actors answer to the observations [rows, F], [rows]."""
-        chosen, values = self.gate.best(observations), np.empty(len(observations))
+    def means(self, observations: Float32s) -> Float32s:
+        """Return the outputs of the chosen actors, not clipped, [rows], for observations [rows, F]."""
+        chosen, means = self.gate.best(observations), np.empty(len(observations), np.float32)
         for number, actor in enumerate(self.actors):
             rows = np.flatnonzero(chosen == number)
-            values[rows] = ask(actor, observations[rows])
-        return values
-
-    def means(self, observations: Float32s) -> Float32s:
-        """Return the outputs of the chosen actors, not clipped."""
-        return self.chosen(observations, Actor.means).astype(np.float32)
+            means[rows] = actor.means(observations[rows])
+        return means
 
     def act(self, observations: Float32s) -> Float32s:
         """Return the actions."""
         return np.clip(self.means(observations), -1.0, 1.0)
-
-    def expect(self, observations: Float32s) -> Floats:
-        """Return the sizes that the scouts of the chosen actors expect."""
-        return self.chosen(observations, Actor.expect)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
         """Return copies of all averaged weights, by their names in a policy file."""
@@ -133,7 +122,7 @@ class MixtureModel(VineModel):
 
     policy: Mixture  # type: ignore[assignment]
 
-    def new_actors(self) -> nn.Module:
+    def new_policy(self) -> nn.Module:
         """Return experts and gating network."""
         assert self.recipe.experts is not None
         self.plan = self.recipe.experts
@@ -194,9 +183,9 @@ class MixtureModel(VineModel):
     def enter(self, stage: Stage) -> None:
         """Prepare a stage that begins, or is resumed.
 
-        A second or later expert first imitates templates; then the worlds of its training are selected. All this depends
-        on the earlier experts only, so a resumed training repeats it exactly. Raises ``NoBetterTemplate`` if there is
-        no better template, or no world to select.
+        A second or later expert first imitates templates; then the worlds of its training are selected. All this
+        depends on the earlier experts only, so a resumed training repeats it exactly. Raises ``NoBetterTemplate`` if
+        there is no better template, or no world to select.
         """
         self.stage, self.own = stage, None
         if stage.trains != "other":
@@ -266,14 +255,14 @@ class MixtureModel(VineModel):
 
     def imitate(self, pupil: Actor, shown: Shown, seed: int) -> None:
         """Train an expert to act as shown, in a random order of its own."""
-        pupil.new_optimizer(self.lr_schedule(1.0), alone=True)
+        pupil.new_optimizer(self.lr_schedule(1.0))
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
         for _ in range(self.plan.imitation_epochs):
             for batch in torch.split(torch.randperm(len(wanted), generator=generator), self.recipe.batch_size):
                 means, target = pupil.learning(seen[batch])[:, 0], wanted[batch]
                 reached = (target.abs() >= 1.0) & (means * target >= 1.0)  # an output beyond a bound is clipped to it
-                pupil.descend(mse_loss(means, torch.where(reached, means.detach(), target)))
+                pupil.descend(mse_loss(means, torch.where(reached, means.detach(), target)), self.recipe.averaging)
         pupil.follow(0.0)
 
     def worlds_of(self, act: Act, explored: Explored) -> State:
@@ -286,37 +275,33 @@ class MixtureModel(VineModel):
         own = (more > -self.plan.margin) & (np.abs(more) > NO_DIFFERENCE) & (explored.harm > 0.0)
         return explored.start.take(np.flatnonzero(own))
 
-    def compare(self, seen: Float32s, states: State) -> tuple[Float32s, Floats, Float32s]:
+    def compare(self, seen: Float32s, states: State) -> tuple[Float32s, Floats]:
         """Let every expert drive on from some decisions at which they differ.
 
-        Returns the observations there, [B, F], the cost of each of K experts, [B, K], and importances, [B]. The cost is
-        minus the return, plus ``tie_break`` times the harm by the other count.
+        Returns the observations there, [B, F], and the cost of each of K experts, [B, K]: minus the return, plus
+        ``tie_break`` times the harm by the other count.
         """
         policy, plan = self.policy, self.plan
         actions = np.stack([actor.act(seen) for actor in policy.actors])
         differ = np.flatnonzero((np.ptp(actions, axis=0) > 1e-2) & moving(states))
-        rows, importance = choose_rows(seen, differ, plan.gating_states, self.recipe.focus, policy.gate.expect)
+        rows = drawn(differ, plan.gating_states)
         start, other = states.take(rows), other_count(self.recipe.reward.harm_count)
         costs = np.empty((len(rows), plan.networks))
         for k, actor in enumerate(policy.actors):
             gained, harm = self.drive_from(start, actor.act, other)
             costs[:, k] = plan.tie_break * harm - gained
-        return seen[rows], costs, importance
+        return seen[rows], costs
 
-    def train_gate(self, seen: Float32s, costs: Floats, importance: Float32s) -> None:
+    def train_gate(self, seen: Float32s, costs: Floats) -> None:
         """Teach the gating network the cheapest expert; a wrong choice weighs as much as it costs more."""
         gate, memory, plan = self.policy.gate, self.policy.memory, self.plan
         self._update_learning_rate(gate.optimizer)
         more = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
         rows = np.flatnonzero(more.max(axis=1) > 1e-9)
-        memory.store(seen=seen[rows], more=more[rows] * importance[rows, np.newaxis])
-        if gate.scout is not None:
-            arrays = [torch.from_numpy(array) for array in (seen, more.max(axis=1), importance)]
-            for batch in torch.split(torch.randperm(len(seen)), self.recipe.batch_size):
-                gate.descend(gate.scout.loss(*(array[batch] for array in arrays)))
+        memory.store(seen=seen[rows], more=more[rows])
         if len(rows):
             regret = np.take_along_axis(more[rows], gate.best(seen[rows])[:, np.newaxis], axis=1)
-            self.logger.record("gating/regret", float((regret[:, 0] * importance[rows]).mean()))
+            self.logger.record("gating/regret", float(regret.mean()))
         losses = []
         for _ in range(plan.gating_steps if len(memory) else 0):
             some = torch.randint(len(memory), (self.recipe.batch_size,))
@@ -324,9 +309,7 @@ class MixtureModel(VineModel):
             scores = gate.learning(memory.get_buffer("seen")[some])
             best = scores.gather(1, costlier.argmin(dim=1, keepdim=True))
             loss = (costlier * softplus(scores - best)).sum(dim=1).mean()
-            gate.descend(loss)
-            gate.follow(self.recipe.averaging)
-            losses.append(loss.item())
+            losses.append(gate.descend(loss, self.recipe.averaging))
         if losses:
             self.logger.record("gating/loss", float(np.mean(losses)))
 

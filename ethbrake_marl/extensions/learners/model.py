@@ -83,7 +83,7 @@ class BranchingModel(BaseAlgorithm):
         return self.visit(callback, self.policy.act)
 
     def visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions; return the observations [decisions L, F], and the states there."""
+        """Drive all worlds for ``n_steps`` decisions; return observations [decisions L, F], and the states there."""
         seen, states, every = [], [], np.arange(self.rows.n)
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
@@ -109,4 +109,4 @@ class BranchingModel(BaseAlgorithm):
     def drawn_steps(self, count: int) -> Ints:
         """Draw for how many steps each of ``count`` tried actions lasts, [count]."""
         holds = np.array(self.recipe.holds, np.int64)
-        return holds[torch.randint(len(holds), (count,)).numpy()]
+        return np.asarray(holds[torch.randint(len(holds), (count,)).numpy()])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from operator import not_
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
@@ -60,13 +60,6 @@ class BranchingRecipe(TrainingRecipe):
         ge=0.0,
         lt=1.0,
         description="share of the weight average that a gradient step keeps; the trained policy uses the average",
-    )
-    focus: float = Field(
-        0.0,
-        ge=0.0,
-        le=0.99,
-        exclude_if=not_,
-        description="share of the decisions that are drawn more often where the action is expected to matter more",
     )
 
     @model_validator(mode="after")
@@ -155,8 +148,8 @@ class VineRecipe(BranchingRecipe):
         " and for random weights, with a warning, if there is none; left out: random weights",
     )
     offset: Range = Field(description="range of the offset between a tried action and the policy's action")
-    gradient_limit: Positive | Literal["auto"] = Field(
-        description="largest gradient (return per unit of action); larger ones are cut to it; auto: it is computed"
+    gradient_limit: Positive = Field(
+        description="largest gradient (return per unit of action); larger ones are cut to it"
     )
     trust_radius: Rate = Field(description="largest distance, in one update, between an action and its target")
     anchor: Positive = Field(description="weight that holds actions at their value where the gradient is small")
@@ -177,20 +170,10 @@ class VineRecipe(BranchingRecipe):
             )
         return start
 
-    @field_validator("gradient_limit", mode="wrap")
-    @classmethod
-    def _automatic_or_fixed(cls, value: Any, check: Any) -> Any:
-        try:
-            return check(value)
-        except ValueError:
-            raise ValueError("must be 'auto' or a finite number above 0") from None
-
     def network_spec(self, observation_size: int) -> NetworkSpec:
         """Return the actor, or the experts and the gating network."""
         spec, plan = super().network_spec(observation_size), self.experts
-        return spec if plan is None else spec.model_copy(
-            update={"networks": plan.networks, "gate_hidden": plan.gating}
-        )
+        return spec if plan is None else spec.model_copy(update={"networks": plan.networks, "gate_hidden": plan.gating})
 
     def check_learners(self, learners: int) -> None:
         """Raise ``InvalidInput`` for a mixture of experts with several learners."""
@@ -250,6 +233,13 @@ class RolloutClassificationRecipe(BranchingRecipe):
         exclude_if=not_,
         description="true: in a mixture of scenarios, a cost is divided by the mean cost in its scenario",
     )
+    focus: float = Field(
+        0.0,
+        ge=0.0,
+        le=0.99,
+        exclude_if=not_,
+        description="share of the remembered decisions that are drawn in proportion to their largest extra cost",
+    )
     guide: NonNegative = Field(
         description="weight of the convex term of the loss; without it learning can stall at the beginning"
     )
@@ -294,8 +284,10 @@ class RolloutClassificationRecipe(BranchingRecipe):
         """Return the network, and those of the policies that it can choose."""
         own = {"observation_size": observation_size, "value_hidden": ()}
         among = tuple(each.network.model_copy(update=own) for each in self.members)
-        return super().network_spec(observation_size).model_copy(
-            update={"output": "choice", "choices": self.network.choices, "among": among}
+        return (
+            super()
+            .network_spec(observation_size)
+            .model_copy(update={"output": "choice", "choices": self.network.choices, "among": among})
         )
 
 

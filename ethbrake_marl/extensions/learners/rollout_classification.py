@@ -16,13 +16,12 @@ from torch.nn.functional import softplus
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.extensions.learners.branches import Moment, moving, other_count, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
-from ethbrake_marl.extensions.learners.networks import Averaged, Memory, draw_rows, perceptron, silent
+from ethbrake_marl.extensions.learners.networks import Averaged, Memory, drawn, perceptron, silent
 from ethbrake_marl.extensions.learners.recipes import RolloutClassificationRecipe
 from ethbrake_marl.extensions.learners.start import widened
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.layers import Float32s, Layers
-from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.worlds.sampling import member_numbers
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -61,7 +60,7 @@ class Chooser(Averaged):
         among = [widened(member, features, recipe.name, "policies") for member in recipe.members]
         spec = recipe.network_spec(inputs)
         average = silent(perceptron(inputs, len(among) + shape.choices, shape.policy, shape.activation))
-        super().__init__(average, copy.deepcopy(average), recipe.learning_rate.at(1.0), None)
+        super().__init__(average, copy.deepcopy(average), recipe.learning_rate.at(1.0))
         fixed = {f"among_{m}.{name}": each for m, member in enumerate(among, 1) for name, each in member.items()}
         self.first, self.fixed = len(among), fixed
         self.actor = TorchActor(spec, {**self.tensors("policy"), **fixed})
@@ -81,17 +80,19 @@ class Chooser(Averaged):
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
         """Draw ``count`` remembered decisions for each step of the optimiser: numbers and importances, [count] each.
 
-        The share ``focus`` is drawn in proportion to the largest extra cost, the others uniformly.
+        The share ``focus`` is drawn in proportion to the largest extra cost, the others uniformly. The importance of a
+        decision, ``1 / (n p)`` with the probability p of drawing it from n, keeps the mean of the loss.
         """
         known = len(self.memory)
-        if focus == 0.0 or batches == 0:
+        if focus == 0.0:
             for _ in range(batches):
                 yield torch.randint(known, (count,)), torch.ones(count)
             return
-        most = self.memory.get_buffer("more")[:known].max(dim=1).values
-        rows, importance = draw_rows(most.numpy(), batches * count, focus)
-        parts = zip(*(torch.from_numpy(each).split(count) for each in (rows, importance)), strict=True)
-        yield from parts
+        most = self.memory.get_buffer("more")[:known].max(dim=1).values.numpy()
+        chance = (1.0 - focus) / known + focus * (most / most.sum())
+        rows = torch.multinomial(torch.from_numpy(chance), batches * count, replacement=True)
+        importance = torch.from_numpy((1.0 / (known * chance[rows.numpy()])).astype(np.float32))
+        yield from zip(rows.view(batches, count), importance.view(batches, count), strict=True)
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
         """Return the loss at remembered decisions: expected extra cost of a choice, plus ``guide`` times a convex term.
@@ -142,14 +143,12 @@ class RolloutClassificationModel(BranchingModel):
         self.logger.record("train/regret", float(more[:, 0].mean()) if len(more) else 0.0)
         self.logger.record("train/differ", len(differ))
         losses = []
-        batches = recipe.gradient_steps if len(chooser.memory) else 0
-        for some, importance in chooser.draw(batches, recipe.batch_size, recipe.focus):
-            loss = chooser.loss(some, importance, recipe.guide)
-            chooser.descend(loss)
-            chooser.follow(recipe.averaging)
-            losses.append(loss.item())
+        if not len(chooser.memory):
+            return
+        for some, importance in chooser.draw(recipe.gradient_steps, recipe.batch_size, recipe.focus):
+            losses.append(chooser.descend(chooser.loss(some, importance, recipe.guide), recipe.averaging))
         self._n_updates += len(losses)
-        self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
+        self.logger.record("train/loss", float(np.mean(losses)))
 
     def choices_at(self, seen: Float32s) -> Ints:
         """Return which choices to try at decisions with the observations ``seen`` [B, F], [B, C]; its own one first."""
@@ -177,7 +176,7 @@ class RolloutClassificationModel(BranchingModel):
         """
         recipe, chooser, learners = self.recipe, self.policy, self.learners
         alive = np.flatnonzero(moving(states).repeat(learners))
-        rows = alive[torch.randperm(len(alive))[: recipe.tried].numpy()]
+        rows = drawn(alive, recipe.tried)
         tried = self.choices_at(seen[rows])
         every, steps_of = chooser.first + recipe.network.choices, self.drawn_steps(len(rows))
         pairs, back = np.unique(np.arange(len(rows))[:, np.newaxis] * every + tried, return_inverse=True)
@@ -222,4 +221,4 @@ class RolloutClassificationModel(BranchingModel):
         for m in np.unique(member):
             mean = float(least[member == m].mean())
             usual[m] = USUAL_KEPT * usual[m] + (1.0 - USUAL_KEPT) * mean if usual[m] else mean
-        return np.maximum(usual[member], LEAST_USUAL)
+        return np.asarray(np.maximum(usual[member], LEAST_USUAL))

@@ -10,21 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners.branches import Offsets, moving, play_to_the_end
 from ethbrake_marl.extensions.learners.model import BranchingModel
-from ethbrake_marl.extensions.learners.networks import Averaged, Scout, choose_rows, linear_layers, perceptron
+from ethbrake_marl.extensions.learners.networks import Averaged, drawn, linear_layers, perceptron
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
-from ethbrake_marl.motion.elementary import exp, log
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.policies.layers import Float32s
-
-REMEMBERED = 65_536  # measured gradients from which `gradient_limit: auto` is computed
-CUT = 0.1  # share of the sum of gradients that the limit then removes
-SPREAD = 2.0  # ratio of the gradients (root mean square) at the smallest offset to those at the largest
-NARROWEST = 4.0  # least ratio of the largest offset to the smallest
 
 
 class Actor(Averaged):
@@ -40,8 +34,7 @@ class Actor(Averaged):
         nn.init.orthogonal_(last.weight, 0.01)
         nn.init.constant_(last.bias, shape.initial_action or 0.0)
         learning = perceptron(inputs, 1, shape.policy, shape.activation)
-        scout = Scout(inputs) if recipe.focus > 0.0 else None
-        super().__init__(average, learning, recipe.learning_rate.at(1.0), scout)
+        super().__init__(average, learning, recipe.learning_rate.at(1.0))
 
     @torch.no_grad()
     def means(self, observations: Float32s) -> Float32s:
@@ -60,7 +53,6 @@ class Tried(NamedTuple):
     seen: Float32s  # [B, F] observations
     mean: Float32s  # [B] output of the actor, not clipped
     gradient: Float32s  # [B] of the return with respect to the action
-    importance: Float32s  # [B] weight in the loss
 
 
 class VineModel(BranchingModel):
@@ -70,14 +62,7 @@ class VineModel(BranchingModel):
     recipe: VineRecipe
 
     def new_policy(self) -> nn.Module:
-        """Return the actor, with the memory of measured gradients and their offsets if the limit is automatic."""
-        policy = self.new_actors()
-        if self.recipe.gradient_limit == "auto":
-            policy.register_buffer("measured", torch.zeros(REMEMBERED, 2, dtype=torch.float64))
-        return policy
-
-    def new_actors(self) -> nn.Module:
-        """Return what drives."""
+        """Return the actor."""
         return Actor(len(self.features), self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -91,10 +76,8 @@ class VineModel(BranchingModel):
         """Draw visited decisions; play a branch with a higher and one with a lower action than the policy's."""
         recipe, learners = self.recipe, self.learners
         alive = np.flatnonzero(moving(states).repeat(learners))
-        rows, importance = choose_rows(seen, alive, recipe.tried, recipe.focus, policy.expect)
-        least, most, memory = recipe.offset.smallest, recipe.offset.largest, getattr(self.policy, "measured", None)
-        if memory is not None:
-            least = smallest_offset(memory.numpy(), least, most)
+        rows = drawn(alive, recipe.tried)
+        least, most = recipe.offset.smallest, recipe.offset.largest
         sizes: Floats = least * (most / least) ** torch.rand(len(rows), dtype=torch.float64).numpy()
         steps = np.tile(self.drawn_steps(len(rows)), 2)
         offsets = Offsets(np.tile(rows % learners, 2), np.concatenate([sizes, -sizes]), steps)
@@ -102,39 +85,22 @@ class VineModel(BranchingModel):
         gained, moved = play_to_the_end(self.game, branches, policy.act, offsets, recipe.gamma)
         (up, down), (higher, lower) = np.split(gained, 2), np.split(moved, 2)
         measured = (up - down) / (higher - lower)
-        gradient = self.limited(measured, sizes, memory, least)
-        return Tried(seen[rows], policy.means(seen[rows]), gradient.astype(np.float32), importance)
-
-    def limited(self, measured: Floats, sizes: Floats, memory: Tensor | None, least: float) -> Floats:
-        """Return the gradients within the recipe's limit, and remember them if the limit is automatic."""
-        limit = self.recipe.gradient_limit
-        if memory is not None:
-            new = torch.from_numpy(np.stack([np.abs(measured), sizes], axis=1))
-            memory.copy_(torch.cat([memory, new])[-len(memory) :])
-            limit = limit_that_cuts(memory[:, 0].numpy(), CUT)
-            self.logger.record("train/gradient_limit", limit)
-            self.logger.record("train/smallest_offset", least)
-        assert limit != "auto"
-        gradient = np.clip(measured, -limit, limit)
+        gradient = np.clip(measured, -recipe.gradient_limit, recipe.gradient_limit)
         whole = float(np.abs(measured).sum())
         self.logger.record("train/gradient_cut", 1.0 - float(np.abs(gradient).sum()) / whole if whole else 0.0)
-        return gradient
+        return Tried(seen[rows], policy.means(seen[rows]), gradient.astype(np.float32))
 
     def train_actor(self, actor: Actor, tried: Tried) -> None:
         """Move an actor's outputs towards their targets."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)
-        arrays = (tried.seen, target, weight * tried.importance, np.abs(tried.gradient), tried.importance)
-        seen, wanted, weights, sizes, importance = (torch.from_numpy(array) for array in arrays)
+        seen, wanted, weights = (torch.from_numpy(array) for array in (tried.seen, target, weight))
         losses = []
         for _ in range(recipe.n_epochs):
             for batch in torch.split(torch.randperm(len(wanted)), recipe.batch_size):
                 loss = (weights[batch] * (actor.learning(seen[batch])[:, 0] - wanted[batch]) ** 2).mean()
-                scout = [] if actor.scout is None else [actor.scout.loss(seen[batch], sizes[batch], importance[batch])]
-                actor.descend(loss, *scout)
-                actor.follow(recipe.averaging)
-                losses.append(loss.item())
+                losses.append(actor.descend(loss, recipe.averaging))
         self._n_updates += recipe.n_epochs
         self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
         self.logger.record("train/gradient", float(np.abs(tried.gradient).mean()) if len(wanted) else 0.0)
@@ -149,34 +115,8 @@ def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32
     m. An output at or beyond 1 is not moved farther out, because actions are clipped to [-1, 1].
     """
     outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))
-    gradient = np.where(outward, np.float32(0.0), tried.gradient)
+    gradient = tried.gradient.copy()
+    gradient[outward] = 0.0
     weight = (np.abs(gradient) / radius + anchor).astype(np.float32)
-    return tried.mean + gradient / weight, weight
-
-
-def limit_that_cuts(sizes: Floats, share: float) -> float:
-    """Return the limit at which clipping ``sizes`` [n] lowers their sum by the fraction ``share``.
-
-    Sizes 1, 1, 4 and the share 1/3 give 2: clipped they are 1, 1, 2, and their sum falls from 6 to 4.
-    """
-    rising = np.sort(sizes)
-    remaining = np.cumsum(rising) + np.arange(len(rising) - 1, -1, -1) * rising  # sum if each in turn is the limit
-    return float(np.interp((1.0 - share) * remaining[-1], remaining, rising))
-
-
-def smallest_offset(measured: Floats, least: float, most: float) -> float:
-    """Return the smallest offset with which gradients should be measured, from ``least`` to ``most / NARROWEST``.
-
-    Where harm is smooth, gradients do not depend on the offset, and ``least`` is best. Where it jumps, they grow as the
-    offset falls; then the result is the offset at which they are expected to be ``SPREAD`` times as large (in root mean
-    square) as at ``most``. ``measured`` [n, 2] has rows (absolute gradient, its offset); offset 0: an empty row. The
-    half with the smaller offsets is compared with the other half, on logarithmic scales.
-    """
-    known = measured[measured[:, 1] > 0.0]
-    halves = np.array_split(known[np.argsort(known[:, 1], kind="stable")], 2)
-    if not all(half[:, 0].any() for half in halves):
-        return least
-    near, far = (log(float(np.mean(half[:, 0] * half[:, 0]))) / 2.0 for half in halves)
-    apart = log(float(np.median(halves[1][:, 1]) / np.median(halves[0][:, 1])))
-    lower = exp(-log(SPREAD) * apart / (near - far)) if near > far else 0.0
-    return max(least, most * min(lower, 1.0 / NARROWEST))
+    target: Float32s = tried.mean + gradient / weight
+    return target, weight
