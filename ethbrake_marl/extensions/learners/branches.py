@@ -6,6 +6,7 @@ that still run; L: learners, front to rear; F: features.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,7 +14,8 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import FORCE, GAP, HIT, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
 
@@ -52,9 +54,8 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
     ``decide`` is asked for those that still run. If harm is the only term of the reward, an episode also ends once
     everything stands for good, but not in its first ``at_least`` steps.
     """
-    learners = game.rules.learners
+    learners, only_harm = game.rules.learners, set(game.rewarding.counted) <= {"harm"}
     gained, last, rows = np.zeros((state.n, len(learners))), state, np.flatnonzero(~state.ended)
-    only_harm = set(game.rewarding.counted) <= {"harm"}
     now, discount, number = state.take(rows), 1.0, 0
     while len(rows):
         after, step = game.step(now, decide(Moment(now, game.observe_alike(now, learners), rows, number)))
@@ -64,7 +65,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
             over |= stands_for_good(now, after)
         if over.any():
             last = last.put(rows[over], after.take(over), donate=last is not state)
-            rows, after = rows[~over], after.take(~over)
+            rows, after = rows[~over], after.take(np.flatnonzero(~over))
         now, discount, number = after, discount * gamma, number + 1
     return gained, last
 
@@ -75,16 +76,28 @@ def stands_for_good(before: State, after: State) -> Bools:
     There nothing has changed in this step, and nobody waits for a latency or for news. It is never sure with scripts or
     messages that have a memory.
     """
-    stands = ~(before.line[:, SPEED].any(axis=1) | after.line[:, SPEED].any(axis=1))
-    if after.memories or not stands.any():
-        return np.zeros(after.n, np.bool_)
-    time = before.time_s[:, np.newaxis]
-    late = after.car[:, LATENCY]
-    stands &= (before.line[:, (GAP, HIT)] == after.line[:, (GAP, HIT)]).all(axis=(1, 2))
-    stands &= (np.abs(after.line[:, FORCE] - before.line[:, FORCE]) < ROUNDING_MPS2).all(axis=1)
-    stands &= ((late < time) | np.isinf(late)).all(axis=1)
-    known = (after.know < time[:, np.newaxis]) | np.isinf(after.know)
-    return np.asarray(stands & known.all(axis=(1, 2)))
+    out = np.zeros(after.n, np.bool_)
+    if not after.memories:
+        find_standing(before.line, after.line, after.car, after.know, before.clock, out)
+    return out
+
+
+@large
+def find_standing(before: Floats, line: Floats, car: Floats, know: Floats, clock: Floats, out: Bools) -> None:
+    """Set ``out`` [n] where worlds stand for good; ``before`` and ``clock`` are those of the step before."""
+    bodies = line.shape[2]
+    for k in range(len(out)):
+        stands, time = True, clock[k, TIME]
+        for i in range(bodies):
+            stands = stands and before[k, SPEED, i] == 0.0 and line[k, SPEED, i] == 0.0
+        if stands:
+            for i in range(bodies):
+                stands = stands and before[k, GAP, i] == line[k, GAP, i] and before[k, HIT, i] == line[k, HIT, i]
+                stands = stands and abs(before[k, FORCE, i] - line[k, FORCE, i]) < ROUNDING_MPS2
+                stands = stands and (car[k, LATENCY, i] < time or car[k, LATENCY, i] == math.inf)
+                for j in range(bodies):
+                    stands = stands and (know[k, i, j] < time or know[k, i, j] == math.inf)
+        out[k] = stands
 
 
 def play_to_the_end(game: Game, state: State, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
