@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
-from ethbrake_marl.first_edition.game.observed import observation_for
-from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec
-from ethbrake_marl.first_edition.policies.policy import Policy
-from ethbrake_marl.first_edition.training.recipe import load_recipe
-from ethbrake_marl.first_edition.training.recipes import PpoRecipe
-from ethbrake_marl.first_edition.training.run_folder import RunDirectory
-from ethbrake_marl.first_edition.training.training import Training
+from ethbrake_marl.policies.bundle import save_drivers
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.recipe import PpoRecipe, load_recipe
+from ethbrake_marl.training.run import RunFolder
+from ethbrake_marl.training.training import Training
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
@@ -44,24 +43,21 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
 def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path, algorithm: str = "mappo") -> Policy:
     """Train BenchMARL's MAPPO with the hyperparameters of `recipe`, and save the shared actor in the new `directory`.
 
-    `algorithm` may also be "ippo", whose critic has the observation of the actor. `load_team` and `ppo@DIRECTORY` load
-    the result. The learning rate keeps its initial value, because BenchMARL has no schedule. There are no checkpoints
-    and no evaluations during the training.
+    `algorithm` may also be "ippo", whose critic has the observation of the actor. `team@DIRECTORY` and `ppo@DIRECTORY`
+    drive with the result. The learning rate keeps its initial value, because BenchMARL has no schedule. There are no
+    checkpoints and no evaluations during the training.
     """
-    from ethbrake_marl.first_edition.training.random_state import own_random_state
-
     recipe = recipe.replace(scheme="centralised")
     if recipe.observation is not None:
         scenario = scenario.replace(observation=list(recipe.observation))
-    team = Training.of(recipe, scenario).team()
-    content = {"recipe": recipe.model_dump(mode="json"), "scenario": scenario.model_dump(mode="json")}
-    run = RunDirectory(directory).create({**content, "library": "benchmarl"}, team=team)
-    with own_random_state(), tempfile.TemporaryDirectory() as scratch:
+    training, run = Training.of(recipe, scenario), RunFolder(directory)
+    run.create(training, {**training.config(), "library": "benchmarl"})
+    with tempfile.TemporaryDirectory() as scratch:
         experiment = make_experiment(recipe, scenario, scratch, algorithm)
         experiment.run()
         policy = policy_of(experiment, recipe, scenario)
-    policy.save(run.policy)
-    run.write_status("finished", steps=policy.steps)
+    save_drivers(dict.fromkeys(training.learners, policy), run.policy)
+    run.write_status("finished", steps=policy.manifest.steps)
     return policy
 
 
@@ -103,9 +99,9 @@ def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Poli
     from torchrl.modules import MultiAgentMLP
 
     (actor,) = (m for m in experiment.group_policies["learners"].modules() if isinstance(m, MultiAgentMLP))
-    observation = observation_for(scenario)
+    training = Training.of(recipe, scenario)
     network = NetworkSpec(
-        observation_size=observation.size,
+        observation_size=len(training.row.names),
         action_size=1,
         policy_hidden=recipe.network.policy,
         value_hidden=(),
@@ -116,9 +112,9 @@ def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Poli
         tensors_of(actor, len(recipe.network.policy)),
         algorithm="ppo",
         network=network,
-        observation=observation,
-        learners=tuple(scenario.vehicle_names[vehicle] for vehicle in scenario.learners),
-        scenario=scenario.model_dump(mode="json"),
+        observation=training.row,
+        learners=training.learners,
+        scenario=scenario.content(),
         reward=recipe.reward.model_dump(mode="json"),
         seeds={"training": recipe.seed},
         steps=int(experiment.total_frames) * len(scenario.learners),

@@ -1,10 +1,8 @@
 """A scenario as a TorchRL environment and as a BenchMARL task; needs ``pip install ethbrake-marl[marl]``.
 
-The environment runs ``n`` worlds in one engine. All learners of a world form one group in TorchRL, and the episode of a
-world ends for all its learners at the same time. ``state``, the input of a central critic, is the full state of the
-line (``game.full_state.full_state``).
-
-Letters in shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
+The learners of a world are one group of TorchRL, whose episode ends for all at the same time. ``state``, the input of a
+central critic, is the full state of the line (``episode.full_state``). Letters in shapes: n worlds, L learners, F
+features of an observation, S of the state.
 """
 
 from __future__ import annotations
@@ -19,36 +17,39 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.first_edition.envs.making import feature_box, learner_action_space, make_engine
-from ethbrake_marl.first_edition.game.discrete_actions import index_to_action
-from ethbrake_marl.first_edition.game.full_state import full_state, state_features
-from ethbrake_marl.first_edition.game.observed import observation_for
-from ethbrake_marl.first_edition.game.rewards import Reward
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.scenario.schema import Scenario
-from ethbrake_marl.first_edition.shields.attach import guard_of
-from ethbrake_marl.first_edition.shields.options import ShieldOptions
+from ethbrake_marl.episode.full_state import full_state, state_features
+from ethbrake_marl.episode.reward import Reward
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.faces.actions import action_space, checked_actions
+from ethbrake_marl.faces.shield import MODES
+from ethbrake_marl.faces.spaces import FeatureBox
+from ethbrake_marl.faces.stream import Stream
+from ethbrake_marl.names import open_game
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.scenario import Scenario
 
 GROUP = "learners"
 
 
 class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the extra is not installed
-    """TorchRL environment with ``n`` worlds of one scenario and ``L`` learners.
+    """``n`` worlds of one scenario.
 
     Shapes: observation [n, L, F], action [n, L, 1] (with discrete actions [n, L]), reward [n, L, 1], state [n, S], done
     [n, 1].
 
     Args:
-        scenario: the scenario, which must have at least one learner.
+        scenario: must have a learner; all learners observe the same features.
         n: number of worlds.
-        seed: seed from which the worlds are drawn.
-        reward: reward of the learners: a name such as ``harm``, or the weights of the reward's terms.
-        horizon_is_end: True: an episode that reaches the horizon is terminated; False: it is truncated.
-        shield: mode of the learners' shield, which must be ``step`` if there are several learners. None: no shield.
+        seed: of the stream of worlds.
+        reward: a name such as ``harm``, or weights of terms.
+        horizon_is_end: an episode at the horizon is terminated, not truncated.
+        shield: mode of a shield around the learners, such as ``step``; None: no shield.
         actions: number of discrete actions, for algorithms such as QMIX; None: actions are numbers in [-1, 1].
 
     """
+
+    episode: State
 
     def __init__(
         self,
@@ -61,60 +62,65 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         actions: int | None = None,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))
-        self.engine = make_engine(scenario, n, reward=reward, observation=observation_for(scenario), seed=seed)
+        self.scenario, self.game = open_game(scenario, reward=reward)
         if shield is not None:
-            self.engine.protect(guard_of(self.engine, None, ShieldOptions(shield)))
-        self.horizon_is_end = horizon_is_end
-        self._learners = np.array(self.engine.learners, np.int64)
-        rows = (n, len(self._learners))
-        seen = _bound(feature_box(self.engine.observation.features), rows)
-        state = _bound(feature_box(state_features(scenario)), (n,))
+            if shield not in MODES:
+                raise unknown_name("shield mode", shield, MODES)
+            self.game = self.game._replace(shield=MODES[shield](None))
+        self.horizon_is_end, self.actions, self.learners = horizon_is_end, actions, self.game.rules.learners
+        if not len(self.learners) or len({self.game.views[body] for body in self.learners}) > 1:
+            raise InvalidInput(
+                f"scenario {scenario.name!r}: must have at least one learner, and all learners must observe the same"
+                " features"
+            )
+        self.stream, self._of_state = Stream(self.scenario, self.game), (scenario.horizon_s, scenario.has_obstacle)
+        self.stream.seed, rows = seed, (n, len(self.learners))
+        seen = _bound(FeatureBox(self.game.views[self.learners[0]].features), rows)
+        state = _bound(FeatureBox(state_features(scenario.vehicles, *self._of_state)), (n,))
         self.observation_spec = Composite(
             {GROUP: Composite({"observation": seen}, shape=rows), "state": state}, shape=(n,)
         )
-        self.actions, space = actions, learner_action_space(actions)
+        space = action_space(actions)
         action = Bounded(-1.0, 1.0, shape=(*rows, 1)) if actions is None else Categorical(space.n, shape=rows)
         self.action_spec = Composite({GROUP: Composite({"action": action}, shape=rows)}, shape=(n,))
         reward_of_each = Composite({"reward": Unbounded(shape=(*rows, 1))}, shape=rows)
         self.reward_spec = Composite({GROUP: reward_of_each}, shape=(n,))
         flags = ("done", "terminated", "truncated")
-        flag = {name: Categorical(2, dtype=torch.bool, shape=(n, 1)) for name in flags}
-        self.done_spec = Composite(flag, shape=(n,))
+        self.done_spec = Composite({name: Categorical(2, dtype=torch.bool, shape=(n, 1)) for name in flags}, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Start a new episode in all worlds, or in the worlds where the mask ``_reset`` in ``tensordict`` is True."""
+        """Begin the next episodes, in all worlds or where ``_reset`` in ``tensordict`` is True."""
         asked = None if tensordict is None else tensordict.get("_reset", None)
         if asked is None:
-            self.engine.reset()
-        else:
-            self.engine.renew(np.flatnonzero(asked.numpy().reshape(-1)))
+            self.episode = self.stream.draw(self.batch_size[0])
+        elif asked.any():
+            rows = np.flatnonzero(asked.numpy().reshape(-1))
+            self.episode = self.episode.put(rows, self.stream.draw(len(rows)))
         return TensorDict(self._observe_all(), batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
         given = tensordict[GROUP, "action"].numpy()
-        step = self.engine.step(
-            given[:, :, 0].clip(-1.0, 1.0) if self.actions is None else index_to_action(given, self.actions)
-        )
-        reward = torch.from_numpy(step.reward[:, self._learners, np.newaxis].astype(np.float32))
-        terminated, truncated = step.terminated.copy(), step.truncated.copy()
-        if self.horizon_is_end:
-            terminated, truncated = terminated | truncated, np.zeros_like(truncated)
-        content = self._observe_all()
-        content[GROUP]["reward"] = reward
-        for name, flag in (("done", step.ended), ("terminated", terminated), ("truncated", truncated)):
-            content[name] = torch.from_numpy(np.array(flag, np.bool_)[:, np.newaxis])
+        if self.actions is None:
+            given = given[:, :, 0].clip(-1.0, 1.0)
+        actions = checked_actions(given, given.shape, "the learners", self.actions)
+        self.episode, step = self.game.step(self.episode, actions, donate=True)
+        content, ended = self._observe_all(), self.episode.ended
+        reward = step.reward[:, self.learners - 1, np.newaxis].astype(np.float32)
+        content[GROUP]["reward"] = torch.from_numpy(reward)
+        terminated = ended & (self.episode.at_rest | self.horizon_is_end)
+        for name, flag in (("done", ended), ("terminated", terminated), ("truncated", ended & ~terminated)):
+            content[name] = torch.from_numpy(flag[:, np.newaxis])
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start new episodes in worlds that are drawn from ``seed``; do nothing if ``seed`` is None."""
+        """Let the next episodes be the first ones of another seed."""
         if seed is not None:
-            self.engine.reset(seed=seed)
+            self.stream.seed, self.stream.next = seed, 0
 
     def _observe_all(self) -> dict[str, Any]:
-        every = torch.from_numpy(self.engine.observe_all(self._learners).copy())
-        state = torch.from_numpy(full_state(self.engine.worlds, self.engine.scenario))
-        own = TensorDict({"observation": every}, batch_size=every.shape[:2])
-        return {GROUP: own, "state": state}
+        seen = torch.from_numpy(self.game.observe_alike(self.episode, self.learners))
+        own = TensorDict({"observation": seen}, batch_size=seen.shape[:2])
+        return {GROUP: own, "state": torch.from_numpy(full_state(self.episode, *self._of_state))}
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
@@ -169,7 +175,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
     def group_map(self, env: Any) -> dict[str, list[str]]:
         """Return ``{"learners": names}``: one group with the names of all learners. ``env`` is unused."""
         scenario = self.config["scenario"]
-        return {GROUP: [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]}
+        return {GROUP: [scenario.vehicle_names[body - 1] for body in scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:
         """Return the TorchRL spec of the learners' observations in ``env``, for a single world."""

@@ -14,7 +14,7 @@ from benchmarl.environments.common import Task
 from hydra.core.config_store import ConfigStore
 
 from ethbrake_marl.extensions.benchmarl.task import LineTask
-from ethbrake_marl.first_edition.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
 
 
 class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra is not installed

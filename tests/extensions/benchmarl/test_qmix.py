@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-import ethbrake_marl.first_edition as eb
+import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 
 pytest.importorskip("benchmarl", reason="needs the extra marl")
@@ -80,5 +80,4 @@ def test_qmix__trains_a_team_that_drives(tmp_path: Path) -> None:
             return actor(TensorDict({"learners": each}, rows.shape[:1]))["learners", "action"][:, 0]
 
     agent = eb.policy_agent(qmix, scenario=PAIR, actions=5)
-    harm = eb.evaluate(PAIR.sample(20, 7), {"qmix": agent}, scenario=PAIR).outcome("qmix").first_impact_harm
-    assert np.isfinite(harm).all()
+    assert np.isfinite(eb.evaluate(PAIR, {"qmix": agent}, episodes=20)["qmix"]["first_impact_harm"]).all()
