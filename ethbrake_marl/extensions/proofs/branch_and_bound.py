@@ -11,17 +11,7 @@ from __future__ import annotations
 import math
 
 from ethbrake_marl.extensions.proofs.followers import after
-from ethbrake_marl.extensions.proofs.line import (
-    A_F,
-    A_L,
-    FRONT_FIRST,
-    LIMIT_F,
-    TIME_STEP,
-    U_F,
-    V_L,
-    follower,
-    leader,
-)
+from ethbrake_marl.extensions.proofs.line import A_F, A_L, FRONT_FIRST, LIMIT_F, TIME_STEP, U_F, V_L, follower, leader
 from ethbrake_marl.extensions.proofs.meetings import gentlest
 from ethbrake_marl.motion.compiling import kernel, large
 
@@ -75,10 +65,7 @@ def lacking(kind, at, early, late, softest, hard, begin):
     whole = at[U_F] + at[A_F]
     turn = gentlest(kind, at, early)[1]
     # A speed limit or a standstill may hide which command is in force.
-    if kind == FRONT_FIRST:
-        hidden = leader(at, early)[0] + hard >= at[LIMIT_F]
-    else:
-        hidden = follower(at, late)[0] <= hard
+    hidden = leader(at, early)[0] + hard >= at[LIMIT_F] if kind == FRONT_FIRST else follower(at, late)[0] <= hard
     if early <= begin or hidden:
         return 0.0
     softer = max(hard - softest, 0.0) / (early - begin)
@@ -125,7 +112,13 @@ def divide(kind, at, floor, count, row, cells):
     Returns the new number of cells, and the bound (m2/s2) for one single first contact in the cell, which the smallest
     bound of all first contacts does not exceed.
     """
-    harm, early, late, soft, hard = cells[row, HARM], cells[row, EARLY], cells[row, LATE], cells[row, SOFT], cells[row, HARD]
+    harm, early, late, soft, hard = (
+        cells[row, HARM],
+        cells[row, EARLY],
+        cells[row, LATE],
+        cells[row, SOFT],
+        cells[row, HARD],
+    )
     count -= 1
     for column in range(CELL_COLUMNS):
         cells[row, column] = cells[count, column]

@@ -62,9 +62,9 @@ def least_closing(line, pair, opening, lost, late, end, until):
     """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
     It is a difference v - d: v is the closing speed of the second neighbour relative to the centre of mass of the pair,
-    which ``line`` (``value_of``; a bend may be negative) describes as a function of time; d, from ``largest_lead``, is the largest
-    difference between the controlled vehicle and this centre. ``until`` is the latest time of the contact. All times
-    are in s after the first contact.
+    which ``line`` describes as a function of time (``value_of``; a bend may be negative); d, from ``largest_lead``, is
+    the largest difference between the controlled vehicle and this centre. ``until`` is the latest time of the contact.
+    All times are in s after the first contact.
     """
     best = least_of_line(line, 0.0, until) - largest_lead(pair, opening, lost, late, end, 0.0, until)
     for k in range(len(LEADS)):

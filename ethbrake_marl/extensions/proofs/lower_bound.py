@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.state import TIME, State
-from ethbrake_marl.episode.step import advance_worlds
+from ethbrake_marl.episode.step import advance_worlds, failure
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.avoidability import Avoidability, avoidability, largest_behind, spare_gap
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, least_harm
@@ -318,12 +318,12 @@ def lower_bound(
     has_front = counts[:, body - 2] if body > 1 else none
     has_rear = counts[:, body - 1] if body < state.vehicles else none
     unavoidable = has_front & has_rear & (verdict.reason >= 2)
-    rows, out = rows_of(now, body, time_step_s or 0.0), np.empty((state.n, BOUNDS))
+    rows, until, out = rows_of(now, body, time_step_s or 0.0), horizon_s - start, np.empty((state.n, BOUNDS))
 
     def bound(first: int) -> None:
         part = slice(first, first + _AT_ONCE)
-        arrays = (array[part] for array in (rows, horizon_s - start, has_front, has_rear, unavoidable))
-        bound_worlds(*arrays, np.empty((CELLS, CELL_COLUMNS)), out[part])
+        cells = np.empty((CELLS, CELL_COLUMNS))
+        bound_worlds(rows[part], until[part], has_front[part], has_rear[part], unavoidable[part], cells, out[part])
 
     with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
         list(threads.map(bound, range(0, state.n, _AT_ONCE)))
@@ -357,7 +357,9 @@ def _at_start(state: State, start: Floats) -> State:
     """Return the episodes at the start, when the controlled vehicle may act; until then all brake fully."""
     line, clock, wanted = state.line.copy(), state.clock.copy(), np.zeros(state.wanted.shape)
     wanted[:, 1:] = -state.braking_capacity_mps2
-    advance_worlds(line, state.car, state.time_s.copy(), start, wanted, scratch_for(wanted.shape[1]))
+    failed = advance_worlds(line, state.car, state.time_s.copy(), start, wanted, scratch_for(line.shape[2]))
+    if failed >= 0:
+        raise failure(state, failed, state.time_s[failed], start[failed])
     clock[:, TIME] = start
     return state._replace(line=line, clock=clock)
 

@@ -27,7 +27,7 @@ from ethbrake_marl.extensions.proofs.line import (
     follower,
     leader,
 )
-from ethbrake_marl.extensions.proofs.plans import braking, brake_then_drive, drive_then_brake, time_to_limit, walk
+from ethbrake_marl.extensions.proofs.plans import brake_then_drive, braking, drive_then_brake, time_to_limit, walk
 from ethbrake_marl.motion.compiling import kernel, large
 
 _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speeds are lowered accordingly

@@ -213,19 +213,21 @@ def changed(array, row, body, value):
 
 
 REFUSED = {
-    "avoidability: vehicle_1 of 3 vehicles is controlled, but the proof covers only": lambda: (
-        avoidability(paper_line([9, 9], [9, 9, 9], [0, 0.5, 0.8]), 1)
+    "avoidability: vehicle_1 of 3 vehicles is controlled, but the proof covers only": lambda: avoidability(
+        paper_line([9, 9], [9, 9, 9], [0, 0.5, 0.8]), 1
     ),
-    "world 0 has a vehicle_1 that may brake only after the controlled vehicle": lambda: (
-        avoidability(changed("car", LATENCY, 1, 0.6))
+    "world 0 has a vehicle_1 that may brake only after the controlled vehicle": lambda: avoidability(
+        changed("car", LATENCY, 1, 0.6)
     ),
     "world 0 has a vehicle that moves backward": lambda: avoidability(changed("line", SPEED, 3, -1)),
-    "world 0 has an obstacle that vehicle_1 reaches although it brakes": lambda: avoidability(changed("line", GAP, 0, 8.0)),
-    "world 0 has an obstacle ahead of the controlled vehicle_1": lambda: (
-        avoidability(worlds(5, [9, 9], 5, obstacle=90), 1)
+    "world 0 has an obstacle that vehicle_1 reaches although it brakes": lambda: avoidability(
+        changed("line", GAP, 0, 8.0)
     ),
-    "world 0 has brakes that build up": lambda: (
-        avoidability(eb.load_scenario("paper-random").replace(brake_rate_mps3=9).sample(2, 7))
+    "world 0 has an obstacle ahead of the controlled vehicle_1": lambda: avoidability(
+        worlds(5, [9, 9], 5, obstacle=90), 1
+    ),
+    "world 0 has brakes that build up": lambda: avoidability(
+        eb.load_scenario("paper-random").replace(brake_rate_mps3=9).sample(2, 7)
     ),
 }
 

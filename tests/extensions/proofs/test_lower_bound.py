@@ -132,8 +132,8 @@ def test_decisions__leave_less_room_and_no_plan_is_below():
     assert np.all(any_time <= decided) and decided.mean() > 1.02 * any_time.mean()
     assert often.mean() < 1.01 * any_time.mean()
     begun, least = game.begin(state), np.full(100, np.inf)
-    for before, after, switch in product((-1, -0.5, 0, 0.5, 1), (-1, -0.5, 0, 1), range(0, 40, 2)):
-        plan = np.where(np.arange(75) < switch, float(before), float(after))
+    for early, late, switch in product((-1, -0.5, 0, 0.5, 1), (-1, -0.5, 0, 1), range(0, 40, 2)):
+        plan = np.where(np.arange(75) < switch, float(early), float(late))
         least = np.minimum(least, eb.price(game, begun, np.tile(plan[:, np.newaxis], (100, 1, 1)), "first"))
     near = (decided > 0) & (least < 1.02 * decided + 1e-6)
     assert np.all(decided <= least) and near.sum() > 15
@@ -377,3 +377,17 @@ def test_obstacle__is_refused():
     with refused("lower_bound: world 0 has an obstacle ahead; the bound is proven without an obstacle"):
         lower_bound(worlds([7, 7], [20, 18, 20], [6, 7, 6], [0, 0.5, 0.8], obstacle=90))
     assert THREE.line[0, SPEED, 1] == 20  # worlds are not changed
+
+
+def test_measures__are_asked_for_by_name():
+    result = eb.evaluate("paper-random", "full_brake,coast", episodes=6, measures="avoidable,proven_harm")
+    assert result["coast"]["avoidable"].tolist() == [False, False, True, True, True, False]
+    assert result["coast"]["avoidable_reason"].tolist() == ["front", "front", "", "", "", "rear"]
+    assert result["full_brake"]["proven_harm"] == pytest.approx(RECORDED["paper-random"][2], rel=1e-12)
+    assert (result["full_brake"]["proven_harm"] <= result["full_brake"]["first_impact_harm"]).all()
+    with refused("avoidable, proven_harm: a vehicle that does not learn does not brake fully"):
+        coasts = eb.load_scenario("paper-random").replace(roles={"vehicle_2": "learner", "vehicle_3": "coast"})
+        eb.evaluate(coasts, "full_brake", episodes=2, measures="avoidable")
+    with refused("avoidable, proven_harm: vehicle_2, vehicle_3 learn; the proofs cover one controlled vehicle"):
+        both = eb.load_scenario("paper-random").with_learners(["vehicle_2", "vehicle_3"])
+        eb.evaluate(both, "full_brake", episodes=2, measures="proven_harm")
