@@ -144,13 +144,17 @@ def wrong(change: Callable[[Profiles], Profiles]) -> Callable[[], object]:
 
 REFUSED: dict[str, Callable[[], object]] = {
     "ends has the shape (1, 7) and commands_mps2 (1, 7, 1); must be (2, K) and (2, K, 1)": wrong(lambda p: p.take([0])),
-    "command 99 m/s2 of vehicle_2 in row 0; must be in [-7, 7] m/s2": wrong(lambda p: Profiles(p.ends, p.commands_mps2 * 0 + 99)),
+    "command 99 m/s2 of vehicle_2 in row 0; must be in [-7, 7] m/s2": wrong(
+        lambda p: Profiles(p.ends, p.commands_mps2 * 0 + 99)
+    ),
     "profiles: ends must not decrease": wrong(lambda p: Profiles(p.ends[:, ::-1], p.commands_mps2)),
     "vehicles [4]: must be one or more of 1 to 3, each once": lambda: problem_in("paper-random", bodies=[4]),
     "vehicles []: must be one or more of 1 to 3, each once": lambda: problem_in("paper-random", bodies=[]),
     "vehicles [2, 2]: must be one or more of 1 to 3, each once": lambda: problem_in("paper-random", bodies=[2, 2]),
     "objective 'injury:CURVE': is not a weighted sum": lambda: problem_in("paper-random", objective="injury:lr4s"),
-    "objective 'own': the 2 controlled vehicles have different objectives": lambda: problem_in("cooperation-3-pair", objective="own"),
+    "objective 'own': the 2 controlled vehicles have different objectives": lambda: problem_in(
+        "cooperation-3-pair", objective="own"
+    ),
     "horizon_s = 0.4: must be after the first decision at 0.5 s": lambda: problem_of(
         (game := eb.open_game("paper-random")[1])._replace(rules=game.rules._replace(horizon_s=0.4)),
         eb.load_scenario("paper-random").sample(1, seed=7),
