@@ -12,6 +12,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -114,12 +115,12 @@ def shipped_bounds(tables: Iterable[BestHarmTable]) -> Sheet:
     gap = (best known harm - proven harm) / best known harm. The header of a table names a shipped scenario and a list
     of its worlds. Raises ``InvalidInput`` if the table holds none of these worlds.
     """
-    harm, share = {"digits": 3}, {"digits": 1, "scale": 100.0, "unit": " %"}
+    harm, share = partial(Column, digits=3), partial(Column, digits=1, scale=100.0, unit=" %")
     columns = (
-        "list", Column("worlds"), Column("proven", **harm), Column("best known, first", **harm), Column("gap", **share),
-        Column("best known, total", **harm), Column("gap", **share), Column("contact proven", **share),
-        Column("impact proven", **share), Column("between", **share), Column("best known there, first", **harm),
-        Column("next to none there", **share),
+        "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"),
+        harm("best known, total"), share("gap"), share("contact proven"),
+        share("impact proven"), share("between"), harm("best known there, first"),
+        share("next to none there"),
     )  # fmt: skip
     rows = []
     for table in tables:
