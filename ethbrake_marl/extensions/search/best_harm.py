@@ -64,12 +64,11 @@ def best_harm(
     effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
     problem = problem_of(game, alert, bodies, objective=objective)
     found: list[tuple[Profiles, Mapping[str, Floats]]] = []
-    for count in counts if known is not None else ():
-        stored = known.stored(problem, count)[1] if known is not None else None
-        assert stored is not None
-        found.append((stored, problem.values(stored)))
+    if known is not None:
+        stored = [known.stored(problem, count)[1] for count in counts]
+        found += [(profiles, problem.values(profiles)) for profiles in stored]
     for count in counts:
-        starts = [short(profiles) for profiles, _ in found]
+        starts = [profiles for profiles, _ in found]
         found.append(_searched(game, alert, problem.counting(count), starts, objective, effort))
     names = [f"vehicle_{body}" for body in problem.bodies]
     header: dict[str, Any] = {"scenario": game.name, "vehicles": names, "budget": budget, "search_seed": seed}
@@ -93,10 +92,10 @@ def _searched(
     for c, body in enumerate(bodies if len(bodies) > 1 else ()):
         count = "total" if problem.total else "first"
         own = problem_of(game, alert, [body], count=count, objective=objective, deciders=bodies)
-        alone, _ = _searched(game, alert, own, (), objective, effort)
-        commands = np.repeat(problem.bounds[:, np.newaxis, :, 0], alone.ends.shape[1], axis=1)
-        commands[:, :, c] = alone.commands_mps2[:, :, 0]
-        starts.append(Profiles(alone.ends, commands))
+        best, _ = _searched(game, alert, own, (), objective, effort)
+        commands = np.repeat(problem.bounds[:, np.newaxis, :, 0], best.ends.shape[1], axis=1)
+        commands[:, :, c] = best.commands_mps2[:, :, 0]
+        starts.append(Profiles(best.ends, commands))
     return search_profiles(problem, joined(starts, problem.n), **effort)
 
 
@@ -118,17 +117,9 @@ def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
     return problem.constant(-choice.deceleration_mps2[:, np.newaxis, np.newaxis])
 
 
-def short(profiles: Profiles) -> Profiles:
-    """Return the profiles; one of more than ``MOST_PHASES`` phases becomes its first command for the whole episode."""
-    ends, commands = Profiles.padded([profiles], MOST_PHASES)[0]
-    fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
-    ends = np.where(fits[:, np.newaxis], ends[:, :MOST_PHASES], ends[:, -1:])
-    return Profiles(ends, np.where(fits[:, np.newaxis, np.newaxis], commands[:, :MOST_PHASES], commands[:, :1]))
-
-
 def joined(parts: Sequence[Profiles], n: int) -> Profiles:
     """Join parts of some profiles for each of n worlds, [n * Q]: first all profiles of world 0, and so on."""
-    ends, commands = zip(*Profiles.padded(parts, MOST_PHASES), strict=True)
+    ends, commands = zip(*(part.shortened() for part in parts), strict=True)
     B = commands[0].shape[2]
     every = np.concatenate([each.reshape(n, -1, MOST_PHASES) for each in ends], axis=1)
     what = np.concatenate([each.reshape(n, -1, MOST_PHASES, B) for each in commands], axis=1)

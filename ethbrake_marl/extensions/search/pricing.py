@@ -73,6 +73,13 @@ class Profiles(NamedTuple):
         phase = np.minimum(phase, self.ends.shape[1] - 1)
         return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
 
+    def shortened(self) -> Profiles:
+        """Return profiles of ``MOST_PHASES`` phases; one that has more becomes its first command, held."""
+        ends, commands = Profiles.padded([self], MOST_PHASES)[0]
+        fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
+        ends = np.where(fits[:, np.newaxis], ends[:, :MOST_PHASES], ends[:, -1:])
+        return Profiles(ends, np.where(fits[:, np.newaxis, np.newaxis], commands[:, :MOST_PHASES], commands[:, :1]))
+
     @staticmethod
     def of_steps(commands_mps2: Floats, last_step: Ints) -> Profiles:
         """Return profiles with one phase for each decision. ``commands_mps2`` is [n, T, B], ``last_step`` [n]."""

@@ -62,7 +62,7 @@ def search_profiles(
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
     n, B = problem.n, len(problem.bodies)
-    given = Profiles.padded([given], MOST_PHASES)[0]
+    given = given.shortened()
     ends = np.ascontiguousarray(given.ends.reshape(n, -1, MOST_PHASES))
     commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, B))
     random = seeded(problem.identity, seed)

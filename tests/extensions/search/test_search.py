@@ -5,7 +5,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import PhysicsError
-from ethbrake_marl.extensions.search.best_harm import best_harm, joined, search_list, short, starting_profiles
+from ethbrake_marl.extensions.search.best_harm import best_harm, joined, search_list, starting_profiles
 from ethbrake_marl.extensions.search.extremes import KEPT, extreme_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
 from ethbrake_marl.extensions.search.search import best_templates, compact, refine, search_profiles
@@ -120,7 +120,7 @@ def test_compact__joins_equal_neighbours_and_drops_empty_phases() -> None:
 
 def test_short__and_joined() -> None:
     long = Profiles(np.arange(1, 15)[np.newaxis], -np.arange(14.0).reshape(1, 14, 1))
-    assert short(long).ends.tolist() == [[14] * 12] and not short(long).commands_mps2.any()
+    assert long.shortened().ends.tolist() == [[14] * 12] and not long.shortened().commands_mps2.any()
     both = joined(
         [Profiles(np.array([[3], [4]]), np.zeros((2, 1, 1))), Profiles(np.array([[3], [4]]), np.ones((2, 1, 1)))], 2
     )
