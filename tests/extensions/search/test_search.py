@@ -86,6 +86,16 @@ def test_best_harm__is_never_worse_than_one_vehicle_alone_a_known_table_or_e_v2x
     assert problem.values(both.profiles["first"])["first"].tolist() == both.harm["first"].tolist()
 
 
+def test_best_harm__keeps_for_each_count_the_better_of_both_searches() -> None:
+    scenario, game = eb.open_game("paper-random-obstacle")  # little first-impact harm is much total harm here
+    alert = scenario.sample(8, seed=7)
+    table, problem = best_harm(game, alert, budget=300, threads=1), problem_of(game, alert)
+    for count, other in (("first", "total"), ("total", "first")):
+        assert problem.values(table.profiles[count])[count].tolist() == table.harm[count].tolist()
+        at_other = problem.values(table.profiles[other])[count]
+        assert (table.harm[count] <= at_other).all() and (table.harm[count] < at_other - 1.0).any()
+
+
 def test_extremes__are_within_steps_and_better_than_constants() -> None:
     profiles = extreme_profiles(PROBLEM)
     PROBLEM.take(np.repeat(np.arange(6), KEPT)).check(profiles)
