@@ -24,7 +24,7 @@ from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import held
 from ethbrake_marl.shields.step import Memory, StepShield
 
-SHARES = np.linspace(0.0, -1.0, 41)  # constant actions that are tried at the alert for the worst member
+SHARES = np.linspace(0.0, -1.0, 101)  # constant actions that are tried at the alert for the worst member
 INSIDE = 1e-9  # by which a gap (m) or speed (m/s) may lie outside the range of the members
 
 
