@@ -124,12 +124,12 @@ def opened(game: Game, alerts: State) -> State:
 
 def apart(states: State, n: int) -> State:
     """Return states, M rows for each of n worlds, as arrays [n, M, ...], which have one row per world."""
-    return mapped(lambda array: array.reshape(n, -1, *array.shape[1:]), states)  # type: ignore[no-any-return]
+    return mapped(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
 
 
 def joined(states: State) -> State:
     """Return states with arrays [n, M, ...] as M rows for each world."""
-    return mapped(lambda array: array.reshape(-1, *array.shape[2:]), states)  # type: ignore[no-any-return]
+    return mapped(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
 
 
 def may_be_in(state: State, members: State) -> Bools:
