@@ -53,12 +53,14 @@ class MembersShield(StepShield):
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
         """Return the plans of the step shield for the nominal state, and the best constant one in the worst state."""
-        learners, n = game.rules.learners, state.n
+        learners, n, plans = game.rules.learners, state.n, super().plans(game, alert, state, states)
+        if states.n == n:
+            return plans
         actions = np.repeat(SHARES[:, np.newaxis], len(learners), axis=1)
         commands = actions * states.car[:, np.newaxis, BRAKING, learners]
         harm = hold(states, states.wanted, learners.tolist(), commands, game.rules.horizon_s, self.count)[0]
         best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
-        return [*super().plans(game, alert, state, states), held(game, actions[best])]
+        return [*plans, held(game, actions[best])]
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
         """Return the actions to apply, [n, L], and the new memory, whose members have made the step."""
