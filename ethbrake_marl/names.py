@@ -7,7 +7,7 @@
     wrapper = NAME[:ARGUMENT], a search or a shield around what stands before it
 
 Two tables hold the names, agents and wrappers; packages add to them by entry points, as this one does. An entry
-``NAME.ARGUMENT`` stands for this argument, the last one. An agent's entry may also be a list of specs (a group, ``ladder``).
+``NAME.ARGUMENT`` stands for this argument. An agent's entry may also be a list of specs (a group, ``ladder``).
 """
 
 from __future__ import annotations

@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.episode.step import advance_worlds, failure
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS
 from ethbrake_marl.extensions.messages.belief import known_pieces
@@ -59,6 +60,7 @@ from ethbrake_marl.motion.layout import (
     TOTAL,
     Bools,
     Floats,
+    scratch_for,
 )
 from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.roles import HELD, LEARNER, first_command
@@ -143,7 +145,7 @@ class Lines(NamedTuple):
         """
         M, (pieces, news) = self.alert.n, self.received(state)
         lines, true = self.alert.take(np.tile(np.arange(M), alert.n)), alert.take(np.arange(alert.n).repeat(M))
-        whole = pieces[:, :, :P_INTENT].all(axis=2)
+        whole = np.asarray(pieces[:, :, :P_INTENT].all(axis=2))
         whole[:, 0] = whole[:, 1]
         acts = (whole & (news[:, SAMPLE_FORCE] != 0.0)).repeat(M, axis=0)
         acts[:, self.body] = True
@@ -178,9 +180,9 @@ class Lines(NamedTuple):
         """
         n, M = state.n, lines.n // state.n
         possible = self.agrees(state, lines)
-        some = possible.any(axis=1)
+        some = np.asarray(possible.any(axis=1))
         kept = np.where(possible | ~some[:, np.newaxis], np.arange(M), possible.argmax(axis=1)[:, np.newaxis])
-        changed = ~possible.all(axis=1)
+        changed = ~np.asarray(possible.all(axis=1))
         if changed.any():
             lines = lines.take((np.arange(n)[:, np.newaxis] * M + kept).ravel())
         if not some.all():
@@ -217,7 +219,7 @@ class Lines(NamedTuple):
         line, car = lines.line.copy(), lines.car.copy()
         for row, piece in TOLD.items():
             car[:, row, 1:] = np.where(pieces[:, 1:, piece], state.car[:, row, 1:], car[:, row, 1:])
-        known, acts = pieces[:, :, [P_PLACE, P_SPEED]].all(axis=2), pieces[:, :, P_ACCELERATION]
+        known, acts = np.asarray(pieces[:, :, [P_PLACE, P_SPEED]].all(axis=2)), pieces[:, :, P_ACCELERATION]
         known[:, 0] = False
         at = np.where(known, news[:, AT], 0.0)
         late = np.maximum(np.maximum(car[:, OWN_LATENCY], np.resize(self.news_s, car[:, LATENCY].shape)), at)
@@ -260,9 +262,22 @@ def in_order(place: Floats, known: Bools, out: Floats | None = None) -> None:
         out[:] = -ordered
 
 
+def advanced(state: State, until_s: Floats) -> State:
+    """Return the line at ``until_s`` [n] if all hold their commands."""
+    line, clock = state.line.copy(), state.clock.copy()
+    failed = advance_worlds(line, state.car, state.time_s.copy(), until_s, state.wanted, scratch_for(line.shape[2]))
+    if failed >= 0:
+        raise failure(state, failed, state.time_s[failed], until_s[failed])
+    clock[:, TIME] = until_s
+    return state._replace(line=line, clock=clock)
+
+
 @large
 def move_on(speed, way, wanted, onset, limit, age):
-    """Move vehicles on by ``age`` (s) without contact, from ``onset`` (s) on under ``wanted`` (m/s2); all [n, N + 1]."""
+    """Move vehicles on by ``age`` (s) without contact; from ``onset`` (s) on they follow ``wanted`` (m/s2).
+
+    All are [n, N + 1].
+    """
     for k in range(speed.shape[0]):
         for i in range(speed.shape[1]):
             if age[k, i] > 0.0:

@@ -23,12 +23,11 @@ from ethbrake_marl.agents.drive import Agent, Team
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import TIME, State
-from ethbrake_marl.episode.step import advance_worlds, failure
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines
+from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines, advanced
 from ethbrake_marl.extensions.certified.robust import Members, MembersShield, apart, joined, opened
-from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints, scratch_for
+from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield, Memory as EpisodeMemory
 from ethbrake_marl.shields.step import Memory, part
@@ -193,16 +192,6 @@ def with_shield(state: State, memory: Memory) -> State:
     return state._replace(memories={**state.memories, "shield": memory})
 
 
-def advanced(state: State, until_s: Floats) -> State:
-    """Return the line at ``until_s`` [n] if all hold their commands."""
-    line, clock = state.line.copy(), state.clock.copy()
-    failed = advance_worlds(line, state.car, state.time_s.copy(), until_s, state.wanted, scratch_for(line.shape[2]))
-    if failed >= 0:
-        raise failure(state, failed, state.time_s[failed], until_s[failed])
-    clock[:, TIME] = until_s
-    return state._replace(line=line, clock=clock)
-
-
 def make_step(team: Team, argument: str | None, settings: Any) -> Team:
     """Return the team ``TEAM+step:estimated``."""
     return with_lines(team, argument, settings, corners=False)
@@ -241,7 +230,9 @@ def _entry(make: Any, form: str, about: str) -> Part:
 
 STEP = _entry(make_step, "step:estimated", "certified in the median line that its vehicle estimates")
 CORNERS = _entry(make_robust, "robust:estimated", "also in the corners of the ranges of what was not received")
-EPISODE = _entry(make_episode, "episode[:pairwise]:estimated", "the paper's hybrid in the line that its vehicle estimates")
+EPISODE = _entry(
+    make_episode, "episode[:pairwise]:estimated", "the paper's hybrid in the line that its vehicle estimates"
+)
 E_V2X_BM = _entry(
     make_e_v2x_bm, "e_v2x_bm[:pairwise]:estimated", "computed from received information and the scenario's ranges"
 )

@@ -49,7 +49,7 @@ class MembersShield(StepShield):
         """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2, or above ``most``."""
         M = states.n // len(plans)
         each = np.broadcast_to(most, len(plans)).repeat(M)
-        return super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1)
+        return np.asarray(super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1))
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
         """Return the plans of the step shield for the nominal state, and the best constant one in the worst state."""

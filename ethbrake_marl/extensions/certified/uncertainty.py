@@ -1,4 +1,4 @@
-"""Uncertainty: an interval around each uncertain quantity of a world, and the *members* that stand for all worlds in it.
+"""Uncertainty: intervals around the quantities of a world, and the *members* that stand for all worlds in them.
 
 The true value of a quantity with the nominal value x lies in [x - h, x + h]. The half-width h is a number in the
 quantity's unit, or a share of x (such as 5 %). What is impossible is cut off: latencies, speeds and gaps below 0, and

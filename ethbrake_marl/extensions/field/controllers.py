@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,7 +24,15 @@ from ethbrake_marl.registry import Part
 TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap
 SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
 
-Parameters = SimpleNamespace  # parameters of one law, with the names in ``LAWS``, in SI units
+
+class Parameters:
+    """Parameters of one law, with the names in ``LAWS``, in SI units."""
+
+    def __init__(self, **values: float) -> None:
+        self.__dict__.update(values)
+
+    def __getattr__(self, name: str) -> float:
+        raise AttributeError(name)
 
 
 class Seen(NamedTuple):
@@ -217,7 +224,7 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``.
 
-    Its memory is the time at which it noticed a danger, [n] s: infinite if it has noticed none, and NaN before the first
+    Its memory is the time at which it noticed a danger, [n] s: infinite if it has noticed none, NaN before the first
     decision. The reaction time begins then; if there is a danger at the first decision, it begins at the alert, so it
     overlaps with the latency. It ends with the danger, and the next danger starts a new one, unless ``law.stays``.
 
@@ -289,7 +296,8 @@ def make_controller(argument: str | None, settings: Any) -> Controller:
         raise InvalidInput(
             f"{where}: b_min = {parameters['b_min']:g}: must be at most b_max, which is {parameters['b_max']:g}"
         )
-    return Controller(settings.spec, law, parameters, 0.1 if settings.scenario is None else settings.scenario.time_step_s)
+    step_s = 0.1 if settings.scenario is None else settings.scenario.time_step_s
+    return Controller(settings.spec, law, parameters, step_s)
 
 
 def _entry(form: str, about: str) -> Part:

@@ -46,7 +46,9 @@ def test_the_line_is_the_true_one__where_everything_is_known() -> None:
         assert known.sum() > 10
         np.testing.assert_allclose(median.line[known][:, [SPEED, GAP], :-1], state.line[known][:, [SPEED, GAP], :-1])
         np.testing.assert_array_equal(median.car[known][:, [MASS, BRAKING]], state.car[known][:, [MASS, BRAKING]])
-    np.testing.assert_array_equal(lines_at(BASE, steps=9, action=-0.5)[2].line, lines_at(BASE, steps=9, action=-0.5)[1].line)
+    np.testing.assert_array_equal(
+        lines_at(BASE, steps=9, action=-0.5)[2].line, lines_at(BASE, steps=9, action=-0.5)[1].line
+    )
 
 
 def test_who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script() -> None:
@@ -64,7 +66,8 @@ def test_who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script(
 
 def test_corners__are_all_combinations_of_the_ends_of_what_is_open() -> None:
     lines = Lines.of(DEAF.replace(mass_t=[4.5, 5.5, {"uniform": [2.0, 9.0]}]), 2, corners=True)
-    corners = {(line[GAP, 2], line[SPEED, 3], car[MASS, 3]) for line, car in zip(lines.alert.line, lines.alert.car)}
+    alert = lines.alert
+    corners = {*zip(alert.line[:, GAP, 2], alert.line[:, SPEED, 3], alert.car[:, MASS, 3], strict=True)}
     ends = {(gap, speed, mass) for gap in (5.0, 10.0) for speed in (18.0, 22.0) for mass in (2.0, 9.0)}
     assert lines.alert.n == 9 and corners == ends | {(7.5, 20.0, 5.5)}
     alert = eb.load_scenario("cooperation-2-blocked").replace(gaps_m=7, speeds_mps=20)
@@ -73,14 +76,22 @@ def test_corners__are_all_combinations_of_the_ends_of_what_is_open() -> None:
 
 
 def test_an_old_message__is_moved_on_by_the_script_to_the_truth() -> None:
-    channel = {"preset": "paper", "link_latency_s": 0.2, "persistence": "periodic", "senses": "front", "sensing_s": [5, 5]}
+    channel = {
+        "preset": "paper",
+        "link_latency_s": 0.2,
+        "persistence": "periodic",
+        "senses": "front",
+        "sensing_s": [5, 5],
+    }
     agent, places = EstimatedEV2XBM(BASE.replace(v2x=channel)), []
 
     class Spy(EstimatedEV2XBM):
         def act(self, state: State, memory: Any, body: int) -> Any:
             _, memory = super().act(state, memory, body)
             free = ~state.pair_hit.any(axis=1)
-            places.append((memory.median.line[free][:, [SPEED, GAP], :-1] - state.line[free][:, [SPEED, GAP], :-1], free))
+            places.append(
+                (memory.median.line[free][:, [SPEED, GAP], :-1] - state.line[free][:, [SPEED, GAP], :-1], free)
+            )
             return np.full(state.n, -6.0), memory
 
     loaded, game = eb.open_game(agent.scenario)
@@ -213,7 +224,9 @@ def test_what_was_not_received__changes_no_command(spec: str, channel: str) -> N
 
 def test_a_leak_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
     received = Lines.received
-    monkeypatch.setattr(Lines, "received", lambda self, state: (np.ones_like(received(self, state)[0]), received(self, state)[1]))
+    monkeypatch.setattr(
+        Lines, "received", lambda self, state: (np.ones_like(received(self, state)[0]), received(self, state)[1])
+    )
     with pytest.raises(AssertionError):
         test_what_was_not_received__changes_no_command("coast+step:estimated", "blocked")
 
@@ -226,7 +239,11 @@ def test_a_leak_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
     ["coast+step:estimated", "ppo+episode:estimated", "ppo+episode:pairwise:estimated", "e_v2x_bm:estimated",
      "e_v2x_bm:pairwise:estimated"],
 )  # fmt: skip
-@pytest.mark.parametrize("scenario", [PERIODIC, eb.load_scenario("cooperation-2-five").replace(v2x="blocked", roles={"vehicle_2": "learner"})], ids=str)
+@pytest.mark.parametrize(
+    "scenario",
+    [PERIODIC, eb.load_scenario("cooperation-2-five").replace(v2x="blocked", roles={"vehicle_2": "learner"})],
+    ids=str,
+)
 def test_no_world_depends_on_the_batch(spec: str, scenario: eb.Scenario) -> None:
     _, game = eb.open_game(scenario)
     worlds, agent = scenario.sample(5, 3), eb.make_agent(spec, scenario=scenario)
@@ -249,7 +266,10 @@ def test_a_role_is_the_same_agent_as_a_driver() -> None:
     base = BASE.replace(latency_s=0.0)
     scripted = base.replace(roles={"vehicle_2": "e_v2x_bm:estimated", "vehicle_3": "learner"})
     by_role = eb.evaluate(scripted, "full_brake", episodes=5)["full_brake"]["total_harm"]
-    assert by_role.tolist() == eb.evaluate(base, "e_v2x_bm:estimated", episodes=5)["e_v2x_bm:estimated"]["total_harm"].tolist()
+    assert (
+        by_role.tolist()
+        == eb.evaluate(base, "e_v2x_bm:estimated", episodes=5)["e_v2x_bm:estimated"]["total_harm"].tolist()
+    )
 
 
 def test_the_environment_says_that_the_bound_is_of_the_estimate() -> None:

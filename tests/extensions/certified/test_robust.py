@@ -12,8 +12,8 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.extensions.certified.robust import RobustShield
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.motion.layout import BRAKING, LATENCY, OWN_LATENCY
+from ethbrake_marl.shields.step import StepShield
 from tests.extensions.certified.attack import UNCERTAINTIES, Wrongly, attacked, robust
 from tests.refused import refused
 from tests.shields.attack import WAYS
@@ -178,7 +178,9 @@ def test_a_shield_takes_rows_and_does_not_change_the_state() -> None:
     before, rows = state.memories["shield"].members.states.line.copy(), np.array([4, 1])
     whole, part = game.step(state, proposed)[0].take(rows), game.step(state.take(rows), proposed[rows])[0]
     np.testing.assert_array_equal(whole.line, part.line)
-    np.testing.assert_array_equal(whole.memories["shield"].members.states.line, part.memories["shield"].members.states.line)
+    np.testing.assert_array_equal(
+        whole.memories["shield"].members.states.line, part.memories["shield"].members.states.line
+    )
     np.testing.assert_array_equal(state.memories["shield"].members.states.line, before)
     assert (whole.memories["shield"].members.states.clock[..., 0] > state.time_s.min()).all()
 
@@ -240,7 +242,9 @@ def test_uncertainty__as_a_text_is_refused(text: str) -> None:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "ppo+robust': needs intervals, for instance ppo+robust:braking": lambda: eb.make_agent("ppo+robust", scenario=PAPER),
+    "ppo+robust': needs intervals, for instance ppo+robust:braking": lambda: eb.make_agent(
+        "ppo+robust", scenario=PAPER
+    ),
     "uncertainty = 0.1: must be a text": lambda: RobustShield(uncertainty=0.1),
     "the first decision may be as late as 1000.5 s": lambda: first(PAPER, uncertainty="latency_s.vehicle_2=1000"),
     "vehicle_1 of world 0 is to accelerate with -5.9 m/s2, which may be beyond its capacity": lambda: members(
