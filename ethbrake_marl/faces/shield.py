@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
 from inspect import signature
 from typing import Any
 
-from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.agents.drive import Agent, Team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -21,8 +20,11 @@ from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.scenario import Scenario
 
-MakeShield = Callable[..., Shield]  # (drivers, **options): body -> agent, perhaps empty; the options of the mode
+# (drivers, **options): body -> agent, perhaps empty; the options of the mode. One called ``scenario`` is the worlds'.
+MakeShield = Callable[..., Shield]
+Make = Callable[[Mapping[int, Agent] | None, Scenario | None], Shield]
 
 
 def register_shield_mode(name: str, make: MakeShield) -> None:
@@ -63,11 +65,19 @@ def shield(
     """
     if mode not in MODES:
         raise unknown_name("shield mode", mode, MODES)
-    known = [name for name in signature(MODES[mode]).parameters if name != "drivers"]
+    wanted = signature(MODES[mode]).parameters
+    known = [name for name in wanted if name not in ("drivers", "scenario")]
     for name in options:
         if name not in known:
             raise unknown_name(f"option of a shield in mode {mode}", name, known)
-    make = partial(MODES[mode], **options)
+
+    def make(drivers: Mapping[int, Agent] | None, worlds: Scenario | None) -> Shield:
+        if "scenario" not in wanted:
+            return MODES[mode](drivers, **options)
+        if worlds is None:
+            raise InvalidInput(f"shield: mode {mode!r} needs a scenario, which a team has not; shield an environment")
+        return MODES[mode](drivers, **options, scenario=worlds)
+
     if not isinstance(env, Team) and not hasattr(env, "act"):
         if scenario is not None:
             raise InvalidInput("shield: scenario: an environment has its own; leave it out")
@@ -78,8 +88,9 @@ def shield(
     return team._replace(name=f"{team.name}+{mode}")
 
 
-def shielded_team(driver: Driver, scenario: AnyScenario | None, make: MakeShield) -> Team:
+def shielded_team(driver: Driver, scenario: AnyScenario | None, make: Make) -> Team:
     """Return a team with a shield, or an agent for all learners of a scenario."""
+    loaded = None
     if isinstance(driver, Team):
         team = driver
         if scenario is not None:
@@ -87,13 +98,14 @@ def shielded_team(driver: Driver, scenario: AnyScenario | None, make: MakeShield
     elif scenario is None:
         raise InvalidInput(f"shield: agent {driver.name!r}: pass scenario=..., in which it drives")
     else:
-        team = team_of(driver, load_scenario(scenario))
+        loaded = load_scenario(scenario)
+        team = team_of(driver, loaded)
     if team.shield is not None:
         raise InvalidInput(f"shield: team {team.name!r} already has a shield")
-    return team._replace(shield=make(team.drivers))
+    return team._replace(shield=make(team.drivers, loaded))
 
 
-def shielded_environment(env: Any, policy: Any, make: MakeShield, harm_count: str) -> Any:
+def shielded_environment(env: Any, policy: Any, make: Make, harm_count: str) -> Any:
     """Return a copy of an environment with a shield. A policy that is a name minimises ``harm_count``."""
     base: Any = getattr(env, "unwrapped", None)
     game, stream = getattr(base, "game", None), getattr(base, "stream", None)
@@ -110,12 +122,12 @@ def shielded_environment(env: Any, policy: Any, make: MakeShield, harm_count: st
     if not len(game.rules.learners):
         raise InvalidInput(f"shield: scenario {game.name!r} has no learner to shield; pass learners=['vehicle_2']")
     if policy is None:
-        return guarded(env, base, game._replace(shield=make(None)))
+        return guarded(env, base, game._replace(shield=make(None, base.scenario)))
     policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
     team = teams_of({"policy": policy}, base.scenario, harm_count=harm_count)["policy"]
     if team.shield is not None:
         raise InvalidInput(f"shield: policy {policy!r:.60} has a shield of its own; pass it without one")
-    return guarded(env, base, team._replace(shield=make(team.drivers)).game(game))
+    return guarded(env, base, team._replace(shield=make(team.drivers, base.scenario)).game(game))
 
 
 def guarded(env: Any, base: Any, game: Game) -> Any:

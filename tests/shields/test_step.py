@@ -336,6 +336,9 @@ class Robust(StepShield):
 
     M, FACTORS = 3, (1.0, 0.6, 1.5)
 
+    def begin(self, game: Game, alert: State, state: State) -> Any:
+        return self.start(game, alert, state, self.seen(state, None), self.agents_at(game, alert))
+
     def seen(self, state: State, memory: Any) -> State:
         many = state.take(np.arange(state.n).repeat(self.M))
         car = many.car.copy()

@@ -1,177 +1,286 @@
-"""Shields over estimated worlds: the bound in worlds that are corners of what is open, and in others."""
+"""Estimated lines by hand, the bound in worlds that are corners of what is open, and what was not received."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
 
-import ethbrake_marl.first_edition as eb
-from ethbrake_marl.first_edition.agents.driving import drive
-from ethbrake_marl.first_edition.agents.making import make_agent
-from ethbrake_marl.first_edition.physics.state import Floats
-from ethbrake_marl.first_edition.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv, shielded_aec
-from tests.extensions.certified.estimates import ABOVE, HEARD_LATE, LISTS, NEVER_HEARD, WAYS, shielded
-from tests.first_edition.shield.attacks import all_infos
-from tests.first_edition.shield.plays import reported
+import ethbrake_marl as eb
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.extensions.certified.estimated import Lines, in_order
+from ethbrake_marl.extensions.certified.estimating import EstimatedEV2XBM, EstimatedShield
+from ethbrake_marl.extensions.certified.robust import opened
+from ethbrake_marl.motion.layout import BRAKING, GAP, HIT, LATENCY, MASS, OWN_LATENCY, SPEED
+from tests.extensions.certified.attack import BASE, CHANCE, ENDS, NEVER_HEARD, attacked, estimated
+from tests.refused import refused
+from tests.shields.attack import WAYS
 
-BASE = eb.load_scenario("cooperation-2-paper").replace(early_impacts="keep")
 PERIODIC = BASE.replace(v2x={"preset": "blocked", "persistence": "periodic"})
+DEAF = BASE.replace(
+    v2x={"preset": "paper", "hears": "front"}, gaps_m=[7.0, {"uniform": [5, 10]}],
+    speeds_mps=[20.0, 20.0, {"uniform": [18, 22]}],
+)  # fmt: skip
 
 
-def driven(agent: object, scenario: eb.Scenario, n: int, seed: int = 7, vehicle: int = 1) -> tuple[Floats, Floats]:
-    """Harm realised, and the first bound, [n] each."""
-    episodes = drive(scenario.sample(n, seed).worlds, agent, scenario, vehicle)
-    told = episodes.memories[vehicle] if episodes.guarded is None else episodes.guarded.results
-    return episodes.ledger.world_harm("first"), told["predicted_harm"]
+def lines_at(scenario: eb.Scenario, n: int = 20, steps: int = 0, action: float = 0.0) -> tuple[Lines, State, State]:
+    """The median lines of Vehicle 2, the true state, and the lines, after some steps."""
+    loaded, game = eb.open_game(scenario)
+    lines, alert = Lines.of(loaded, 2, corners=False), loaded.sample(n, 7)
+    state = game.begin(alert)
+    median = lines.heard(state, opened(game, lines.at_alert(alert, state)))[0]
+    for _ in range(steps):
+        state = game.step(state, np.full((n, 1), action))[0]
+        median = lines.heard(state, game.follow(median, np.full((n, 1), action))[0])[0]
+    return lines, state, median
 
 
-@pytest.mark.parametrize("name", LISTS)
-@pytest.mark.parametrize("way", WAYS)
-def test_robust__at_the_corners_no_world_is_above_the_first_bound(name: str, way: str) -> None:
-    harm, bound, replaced = shielded(way, LISTS[name], 4, 7)
-    assert (harm <= bound + ABOVE).all() and replaced > 4
+# ------------------------------------------------------------------------------------------------ lines by hand
 
 
-def test_robust__between_the_corners_some_worlds_are_above_though_trusted() -> None:
-    """The counterexample of docs/extensions/certified.md: proposals to coast, in the first world of seed 5006."""
-    env = eb.HybridShield(eb.parallel_env("cooperation-1-front"), mode="robust", estimated=True)
-    env.reset(seed=5006)
-    told = []
-    while env.agents:
-        told.append(env.step({"vehicle_2": [0.0]})[4]["vehicle_2"])
-        assert told[-1]["shield_trusted"]
-    assert told[-1]["world_first_impact_harm"] > told[0]["shield_bound_harm"] + 8.0
+def test_the_line_is_the_true_one__where_everything_is_known() -> None:
+    for scenario in (BASE, BASE.replace(v2x="nominal")):
+        _, state, median = lines_at(scenario, steps=9, action=-0.5)
+        known = (state.know[:, 2, 1:] <= state.time_s[:, np.newaxis]).all(axis=1)
+        assert known.sum() > 10
+        np.testing.assert_allclose(median.line[known][:, [SPEED, GAP], :-1], state.line[known][:, [SPEED, GAP], :-1])
+        np.testing.assert_array_equal(median.car[known][:, [MASS, BRAKING]], state.car[known][:, [MASS, BRAKING]])
+    np.testing.assert_array_equal(
+        lines_at(BASE, steps=9, action=-0.5)[2].line, lines_at(BASE, steps=9, action=-0.5)[1].line
+    )
 
 
-def test_step__in_the_middle_promises_nothing_of_the_corners() -> None:
-    harm, bound, _ = shielded("coast", NEVER_HEARD, 30, 7, robust=False)
-    assert (harm > bound + 1.0).any()
+def test_who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script() -> None:
+    # Vehicle 3 is never heard: at the alert 7.5 m behind, at 20 m/s; it coasts to 0.8 s, then brakes with 6. At 1 s it
+    # has made 20 m less 0.5 * 6 * 0.2^2 = 0.12 m, and Vehicle 2, with 20 m/s and no command, 20 m.
+    _, state, median = lines_at(DEAF, 40, steps=5)
+    free = ~state.pair_hit[:, 0] & (state.speeds_mps[:, 1] == 20.0)
+    np.testing.assert_allclose(state.time_s, 1.0)
+    assert free.sum() > 20
+    np.testing.assert_allclose(median.gaps_m[free, 1], 7.5 + 0.12)
+    np.testing.assert_allclose(median.speeds_mps[free, 2], 20.0 - 6.0 * 0.2)
+    np.testing.assert_allclose(median.gaps_m[:, 0], state.gaps_m[:, 0], atol=1e-9)
+    assert (median.commands_mps2[:, 2] == -6.0).all()
 
 
-@pytest.mark.parametrize("robust", [False, True])
-def test_estimated__where_everything_is_known_the_bound_is_that_of_the_best_constant(robust: bool) -> None:
-    harm, bound, _ = shielded("drive", BASE, 20, 7, robust=robust)
-    _, best = driven(make_agent("e_v2x_bm", scenario=BASE), BASE, 20)
-    np.testing.assert_allclose(bound, best, atol=1e-4)
-    assert (harm <= bound + 1e-6).all()
+def test_corners__are_all_combinations_of_the_ends_of_what_is_open() -> None:
+    lines = Lines.of(DEAF.replace(mass_t=[4.5, 5.5, {"uniform": [2.0, 9.0]}]), 2, corners=True)
+    alert = lines.alert
+    corners = {*zip(alert.line[:, GAP, 2], alert.line[:, SPEED, 3], alert.car[:, MASS, 3], strict=True)}
+    ends = {(gap, speed, mass) for gap in (5.0, 10.0) for speed in (18.0, 22.0) for mass in (2.0, 9.0)}
+    assert lines.alert.n == 9 and corners == ends | {(7.5, 20.0, 5.5)}
+    alert = eb.load_scenario("cooperation-2-blocked").replace(gaps_m=7, speeds_mps=20)
+    late = Lines.of(alert, 2, corners=True)  # only when Vehicle 3 gets the alert is open
+    assert late.alert.n == 3 and late.alert.car[1, LATENCY, 3] == 0.8 < late.alert.car[2, LATENCY, 3]
 
 
-@pytest.mark.parametrize("spec", ["coast+step:estimated", "coast+robust:estimated", "ppo+episode:estimated"])
-def test_estimated__no_world_depends_on_the_batch(spec: str) -> None:
-    worlds = PERIODIC.sample(5, 3).worlds
-    whole = drive(worlds, make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final
-    alone = drive(worlds.take([4]), make_agent(spec, scenario=PERIODIC), PERIODIC, 1).final
-    np.testing.assert_allclose(whole.speeds_mps[4], alone.speeds_mps[0], atol=1e-6)
+def test_an_old_message__is_moved_on_by_the_script_to_the_truth() -> None:
+    channel = {
+        "preset": "paper",
+        "link_latency_s": 0.2,
+        "persistence": "periodic",
+        "senses": "front",
+        "sensing_s": [5, 5],
+    }
+    agent, places = EstimatedEV2XBM(BASE.replace(v2x=channel)), []
+
+    class Spy(EstimatedEV2XBM):
+        def act(self, state: State, memory: Any, body: int) -> Any:
+            _, memory = super().act(state, memory, body)
+            free = ~state.pair_hit.any(axis=1)
+            places.append(
+                (memory.median.line[free][:, [SPEED, GAP], :-1] - state.line[free][:, [SPEED, GAP], :-1], free)
+            )
+            return np.full(state.n, -6.0), memory
+
+    loaded, game = eb.open_game(agent.scenario)
+    for _ in eb.play(game, loaded.sample(40, 7), eb.Team("spy", {2: Spy(loaded)})):
+        pass
+    assert len(places) > 20 and places[11][1].sum() > 3
+    assert max(np.abs(far).max(initial=0.0) for far, _ in places[:12]) < 1e-9
 
 
+def test_a_piece_that_messages_lack__is_the_middle_of_its_range() -> None:
+    base = BASE.replace(mass_t=[4.5, 5.5, {"uniform": [2.0, 9.0]}], braking_capacity_mps2={"uniform": [6, 8]})
+    tells = {"vehicle_1": ["place", "speed", "mass"], "vehicle_3": ["place", "speed", "braking_capacity"]}
+    _, state, median = lines_at(base.replace(v2x={"tells": tells}))
+    np.testing.assert_allclose(median.gaps_m, state.gaps_m, atol=1e-9)
+    np.testing.assert_allclose(median.speeds_mps, state.speeds_mps)
+    assert (median.mass_t[:, 2] == 5.5).all() and (median.mass_t[:, 0] == state.mass_t[:, 0]).all()
+    assert (median.braking_capacity_mps2[:, 0] == 7.0).all()
+    assert (median.braking_capacity_mps2[:, 2] == state.braking_capacity_mps2[:, 2]).all()
+
+
+def test_who_reacts_later_than_it_says__is_believed_to_react_from_then_on() -> None:
+    """News of the alert reach Vehicle 3 late; Vehicle 2 hears from it that it does not brake yet."""
+    _, state, median = lines_at(BASE.replace(v2x=CHANCE, latency_s=[0, 0.1, 0.1]), 200, steps=2)
+    late = (state.car[:, LATENCY, 3] > state.time_s) & (state.know[:, 2, 3] <= state.time_s)
+    assert late.any() and (median.car[late, OWN_LATENCY, 3] == 0.1).all()
+    np.testing.assert_allclose(median.speeds_mps[late, 2], state.speeds_mps[late, 2])
+    assert (median.car[late, LATENCY, 3] >= state.time_s[late]).all()
+
+
+def test_in_order__who_is_not_known_stays_between_those_who_are() -> None:
+    place, known = np.array([[0.0, 9.0, 4.0, 3.0, 7.0]]), np.array([[True, False, True, False, False]])
+    in_order(place, known)
+    assert place.tolist() == [[0.0, 4.0, 4.0, 4.0, 7.0]]
+
+
+# ------------------------------------------------------------------------------------------------ the claim
+
+
+@settings(max_examples=14)
+@given(
+    name=st.sampled_from(list(ENDS)),
+    count=st.sampled_from(["first", "total"]),
+    way=st.sampled_from(list(WAYS)),
+    seed=st.integers(0, 10_000),
+)
+def test_true_corners__do_at_most_the_first_bound_to_the_bit(name: str, count: str, way: str, seed: int) -> None:
+    found = estimated(name, count, way, 4, seed)
+    assert found.above == found.rises == 0 and found.trusted.all()
+
+
+def test_news_remove_corners__and_the_bound_falls() -> None:
+    loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
+    game = game._replace(shield=EstimatedShield(scenario=loaded, corners=True))
+    state, fell = game.begin(loaded.sample(12, 7)), 0
+    for _ in range(12):
+        before, heard = state.memories["shield"], state.know[:, 2, 3] <= state.time_s
+        state, _ = game.step(state, np.full((12, 1), np.nan))
+        after = state.memories["shield"]
+        masses = after.members.states.car[:, :, MASS, 3]
+        assert (masses[heard] == state.car[heard, MASS, 3, np.newaxis]).all()
+        fell += int((after.price < before.price - 1.0).sum())
+    assert fell > 3 and heard.any()
+
+
+def test_between_the_corners__some_worlds_are_above_their_bound() -> None:
+    loaded, game = eb.open_game("cooperation-1-front")
+    found = attacked(game, loaded.sample(80, 7), EstimatedShield(scenario=loaded, corners=True), "first", "coast", 0)
+    assert 0 < (found.harm > found.first).sum() < 12 and not found.trusted.all()
+
+
+def test_in_the_middle__nothing_is_promised_of_the_corners() -> None:
+    found = estimated("never heard", "first", "coast", 30, 7, corners=False)
+    assert (found.harm > found.first + 1.0).any()
+
+
+@pytest.mark.parametrize("corners", [False, True])
+def test_where_everything_is_known__the_bound_is_that_of_step_mode(corners: bool) -> None:
+    loaded, game = eb.open_game(BASE)
+    alert = loaded.sample(20, 7)
+    found = attacked(game, alert, EstimatedShield(scenario=loaded, corners=corners), "first", "random", 0)
+    plain = game._replace(shield=eb.shield(eb.make_agent("coast"), scenario=BASE).shield).begin(alert)
+    assert found.above == 0 and found.trusted.all() and (found.first <= found.first.max()).all()
+    np.testing.assert_allclose(np.minimum(found.first, plain.memories["shield"].first + 0.01), found.first)
+
+
+# ------------------------------------------------------------------------------------------------ knowledge
+
+
+CHANNELS = {
+    "blocked": "blocked",
+    "periodic": {"preset": "blocked", "persistence": "periodic"},
+    "front alone": {"preset": "paper", "hears": "front"},
+    "no capacity": {"preset": "blocked", "tells": ["place", "speed", "latency", "mass"]},
+}
+
+
+SPECS = ["e_v2x_bm:estimated", "coast+step:estimated", "ppo+episode:estimated", "coast+robust:estimated"]
+
+
+def decided(spec: str, scenario: eb.Scenario, alert: State) -> tuple[Any, Any]:
+    """Commands of Vehicle 2 at its first four decisions, and whether it has heard or felt anything of Vehicle 3."""
+    _, game = eb.open_game(scenario)
+    team, commands, aware = eb.make_agent(spec, scenario=scenario), [], []
+    team = team if isinstance(team, eb.Team) else eb.Team(spec, {2: team})
+    for k, (_, state) in enumerate(eb.play(game, alert, team)):
+        commands.append(state.wanted[:, 2])
+        aware.append((state.know[:, 2, 3] <= state.time_s) | (state.line[:, HIT, 2] == 1.0) | (state.time_s > 1.2))
+        if k == 4:
+            return np.array(commands[1:]), np.array(aware[:-1])
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize("spec", SPECS)
+def test_what_was_not_received__changes_no_command(spec: str, channel: str) -> None:
+    scenario = BASE.replace(v2x=CHANNELS[channel])
+    alert, rng = scenario.sample(60, 7), np.random.default_rng(0)
+    car, line = alert.car.copy(), alert.line.copy()
+    if channel == "no capacity":
+        car[:, BRAKING, 3] += 1.0  # it reacts at 0.8 s at the earliest
+    else:
+        line[:, SPEED, 3], line[:, GAP, 2] = rng.uniform(18.0, 19.0, 60), rng.uniform(9.0, 10.0, 60)
+        car[:, MASS, 3] += 3.0
+    one, two = (decided(spec, scenario, worlds) for worlds in (alert, alert._replace(car=car, line=line)))
+    unaware = ~(one[1] | two[1])
+    if channel == "no capacity":
+        unaware = np.zeros((4, 60), bool)
+        unaware[:2] = alert.car[:, LATENCY, 2] <= 0.6
+    assert unaware.sum() > 10 and (one[0] == two[0])[unaware].all()
+
+
+def test_a_leak_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    received = Lines.received
+    monkeypatch.setattr(
+        Lines, "received", lambda self, state: (np.ones_like(received(self, state)[0]), received(self, state)[1])
+    )
+    with pytest.raises(AssertionError):
+        test_what_was_not_received__changes_no_command("coast+step:estimated", "blocked")
+
+
+# ------------------------------------------------------------------------------------------------ doors
+
+
+@pytest.mark.parametrize(
+    "spec",
+    ["coast+step:estimated", "ppo+episode:estimated", "ppo+episode:pairwise:estimated", "e_v2x_bm:estimated",
+     "e_v2x_bm:pairwise:estimated"],
+)  # fmt: skip
 @pytest.mark.parametrize(
     "scenario",
-    [
-        eb.load_scenario("paper-random").replace(
-            vehicles=2, braking_capacity_mps2=6.0, driving_capacity_mps2=6.0, mass_t=5.0, latency_s=0.1,
-            roles={"vehicle_2": "learner"}, v2x={"preset": "nominal", "persistence": "periodic"}, horizon_s=10.0,
-        ),
-        eb.load_scenario("cooperation-4-all").with_learners(["vehicle_2"]).replace(
-            early_impacts="keep", v2x=PERIODIC.v2x.model_dump(exclude_none=True)
-        ),
-    ],
-    ids=["two vehicles", "an obstacle"],
-)  # fmt: skip
-@pytest.mark.parametrize("robust", [False, True])
-def test_estimated__shields_other_lines(scenario: eb.Scenario, robust: bool) -> None:
-    if not robust or scenario.vehicles == 2:
-        assert np.isfinite(shielded("coast", scenario, 4, 7, robust=robust)[:2]).all()
-
-
-@pytest.mark.parametrize("spec", ["coast+robust:estimated", "coast+step:estimated", "e_v2x_bm:estimated"])
-@pytest.mark.parametrize("script", ["coast", "e_v2x_bm"])
-def test_estimated__the_script_of_the_controlled_vehicle_itself_does_not_count(spec: str, script: str) -> None:
-    scripted = BASE.replace(roles={"vehicle_1": "full_brake", "vehicle_2": script, "vehicle_3": "full_brake"})
-    worlds = scripted.sample(3, 1).worlds
-    harms = [
-        drive(worlds, make_agent(spec, scenario=scenario), scenario, 1).ledger.world_harm("total")
-        for scenario in (BASE, scripted)
-    ]
-    np.testing.assert_array_equal(*harms)
-
-
-def test_estimated__bounds_nothing_where_its_vehicle_had_an_impact_before_the_first_decision() -> None:
-    late = BASE.replace(latency_s=[0.0, 1.2, 0.5])
-    agents = {spec: make_agent(spec, scenario=late) for spec in ("coast+step", "coast+step:estimated")}
-    harm, bound = driven(agents["coast+step:estimated"], late, 60)
-    assert 0 < np.isinf(bound).sum() < 10 and (harm <= bound + ABOVE).all()
-    known, received = eb.summarise(eb.evaluate(late.sample(60, 7), agents, scenario=late))
-    assert known["predicted_harm"] is not None and received["predicted_harm"] is None  # no mean of what is not finite
-
-
-# On the interfaces.
-def told_in(env: Any, world: int = 3, action: float = 0.0) -> list[dict[str, Any]]:
-    """All that a parallel shield told of an episode in which one action is proposed, in that world of list 7."""
-    infos = all_infos(env, {"vehicle_2": [action]}, options={"listed_world": {"seed": 7, "number": world}})
-    return [reported(each["vehicle_2"]) for each in infos]
-
-
-@pytest.mark.parametrize("mode", ["step", "robust"])
-@pytest.mark.parametrize("scenario", [PERIODIC, HEARD_LATE, eb.load_scenario("cooperation-2-blocked")], ids=str)
-def test_parallel__does_what_the_agent_of_evaluations_does(scenario: eb.Scenario, mode: str) -> None:
-    env = HybridShield(eb.parallel_env(scenario), mode=mode, estimated=True)
-    for world in range(1 if mode == "robust" else 2):
-        told = told_in(env, world)
-        agent = make_agent(f"coast+{mode}:estimated", scenario=scenario)
-        alone = drive(scenario.sample(1, 7, first=world).worlds, agent, scenario, 1)
-        harm, shield = env.unwrapped.engine.ledger.world_harm("first"), alone.guarded.shield
-        assert harm[0] == alone.ledger.world_harm("first")[0]
-        assert sum(each["intervened"] for each in told) == shield.interventions[0]
-        assert told[1]["bound_harm"] <= shield.predicted_harm[0]
-        assert all(
-            (each["mode"], each["trusted"], "members" in each)
-            == ({"step": 1, "robust": 2}[mode], *2 * [mode == "robust"])
-            for each in told
-        )
-
-
-def test_every_interface__decides_alike_and_says_that_the_bound_is_of_the_estimate() -> None:
-    single = ShieldedEnv(eb.EthBrakeEnv(PERIODIC), estimated=True)
-    aec = shielded_aec(eb.parallel_env(PERIODIC), mode="step", estimated=True)
-    vector = ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=1, scenario=PERIODIC), estimated=True)
-    start, *told = told_in(HybridShield(eb.parallel_env(PERIODIC), mode="step", estimated=True), action=0.5)
-    assert start["bound_harm"] == np.inf and np.isfinite(told[0]["bound_harm"]) and set(start) == set(told[0])
-    assert all(each["estimated"] and not each["trusted"] for each in told)
-    for env in (single, aec, vector):
-        env.reset(options={"listed_world": {"seed": 7, "number": 3}})
-    for wanted in told:
-        *_, info = single.step(np.array([0.5], np.float32))
-        *_, infos = vector.step(np.array([[0.5]], np.float32))
-        assert reported(info) == {key: column[0] for key, column in reported(infos).items()} == wanted
-    decided = []
-    for agent in aec.agent_iter():
-        ended = aec.terminations[agent] or aec.truncations[agent]
-        decided += [aec.infos[agent]["shield_applied_action"]] if agent == "vehicle_2" else []
-        aec.step(np.array([0.5], np.float32) if agent == "vehicle_2" and not ended else None)
-    assert decided[1:] == [each["applied_action"] for each in told]
-
-
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: ShieldedVectorEnv(eb.EthBrakeVectorEnv(num_envs=2, scenario=PERIODIC), mode="robust", estimated=True),
-        lambda: eb.ShieldedVecEnv(eb.make_sb3_vec_env(PERIODIC, 2, seed=5), mode="robust", estimated=True),
-    ],
-    ids=["vector", "sb3"],
+    [PERIODIC, eb.load_scenario("cooperation-2-five").replace(v2x="blocked", roles={"vehicle_2": "learner"})],
+    ids=str,
 )
-def test_batch__rows_that_begin_again_are_those_of_a_fresh_episode(make: Any) -> None:
-    """In these worlds no bound rises; what is heard of a world that is no corner may raise it."""
-    env = make()
-    env.reset(**({"seed": 0} if isinstance(env, ShieldedVectorEnv) else {}))
-    engine, bounds, begun, rng = env.attached.engine, np.zeros(2), 0, np.random.default_rng(0)
-    for _ in range(120):
-        fresh, idle = engine.steps == 0, engine.ended.copy()
-        env.step(rng.uniform(-1.0, 1.0, (2, 1)).astype(np.float32))
-        told = env.attached.guard.tell(engine.ruling.memory, engine.ruling)["bound_harm"]
-        bounds = np.where(fresh, told, bounds)
-        assert (told <= bounds + ABOVE)[~idle].all()
-        begun += int(fresh.sum())
-    assert begun >= 4  # each row at least twice: an episode has at most 80 steps
+def test_no_world_depends_on_the_batch(spec: str, scenario: eb.Scenario) -> None:
+    _, game = eb.open_game(scenario)
+    worlds, agent = scenario.sample(5, 3), eb.make_agent(spec, scenario=scenario)
+    team = agent if isinstance(agent, eb.Team) else eb.Team(spec, {2: agent})
+    whole, alone = eb.drive(game, worlds, team), eb.drive(game, worlds.take([4]), team)
+    np.testing.assert_array_equal(whole.line[4], alone.line[0])
+
+
+def test_knowledge_and_names() -> None:
+    for spec, knows in (
+        ("e_v2x_bm:estimated", "estimated model"),
+        ("coast+step:estimated", "own sensors + estimated model"),
+        ("ppo+robust:estimated", "messages + estimated model"),
+        ("ppo+episode:pairwise:estimated", "messages + estimated model"),
+    ):
+        assert eb.evaluate(DEAF, spec, episodes=1).knows[spec] == knows
+
+
+def test_a_role_is_the_same_agent_as_a_driver() -> None:
+    base = BASE.replace(latency_s=0.0)
+    scripted = base.replace(roles={"vehicle_2": "e_v2x_bm:estimated", "vehicle_3": "learner"})
+    by_role = eb.evaluate(scripted, "full_brake", episodes=5)["full_brake"]["total_harm"]
+    assert (
+        by_role.tolist()
+        == eb.evaluate(base, "e_v2x_bm:estimated", episodes=5)["e_v2x_bm:estimated"]["total_harm"].tolist()
+    )
+
+
+def test_the_environment_says_that_the_bound_is_of_the_estimate() -> None:
+    env = eb.shield(eb.parallel_env("cooperation-2-blocked"), mode="estimated", corners=True)
+    info = env.reset(seed=7)[1]["vehicle_2"]
+    bound = info["shield_bound_harm"]
+    while env.agents:
+        info = env.step({"vehicle_2": [0.0]})[4]["vehicle_2"]
+    assert np.isfinite(bound) and isinstance(info["shield_trusted"], bool)
+    team = eb.shield(eb.make_agent("coast"), mode="estimated", scenario="cooperation-2-blocked")
+    assert team.name == "coast+estimated" and team.shield.lines.alert.n == 1
 
 
 def test_latencies_that_are_over__are_not_waited_for_again() -> None:
@@ -179,5 +288,35 @@ def test_latencies_that_are_over__are_not_waited_for_again() -> None:
         name="late", vehicles=2, gaps_m=15, speeds_mps=[0, 10], braking_capacity_mps2=5, driving_capacity_mps2=5,
         mass_t=1, latency_s=[0, 0.6], roles={"vehicle_1": "full_brake", "vehicle_2": "learner"},
     )  # fmt: skip
-    for found in driven(make_agent("full_brake+episode:estimated", scenario=late), late, 1):
-        assert found == pytest.approx([10.0**2 - 2 * 5 * 9])  # 9 m are left when it begins to brake
+    for spec in ("full_brake+episode:estimated", "e_v2x_bm:estimated"):
+        harm = eb.evaluate(late, spec, episodes=1)[spec]["first_impact_harm"]
+        assert harm == pytest.approx([10.0**2 - 2 * 5 * 9])  # 9 m are left when it begins to brake
+
+
+REFUSED: dict[str, Callable[[], object]] = {
+    "needs a scenario": lambda: eb.make_agent("e_v2x_bm:estimated"),
+    "this is a mixture; give one of": lambda: eb.make_agent("e_v2x_bm:estimated", scenario="mixture-delays"),
+    "but vehicle_3 is driven by 'idm'": lambda: eb.make_agent(
+        "coast+step:estimated", scenario=BASE.replace(roles={"vehicle_2": "learner", "vehicle_3": "idm"})
+    ),
+    "has 2 learners; an estimated shield needs exactly one": lambda: eb.make_agent(
+        "coast+step:estimated", scenario="cooperation-3-pair"
+    ),
+    "nothing but estimated can follow the colon": lambda: eb.make_agent("coast+step:gaps_m=1:estimated", scenario=BASE),
+    "must be e_v2x_bm:estimated or e_v2x_bm:pairwise:estimated": lambda: eb.make_agent(
+        "e_v2x_bm:coupled:estimated", scenario=BASE
+    ),
+    "combinations (corners), but at most 1024 are allowed": lambda: eb.make_agent(
+        "coast+robust:estimated",
+        scenario=BASE.replace(
+            braking_capacity_mps2={"uniform": [3, 9]}, mass_t={"uniform": [2, 9]}, latency_s={"uniform": [0, 1]},
+            v2x="nominal",
+        ),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_use__is_refused(message: str) -> None:
+    with refused(message):
+        REFUSED[message]()
