@@ -101,7 +101,7 @@ def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator
         rows, seen = ~state.ended, game.observe(state, game.rules.learners)
         t = int(state.steps.max())
         action = actions[min(t, len(actions) - 1)]
-        after, step = game.step(state, action)
+        after, step = game.step(state, action.astype(np.float64))
         columns = {
             "world": state.clock[rows, NUMBER].astype(np.int64),
             "decision": np.full(rows.sum(), t),
