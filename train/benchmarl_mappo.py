@@ -96,7 +96,7 @@ def policy_of(experiment: Any, training: Training) -> Policy:
         policy_hidden=recipe.network.policy,
         value_hidden=(),
         activation=recipe.network.activation,
-        output="tanh" if False else "clip",
+        output="tanh",
     )
     return Policy.make(
         tensors_of(actor, len(recipe.network.policy)),
