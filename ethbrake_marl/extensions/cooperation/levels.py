@@ -209,7 +209,13 @@ class Plan:
                         changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
                         name = recipe.name
                     training = Training.of(recipe.replace(**changes), level.scenario)
-                    yield level, algorithm, seed, training, self.folder / "trainings" / f"{level.name}-{name}-seed{seed}"
+                    yield (
+                        level,
+                        algorithm,
+                        seed,
+                        training,
+                        self.folder / "trainings" / f"{level.name}-{name}-seed{seed}",
+                    )
 
     def settings_of(self, level: Level) -> tuple[str, ...]:
         """Return the settings that a level's trainings record."""

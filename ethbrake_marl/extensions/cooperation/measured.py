@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,12 +13,12 @@ from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Objective, amounts, objectives_of
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.evaluation.evaluate import evaluate
+from ethbrake_marl.evaluation.evaluate import Result, evaluate
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.measures import Given, Measure
 from ethbrake_marl.evaluation.statistics import Clusters
 from ethbrake_marl.extensions.cooperation.levels import Level, Plan, common_worlds
-from ethbrake_marl.extensions.cooperation.optimum import Answer, least_known, search_all
+from ethbrake_marl.extensions.cooperation.optimum import least_known, search_all
 from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import make_agent, open_game, team_of
@@ -39,11 +40,11 @@ class Measured(NamedTuple):
     algorithm: str | None  # None: the level has no learner
     reached: Columns  # with the trained teams, or with the scripts if there is no learner
     braking: Columns  # if all vehicles brake fully, [1, n]
-    best: Mapping[str, Floats] | None  # count -> [1, m] least known harm in the first m worlds (m2/s2); None: no learner
-    shielded: Mapping[str, Columns]  # count that the shield bounds -> results; empty: without shield
-    goal: str  # what the training minimises, in words; "": the level has no learner
-    clusters: Clusters
-    about: Mapping[str, Any]  # plain data: digests of worlds, scenario and policies, versions
+    best: Mapping[str, Floats] | None = None  # count -> [1, m] least known harm in the first m worlds (m2/s2)
+    shielded: Mapping[str, Columns] = MappingProxyType({})  # count that the shield bounds -> results
+    goal: str = ""  # what the training minimises, in words; "": the level has no learner
+    clusters: Clusters = None
+    about: Mapping[str, Any] = MappingProxyType({})  # plain data: digests of worlds, scenario, policies; versions
 
 
 def measure(plan: Plan, jobs: int, tell: OnProgress) -> list[Measured]:
@@ -51,50 +52,63 @@ def measure(plan: Plan, jobs: int, tell: OnProgress) -> list[Measured]:
 
     Levels come in the order of the plan, each with the algorithms in theirs.
     """
-    runs: dict[tuple[str, str], dict[str, Team]] = {}
+    teams: dict[tuple[str, str], dict[str, Team]] = {}
     trainings: dict[tuple[str, str], Training] = {}
     for level, algorithm, seed, training, folder in plan.trainings():
         team = team_of(make_agent(f"team@{folder}", scenario=level.scenario), level.scenario)
-        runs.setdefault((level.name, algorithm), {})[f"seed {seed}"] = team
+        teams.setdefault((level.name, algorithm), {})[f"{algorithm} seed {seed}"] = team
         trainings[level.name, algorithm] = training
     worlds = common_worlds(plan.levels, plan.episodes, plan.list_seed)
-    searched = search_all(plan, worlds, jobs, tell)
+    answers = search_all(plan, worlds, jobs, tell)
     measured: list[Measured] = []
     for level, drawn in zip(plan.levels, worlds, strict=True):
         braking = level.scenario.replace(roles=dict.fromkeys(level.scenario.vehicle_names, "full_brake"))
         for algorithm in plan.algorithms if level.scenario.learners else (None,):
-            say = partial(tell, Progress(f"driving {level.name}", plan.episodes, plan.episodes))
-            teams = runs[level.name, algorithm] if algorithm else {"scripts": Team("scripts", {})}
-            training = trainings[level.name, algorithm] if algorithm else None
-            goal, measures = goal_of(training), measures_of(training)
-            reached, about = driven(level.scenario, drawn, teams, measures)
-            full, _ = driven(braking, drawn, {"full_brake": Team("full_brake", {})}, measures)
+            tell(Progress(f"driving {level.name}", len(measured), len(plan.levels) * len(plan.algorithms)))
+            own, training = {"scripts": Team("scripts", {})}, None
+            if algorithm is not None:
+                own, training = teams[level.name, algorithm], trainings[level.name, algorithm]
+            result, reached = driven(level.scenario, drawn, own, training)
+            _, full = driven(braking, all_braking(drawn), {"full_brake": Team("full_brake", {})}, training)
             behind = {}
-            for count in COUNTS if plan.shield and algorithm else ():
-                guarded = {name: shield(team, mode=plan.shield, harm_count=count) for name, team in teams.items()}
-                behind[count], _ = driven(level.scenario, drawn, guarded, measures)
-            measured.append(Measured(level, algorithm, reached, full, None, behind, goal, drawn_clusters(drawn), about))
-            say()
-    answers = {name: answer.with_harm(measured) for name, answer in searched.items()}
-    return [
-        each._replace(best={count: least_known(answers[each.level.name], answers.values(), count) for count in COUNTS})
-        if each.level.name in answers
-        else each
-        for each in measured
-    ]
+            for count in COUNTS if plan.shield and training else ():
+                guarded = {name: shield(team, mode=plan.shield, harm_count=count) for name, team in own.items()}
+                behind[count] = driven(level.scenario, drawn, guarded, training)[1]
+            if training is not None:
+                for count, column in HARM.items():
+                    answers[level.name].driven[count].extend(reached[column][:, : plan.search_episodes])
+            policies = [dict(result.policies[name]) for name in own]
+            measured.append(
+                Measured(
+                    level, algorithm, reached, full, None, behind, goal_of(training), result.clusters,
+                    {**result.about, "policy_sha256": policies},
+                )
+            )  # fmt: skip
+    best = {
+        name: {count: least_known(answer, answers.values(), count)[np.newaxis] for count in COUNTS}
+        for name, answer in answers.items()
+    }
+    return [each._replace(best=best.get(each.level.name)) for each in measured]
 
 
 def driven(
-    scenario: Scenario, drawn: Drawn, teams: Mapping[str, Team], measures: tuple[Measure, ...]
-) -> tuple[Columns, dict[str, Any]]:
-    """Let teams drive the worlds; return each column, [teams, n], and what a result says of worlds and policies."""
+    scenario: Scenario, drawn: Drawn, teams: Mapping[str, Team], training: Training | None
+) -> tuple[Result, Columns]:
+    """Let teams drive the worlds; return the result, and each column of numbers, [teams, n]."""
+    measures = (Measure("bound", bound), Measure("decisions", decisions))
+    if training is not None:
+        measures += (Measure("goal", partial(minimised, training)),)
     result = evaluate(drawn, teams, open_game(scenario)[1], measures, about=about_scenario(scenario))
     columns = [result[name] for name in teams]
     numbers = [name for name in columns[0] if columns[0][name].dtype.kind in "fib" and all(name in c for c in columns)]
-    policies = [dict(result.policies[name]) for name in teams]
-    return {name: np.stack([each[name] for each in columns]) for name in numbers}, {
-        **result.about, "policy_sha256": policies,
-    }  # fmt: skip
+    return result, {name: np.stack([each[name] for each in columns]) for name in numbers}
+
+
+def all_braking(drawn: Drawn) -> Drawn:
+    """Return the worlds with the command of full braking for every vehicle."""
+    worlds = drawn.worlds
+    wanted = np.pad(-worlds.braking_capacity_mps2, ((0, 0), (1, 0)))
+    return drawn._replace(worlds=worlds._replace(wanted=wanted))
 
 
 def goal_of(training: Training | None) -> str:
@@ -111,12 +125,6 @@ def own_objectives(training: Training) -> tuple[Objective, ...]:
     objectives = objectives_of(training.recipe.reward.objective or scenario.objective, scenario.vehicles)
     forms = [objectives[body - 1].kind.form for body in scenario.learners]
     return () if set(forms) == {"total"} else tuple(objectives)
-
-
-def measures_of(training: Training | None) -> tuple[Measure, ...]:
-    """Return the measures of an ablation: what the training minimises, the shield's bound, and the decisions."""
-    always = Measure("bound", bound), Measure("decisions", decisions)
-    return always if training is None else (*always, Measure("goal", partial(minimised, training)))
 
 
 def bound(game: Game, alert: State, last: State) -> Given:
@@ -137,8 +145,3 @@ def minimised(training: Training, game: Game, alert: State, last: State) -> Give
         return last.harm(count)
     each = amounts(objectives, None, last, count)
     return np.asarray(each[:, np.array(training.scenario.learners) - 1].mean(axis=1))
-
-
-def drawn_clusters(drawn: Drawn) -> Clusters:
-    """Return the recording of each world, [n]; None if all worlds are independent."""
-    return drawn.recordings if (drawn.recordings != "").any() else None
