@@ -34,13 +34,11 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
         ladder = [each for each in own if each.level.clear is None]
         steps += [_change(before, after, algorithm) for before, after in pairwise(ladder)]
         channels += [_change(by_name[each.level.clear], each, algorithm) for each in own if each.level.clear]
-    goals = [
-        each for each in measured if each.goal and each.reached["goal"].mean() > each.braking["goal"].mean() + TOLERANCE
-    ]
+    goals = [(each, *(own["goal"].mean() for own in (each.reached, each.braking))) for each in measured if each.goal]
     named = [
-        f"{each.level.name} ({each.algorithm}), {each.goal} {each.reached['goal'].mean():.2f}"
-        f" ({each.braking['goal'].mean():.2f} if everybody brakes fully)"
-        for each in goals
+        f"{each.level.name} ({each.algorithm}), {each.goal} {reached:.2f} ({braking:.2f} if everybody brakes fully)"
+        for each, reached, braking in goals
+        if reached > braking + TOLERANCE
     ]
     return {
         "kind": "ablate",

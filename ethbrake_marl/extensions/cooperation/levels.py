@@ -89,8 +89,8 @@ def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[Tr
     path = tuple(key.removeprefix("scenario.").split("."))
     if path[0] not in Scenario.model_fields:
         raise InvalidInput(
-            f"--sweep {key}: only a key of a scenario can be swept; to vary a recipe, write a recipe for each value, and"
-            " use train/sweep.py"
+            f"--sweep {key}: only a key of a scenario can be swept; to vary a recipe, write a recipe for each value,"
+            " and use train/sweep.py"
         )
     if path[0] in OF_LINE:
         raise InvalidInput(

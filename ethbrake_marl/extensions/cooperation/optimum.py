@@ -84,8 +84,8 @@ def can_imitate(own: Answer, other: Answer) -> Bools:
     """Return for each world, [m], whether learners of ``own`` can give the commands of the learners of ``other``.
 
     They can if each learner of ``other`` learns in ``own``, the other vehicles of ``own`` have the same roles, lines
-    and latencies are the same, and each decision of ``other`` is also one of ``own``. ``own`` may have an obstacle where
-    ``other`` has none, because commands are simulated with it.
+    and latencies are the same, and each decision of ``other`` is also one of ``own``. Only ``own`` may have an
+    obstacle, because commands are simulated with it.
     """
     mine, theirs = own.level.scenario, other.level.scenario
     scripted = [name for name, role in mine.roles.items() if role != "learner"]

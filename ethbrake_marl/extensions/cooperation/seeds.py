@@ -71,7 +71,7 @@ def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clus
 def _interval(
     sides: Sequence[Floats], of: Callable[[Floats], Floats], clusters: Clusters
 ) -> tuple[float, float] | None:
-    """Return the percentiles of a statistic of the sides' means, [resamples, sides]; None for one world or recording."""
+    """Return percentiles of a statistic of the sides' means, [resamples, sides]; None for one world or recording."""
     cluster = np.arange(sides[0].shape[1]) if clusters is None else np.unique(clusters, return_inverse=True)[1]
     if cluster.max() == 0:
         return None

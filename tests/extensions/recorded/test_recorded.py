@@ -48,6 +48,12 @@ def test_rows__are_bumper_to_bumper_in_both_directions_and_no_vehicle_is_in_two(
     assert "must not be passed on" in made.text
 
 
+def test_two_vehicles_behind_the_same_one__the_nearer_one_follows_it(tmp_path: Path) -> None:
+    rows = [track(1, 1, 100, 4, 20, 0), track(1, 2, 60, 4, 21, 1), track(1, 3, 80, 4, 22, 1)]
+    made = scenario_from_data("mine", recording(tmp_path, rows), "highd", based_on=scenario_of(2, tmp_path))
+    assert rows_of(made) == ["16.0,20.0,22.0"]
+
+
 def test_formats__same_queues_in_metres_and_in_feet_are_the_same_rows(tmp_path: Path) -> None:
     one, two = (
         np.loadtxt(rows_of(scenario_from_data("mine", write(tmp_path / of, 20), of)), delimiter=",")
