@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -54,33 +54,33 @@ def measure(plan: Plan, jobs: int, tell: OnProgress) -> list[Measured]:
     """
     teams: dict[tuple[str, str], dict[str, Team]] = {}
     trainings: dict[tuple[str, str], Training] = {}
-    for level, algorithm, seed, training, folder in plan.trainings():
+    for level, trained_by, seed, training, folder in plan.trainings():
         team = team_of(make_agent(f"team@{folder}", scenario=level.scenario), level.scenario)
-        teams.setdefault((level.name, algorithm), {})[f"{algorithm} seed {seed}"] = team
-        trainings[level.name, algorithm] = training
+        teams.setdefault((level.name, trained_by), {})[f"{trained_by} seed {seed}"] = team
+        trainings[level.name, trained_by] = training
     worlds = common_worlds(plan.levels, plan.episodes, plan.list_seed)
     answers = search_all(plan, worlds, jobs, tell)
     measured: list[Measured] = []
     for level, drawn in zip(plan.levels, worlds, strict=True):
         braking = level.scenario.replace(roles=dict.fromkeys(level.scenario.vehicle_names, "full_brake"))
-        for algorithm in plan.algorithms if level.scenario.learners else (None,):
+        algorithms: Sequence[str | None] = plan.algorithms if level.scenario.learners else (None,)
+        for algorithm in algorithms:
             tell(Progress(f"driving {level.name}", len(measured), len(plan.levels) * len(plan.algorithms)))
-            own, training = {"scripts": Team("scripts", {})}, None
-            if algorithm is not None:
-                own, training = teams[level.name, algorithm], trainings[level.name, algorithm]
-            result, reached = driven(level.scenario, drawn, own, training)
-            _, full = driven(braking, all_braking(drawn), {"full_brake": Team("full_brake", {})}, training)
+            own_training = None if algorithm is None else trainings[level.name, algorithm]
+            own = {"scripts": Team("scripts", {})} if algorithm is None else teams[level.name, algorithm]
+            result, reached = driven(level.scenario, drawn, own, own_training)
+            _, full = driven(braking, all_braking(drawn), {"full_brake": Team("full_brake", {})}, own_training)
             behind = {}
-            for count in COUNTS if plan.shield and training else ():
-                guarded = {name: shield(team, mode=plan.shield, harm_count=count) for name, team in own.items()}
-                behind[count] = driven(level.scenario, drawn, guarded, training)[1]
-            if training is not None:
+            for count in COUNTS if plan.shield and own_training else ():
+                guarded = {name: shield(team, mode="step", harm_count=count) for name, team in own.items()}
+                behind[count] = driven(level.scenario, drawn, guarded, own_training)[1]
+            if own_training is not None:
                 for count, column in HARM.items():
                     answers[level.name].driven[count].extend(reached[column][:, : plan.search_episodes])
             policies = [dict(result.policies[name]) for name in own]
             measured.append(
                 Measured(
-                    level, algorithm, reached, full, None, behind, goal_of(training), result.clusters,
+                    level, algorithm, reached, full, None, behind, goal_of(own_training), result.clusters,
                     {**result.about, "policy_sha256": policies},
                 )
             )  # fmt: skip
@@ -95,9 +95,8 @@ def driven(
     scenario: Scenario, drawn: Drawn, teams: Mapping[str, Team], training: Training | None
 ) -> tuple[Result, Columns]:
     """Let teams drive the worlds; return the result, and each column of numbers, [teams, n]."""
-    measures = (Measure("bound", bound), Measure("decisions", decisions))
-    if training is not None:
-        measures += (Measure("goal", partial(minimised, training)),)
+    measures = [Measure("bound", bound), Measure("decisions", decisions)]
+    measures += [] if training is None else [Measure("goal", partial(minimised, training))]
     result = evaluate(drawn, teams, open_game(scenario)[1], measures, about=about_scenario(scenario))
     columns = [result[name] for name in teams]
     numbers = [name for name in columns[0] if columns[0][name].dtype.kind in "fib" and all(name in c for c in columns)]

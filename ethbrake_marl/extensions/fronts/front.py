@@ -39,7 +39,7 @@ class Front(NamedTuple):
     """Best profiles in n worlds for each of W choices of weights, and the harm of each vehicle."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
-    count: str  # count of harm that is weighted, ``first`` or ``total``
+    harm_count: str  # count of harm that is weighted, ``first`` or ``total``
     borne: Borne  # [W, n, N] m2/s2 by count
     profiles: tuple[Profiles, ...]  # commands of the learners, [n] for each choice of weights
     agents: Mapping[str, Borne]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
@@ -47,15 +47,17 @@ class Front(NamedTuple):
     @property
     def amounts(self) -> Floats:
         """Weighted harm of each world, [W, n] m2/s2."""
-        return np.stack([weighted(each, row) for each, row in zip(self.borne[self.count], self.weights, strict=True)])
+        return np.stack(
+            [weighted(each, row) for each, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
+        )
 
     def mean(self, count: str | None = None) -> Floats:
         """Return the mean harm of each vehicle, [W, N] m2/s2; ``count`` None: the one that was searched."""
-        return np.asarray(self.borne[count or self.count].mean(axis=1))
+        return np.asarray(self.borne[count or self.harm_count].mean(axis=1))
 
     def nondominated(self) -> Bools:
         """Return whether no other profile of the same world is better for a vehicle and worse for none, [W, n]."""
-        return nondominated(self.borne[self.count].transpose(1, 0, 2)).T
+        return nondominated(self.borne[self.harm_count].transpose(1, 0, 2)).T
 
 
 def weighted(borne: Floats, weights: Floats) -> Floats:
@@ -238,9 +240,9 @@ def least_largest(scenario: Scenario, worlds: State, front: Front, *, budget: in
     game, parts = open_game(scenario)[1], []
     for first in range(0, worlds.n, CHUNK):
         some = worlds.take(slice(first, first + CHUNK))
-        table = best_harm(game, some, counts=(front.count,), budget=budget, threads=threads, objective="maximin")
-        last = problem_of(game, some).follow(table.profiles[front.count])
+        table = best_harm(game, some, counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin")
+        last = problem_of(game, some).follow(table.profiles[front.harm_count])
         parts.append({count: last.borne_harm(count)[np.newaxis] for count in COUNTS})
     every = {count: np.concatenate([_joined(parts)[count], front.borne[count]]) for count in COUNTS}
-    chosen = every[front.count].max(axis=2).argmin(axis=0)
+    chosen = every[front.harm_count].max(axis=2).argmin(axis=0)
     return {count: borne[chosen, np.arange(worlds.n)] for count, borne in every.items()}

@@ -52,12 +52,12 @@ def front_results(
         "seed": seed,
         "episodes": drawn.worlds.n,
         **({} if by is None else {"recordings": len(np.unique(by))}),
-        "harm_count": front.count,
+        "harm_count": front.harm_count,
         "vehicles": list(scenario.vehicle_names),
         "beside": {name: _vehicles(borne, by) for name, borne in beside.items()},
         "points": _points(front, front.borne, by),
         "agents": {name: _points(front, borne, by) for name, borne in front.agents.items()},
-        "hypervolume": hypervolumes(front, beside["full_brake"][front.count], by),
+        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count], by),
         "scenario_sha256": about_scenario(scenario)["scenario_sha256"],
         "worlds_sha256": worlds_sha256(drawn.worlds),
         "versions": versions(),
@@ -67,7 +67,7 @@ def front_results(
 def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
     points = []
     for k, (weights, least) in enumerate(zip(front.weights, front.amounts, strict=True)):
-        harm = borne[front.count][k]
+        harm = borne[front.harm_count][k]
         amounts = weighted(harm, weights)
         points.append({
             "weights": weights.tolist(),
@@ -103,7 +103,8 @@ def hypervolumes(front: Front, full_brake: Floats, clusters: Clusters = None) ->
     draws = [worlds, *(np.concatenate([members[k] for k in row]) for row in drawn)]  # first: each world once
     harms = {FRONT: front.borne, **front.agents}
     points = {
-        name: np.stack([borne[front.count][:, rows].mean(axis=1) for rows in draws]) for name, borne in harms.items()
+        name: np.stack([borne[front.harm_count][:, rows].mean(axis=1) for rows in draws])
+        for name, borne in harms.items()
     }
     braking = np.stack([full_brake[rows].mean(axis=0) for rows in draws])
     largest = np.maximum(braking, points[FRONT].max(axis=1))

@@ -57,7 +57,7 @@ def corners(vehicles: int) -> Floats:
 
 
 def weight_table(rows: Sequence[Sequence[Any]]) -> Floats:
-    """Return choices of weights as an array, [W, N]. Raises ``InvalidInput`` unless all are numbers, as many in each."""
+    """Return choices of weights as an array, [W, N]. Raises ``InvalidInput`` unless all are as many numbers."""
     numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for row in rows for each in row)
     if not numbers or len({len(row) for row in rows}) != 1:
         shown = "; ".join(",".join(map(str, row)) for row in rows)
