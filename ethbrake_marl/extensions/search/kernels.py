@@ -332,3 +332,12 @@ def improve(world, room, ends, commands, budget, drawing, least):
         change[AMOUNT] *= 2.0
         again = spent > 0 and change[WHAT] != SET
     return value, active
+
+
+@large
+def try_all(world, room, ends, commands, values):
+    """Write the value of every profile [Q, K] to ``values`` [Q]; infinite if it cannot be simulated."""
+    begin = min(0, ends.shape[0])  # no literal, as in `gather`
+    for q in range(ends.shape[0]):
+        value, reached = follow(world, room.lines, ends[q], commands[q], begin, math.inf)
+        values[q] = value if reached > 0 else math.inf

@@ -296,7 +296,7 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
         parts += [of_car[:, RESTITUTION, :1], *(of_car[:, row] for row in (BRAKING, DRIVING, LATENCY, MASS, LIMIT))]
         parts += [alert.wanted[rows, ahead:], times[rows], controlled[rows, ahead:]]
         forces = [of_line[:, FORCE], of_car[:, BRAKE_RATE], of_car[:, RELEASE_RATE]]
-        builds = np.isfinite(of_car[:, [BRAKE_RATE, RELEASE_RATE]]).any(axis=(1, 2)).tolist()
+        builds = np.isfinite(of_car[:, [BRAKE_RATE, RELEASE_RATE]]).sum(axis=(1, 2))
         whole, more = (np.ascontiguousarray(np.hstack(each) + 0.0, "<f8") for each in (parts, forces))  # -0.0 is 0.0
         for k, row in enumerate(rows):
             content = whole[k].tobytes() + (more[k].tobytes() if builds[k] else b"")
