@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -63,7 +63,7 @@ def front_command(
         from ethbrake_marl.extensions.fronts.figures import front_figure
         from ethbrake_marl.extensions.fronts.front import least_largest, search_front
         from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolume_sheet
-        from ethbrake_marl.extensions.fronts.weights import corners, weight_grid, weight_table
+        from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
         from ethbrake_marl.extensions.report.style import picture_bytes
         from ethbrake_marl.files.store import check_folder
         from ethbrake_marl.files.yaml import parse_yaml
@@ -73,11 +73,12 @@ def front_command(
         chosen, count = changes.change_scenario(scenario), changes.command.get("harm_count", "first")
         if count not in ("first", "total"):
             raise InvalidInput(f"harm_count = {count!r}: must be 'first' or 'total'")
+        rows: Any
         if weights is None:
             N = chosen.vehicles
             rows = np.concatenate([weight_grid(N, steps), np.ones((1, N)), corners(N)])
         else:
-            rows = weight_table([parse_yaml(f"[{text}]", "--weights").content for text in weights])
+            rows = [parse_yaml(f"[{text}]", "--weights").content for text in weights]
         check_folder(output, ("front.json", "front.png"), force=force)
         drawn = chosen.draw(episodes, seed)
         names = DEFAULT_AGENTS if agents is None and len(chosen.learners) == 1 else agents or ""

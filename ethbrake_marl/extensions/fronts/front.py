@@ -17,6 +17,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.extensions.fronts.hypervolume import nondominated
+from ethbrake_marl.extensions.fronts.weights import weight_table
 from ethbrake_marl.extensions.search.best_harm import best_harm, driven_profiles, joined, short, starting_profiles
 from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, problem_of
 from ethbrake_marl.extensions.search.search import search_profiles
@@ -112,8 +113,8 @@ def search_front(
     with a column for each vehicle, and for a row that cannot be a ``harm_weight``.
 
     """
-    weights = np.asarray(weights, np.float64)
-    if weights.ndim != 2 or weights.shape[1] != scenario.vehicles:
+    weights = weight_table(weights.tolist() if isinstance(weights, np.ndarray) else weights)
+    if weights.shape[1] != scenario.vehicles:
         raise InvalidInput(
             f"weights has shape {weights.shape}: give one or more choices of weights, each with one number for each of"
             f" the {scenario.vehicles} vehicles, for instance {','.join(['1', '4', *'1' * (scenario.vehicles - 2)])}"
