@@ -40,6 +40,7 @@ QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_epis
 
 OF_LINE = ("vehicles", "time_step_s", "horizon_s", "observation")  # keys that all levels share
 OF_VEHICLES = tuple(key for key in CAR_ROWS if key not in ("latency_s", "harm_weight"))
+BUT_CHANNEL = ("name", *WORDS, "v2x")  # keys in which a level and the same one with another channel differ
 SAME_VEHICLES = ("objective", "obstacle_gap_m", "roles", "v2x")  # keys whose sweep leaves the vehicles as they are
 
 
@@ -69,9 +70,9 @@ def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
         scenario = settings.change_scenario(name)
         if any(level.name == scenario.name for level in levels):
             raise InvalidInput(f"levels: {scenario.name!r} is given twice; give each level once")
-        content = scenario.content(without=(*WORDS, "v2x"))
+        content = scenario.content(without=BUT_CHANNEL)
         same = (each for each in levels if each.clear is None and each.scenario.v2x != scenario.v2x)
-        clear = next((each.name for each in same if each.scenario.content(without=(*WORDS, "v2x")) == content), None)
+        clear = next((each.name for each in same if each.scenario.content(without=BUT_CHANNEL) == content), None)
         levels.append(Level(scenario.name, scenario, clear))
     if len(levels) < 2:
         raise InvalidInput(f"levels: {count_of(len(levels), 'level')} given; give at least two levels to compare")

@@ -45,7 +45,7 @@ REFUSED = {
     "--sweep objective=social:0,90 --set reward.objective=own": "has its own objective",
     "--levels cooperation-3-pair,cooperation-3-pair": "given twice",
     "--levels cooperation-3-pair": "give at least two levels",
-    "--levels cooperation-0-sensors,paper-distance": "level 'paper-distance': gaps_m is",
+    "--levels cooperation-0-sensors,paper-distance": "level 'paper-distance': speeds_mps is",
     "--levels cooperation-3-pair,cooperation-3-five": "vehicles is 5, but 3",
     "--levels cooperation-0-sensors,cooperation-3-pair --set roles.vehicle_2=coast --set roles.vehicle_3=coast": (
         "no level has a learner"
