@@ -20,20 +20,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.extensions.cooperation import (
     Equilibrium,
     best_joint_harm,
     compare_starts,
     find_equilibria,
+    mean_over_seeds,
     price_of_anarchy,
 )
 from ethbrake_marl.extensions.cooperation.levels import STANDARD
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.first_edition.evaluation.seeds import mean_over_seeds
-from ethbrake_marl.first_edition.evaluation.statistics import mean, rate
-from ethbrake_marl.first_edition.physics.state import Floats
-from ethbrake_marl.first_edition.training.recipe import Scheme
-from ethbrake_marl.first_edition.training.team import load_team
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.training.recipe import Scheme
 
 LEVELS = [name for name in STANDARD if eb.load_scenario(name).learners]
 WORLDS, SEED, BUDGET, ROUNDS, JOINT_BUDGET = 200, 6005, 10_000, 20, 50_000
@@ -60,8 +59,8 @@ class Level(NamedTuple):
 def search(name: str, worlds: int) -> Level:
     """Search the equilibria of a level for every objective, and its joint optimum."""
     scenario = eb.load_scenario(name)
-    lines, ends, seconds = scenario.sample(worlds, SEED).worlds, {}, {}
-    find_equilibria(scenario, lines.take(np.arange(1)), "own", budget=10, rounds=1)  # compiles
+    lines, ends, seconds = scenario.sample(worlds, SEED), {}, {}
+    find_equilibria(scenario, lines.take([0]), "own", budget=10, rounds=1)  # compiles
     for objective in OBJECTIVES:
         begun = time.process_time()
         ends[objective] = find_equilibria(scenario, lines, objective, budget=BUDGET, rounds=ROUNDS)
@@ -83,10 +82,11 @@ def train(folder: Path, name: str, objective: str, recipe: str, seed: int) -> No
 
 def drive(folders: Sequence[Path], name: str, worlds: int) -> Floats:
     """Return the first-impact harm of each vehicle with every trained team, [seeds, n, N] in m2/s2."""
-    scenario = eb.load_scenario(name)
-    teams = {folder.name: load_team(folder, scenario, folder.name) for folder in folders}
-    result = eb.evaluate(scenario.sample(worlds, SEED), teams, scenario=scenario, aftermath=False).complete()
-    return np.stack([result.outcome(each).vehicle_harm("first") for each in teams])
+    result = eb.evaluate(name, {each.name: f"team@{each}" for each in folders}, episodes=worlds, seed=SEED)
+    vehicles = range(1, eb.load_scenario(name).vehicles + 1)
+    return np.stack(
+        [np.stack([own[f"first_impact_harm_{i}"] for i in vehicles], axis=1) for own in result.columns.values()]
+    )
 
 
 def show(estimate: Estimate | None, digits: int = 2) -> str:
@@ -94,7 +94,7 @@ def show(estimate: Estimate | None, digits: int = 2) -> str:
 
 
 def percent(flags: Any) -> str:
-    return rate(int(np.sum(flags)), int(np.size(flags))).in_words(digits=0, scale=100.0, unit=" %")
+    return rate(np.ravel(flags)).in_words(digits=0, scale=100.0, unit=" %")
 
 
 def price_rows(level: Level) -> list[list[str]]:

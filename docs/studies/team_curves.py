@@ -22,7 +22,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import redirect_stderr, redirect_stdout
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from os import devnull
 from pathlib import Path
@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
+from scipy.stats import bootstrap, trim_mean
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import count_of
@@ -47,13 +48,10 @@ from ethbrake_marl.extensions.report.style import (
 )
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.studies.machine import this_machine
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.first_edition.agents.protocol import Team
-from ethbrake_marl.first_edition.evaluation.seeds import interquartile_mean
-from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
-from ethbrake_marl.first_edition.training.fixed_list import drive_list
-from ethbrake_marl.first_edition.training.random_state import own_random_state
-from ethbrake_marl.first_edition.training.team import load_team
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.training.training import Training
 
 ALGORITHMS = {  # name -> label, and estimated decisions per processor second for the first short training
     "ippo": ("IPPO (`train/ippo.py`)", 16_000),
@@ -79,6 +77,16 @@ def level_of(name: str) -> eb.Scenario:
     return eb.load_scenario(name).replace(observation=SEEN)
 
 
+def interquartile_mean(seeds: Floats, resamples: int = 10_000) -> Estimate:
+    """Return the mean of one number per seed without the best and the worst quarter, with a bootstrap interval."""
+    value = float(trim_mean(seeds, 0.25))
+    if len(seeds) < 2:
+        return Estimate(value, None)
+    middle = partial(trim_mean, proportiontocut=0.25)
+    drawn = bootstrap([seeds], middle, n_resamples=resamples, method="percentile", rng=0, vectorized=True)
+    return Estimate(value, (float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)))
+
+
 # 1. A training with evaluations
 
 
@@ -86,17 +94,17 @@ class Clock:
     """Evaluates a team at about equal intervals of a training, and records the processor time of learning."""
 
     def __init__(self, scenario: eb.Scenario, steps: int, worlds: int) -> None:
-        self.scenario, self.steps, self.worlds = scenario, steps, scenario.sample(worlds, SEED).worlds
+        self.scenario, self.game = eb.open_game(scenario)
+        self.steps, self.worlds = steps, scenario.sample(worlds, SEED)
         self.points: list[list[float]] = []  # decisions, processor seconds, first-impact harm, total harm
         self.begun = 0.0
 
-    def look(self, decisions: int, make_team: Callable[[], Team]) -> None:
+    def look(self, decisions: int, make_team: Callable[[], eb.Team]) -> None:
         """Evaluate the team if an evaluation is due. The first call comes before the first decision."""
         spent = time.process_time() - self.begun if self.points else 0.0
         if decisions >= len(self.points) * self.steps / POINTS:
-            ledgers = [part.ledger for part in drive_list(self.worlds, make_team(), self.scenario)]
-            harms = [np.concatenate([each.world_harm(count) for each in ledgers]).mean() for count in HARM_COUNTS]
-            self.points.append([decisions, spent, *map(float, harms)])
+            last = eb.drive(self.game, self.worlds, make_team())
+            self.points.append([decisions, spent, *(float(last.harm(count).mean()) for count in TITLES)])
         self.begun = time.process_time() - spent
 
 
@@ -125,17 +133,23 @@ def run_script(name: str, clock: Clock, seed: int, folder: Path) -> None:
             self.updates += 1
             return super().collect(actors, *more)
 
-        def team(self, actors: Mapping[str, Any]) -> Team:
+        def team(self, actors: Mapping[str, Any]) -> eb.Team:
             with TemporaryDirectory() as place:
                 module.save_team(Path(place), actors, self.envs[0], seed=seed, steps=self.updates * decisions)
-                return load_team(place, scenario)
+                return team_of_run(place, scenario)
 
     plain, module.Copies = module.Copies, Watched
     try:
         module.train(settings, folder)
     finally:
         module.Copies = plain
-    clock.look(-(-clock.steps // decisions) * decisions, lambda: load_team(folder, scenario))
+    clock.look(-(-clock.steps // decisions) * decisions, lambda: team_of_run(folder, scenario))
+
+
+def team_of_run(folder: str | Path, scenario: eb.Scenario) -> eb.Team:
+    """Return the team of a run."""
+    driver = eb.make_agent(f"team@{folder}", scenario=scenario)
+    return driver if isinstance(driver, eb.Team) else eb.Team("team", dict.fromkeys(scenario.learners, driver))
 
 
 def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
@@ -146,12 +160,13 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
     from benchmarl.experiment import Callback
 
     module, scenario = script("benchmarl_mappo"), clock.scenario
-    recipe = eb.load_recipe("cooperation-ppo").replace(scheme="centralised", total_steps=clock.steps, seed=seed)
+    training = Training.of("cooperation-ppo", scenario, scheme="centralised", total_steps=clock.steps, seed=seed)
+    recipe = training.recipe
     decisions = recipe.n_envs * recipe.rounds * len(scenario.learners)
 
-    def team() -> Team:
-        agent = eb.LearnedAgent(module.policy_of(experiment, recipe, scenario))
-        return Team(dict.fromkeys(scenario.learners, agent), "team")
+    def team() -> eb.Team:
+        agent = eb.LearnedAgent(module.policy_of(experiment, training))
+        return eb.Team("team", dict.fromkeys(scenario.learners, agent))
 
     class Watch(Callback):  # type: ignore[misc]
         def on_batch_collected(self, batch: Any) -> None:
@@ -161,14 +176,13 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
                 for optimiser in optimisers.values():
                     optimiser.param_groups[0]["lr"] = recipe.learning_rate.at(1.0 - done / clock.steps)
 
-    with own_random_state():
-        experiment = module.make_experiment(recipe, scenario, str(folder), "mappo")
-        watch = Watch()
-        watch.experiment = experiment
-        experiment.callbacks.append(watch)
-        clock.look(0, team)
-        experiment.run()
-        clock.look(-(-clock.steps // decisions) * decisions, team)
+    experiment = module.make_experiment(training, str(folder), "mappo")
+    watch = Watch()
+    watch.experiment = experiment
+    experiment.callbacks.append(watch)
+    clock.look(0, team)
+    experiment.run()
+    clock.look(-(-clock.steps // decisions) * decisions, team)
 
 
 def run_recipe(name: str, clock: Clock, seed: int, folder: Path) -> None:
@@ -177,11 +191,11 @@ def run_recipe(name: str, clock: Clock, seed: int, folder: Path) -> None:
     often = max(clock.steps // (recipe.n_envs * recipe.rounds) // 100, 1)
     measured = {**recipe.evaluation.model_dump(), "every_updates": often}
     recipe = recipe.replace(observation=SEEN, total_steps=clock.steps, seed=seed, scheme="shared", evaluation=measured)
-    places = clock.scenario.vehicle_names
 
-    def look(trained: Any) -> dict[str, float]:
-        agents = {places.index(each): eb.LearnedAgent(policy) for each, policy in trained.drivers.items()}
-        clock.look(trained.steps, lambda: Team(agents, "team"))
+    def look(policies: Mapping[str, eb.Policy]) -> dict[str, float]:
+        agents = {vehicle: eb.LearnedAgent(policy) for vehicle, policy in policies.items()}
+        (steps,) = {policy.manifest.steps for policy in policies.values()}
+        clock.look(steps, lambda: eb.Team.of(agents, "team"))
         return dict(zip(("first_impact_harm", "total_harm"), clock.points[-1][2:], strict=True))
 
     eb.train(recipe, clock.scenario, folder, measure=lambda training: look, on_progress=None)
@@ -239,13 +253,12 @@ def train(file: Path, algorithm: str, level: str, steps: int, seed: int) -> str:
 def refer(file: Path, level: str) -> str:
     """Write the harm of full braking, of E-V2X-BM and of the joint optimum of a search, on the list of a level."""
     scenario = level_of(level)
-    sample = scenario.sample(WORLDS, SEED)
-    table = search_list(scenario, sample, budget=BUDGET, threads=1, chunks=file.with_suffix(".search"))
-    harms = {"joint optimum": [float(table.best[count].harm.mean()) for count in HARM_COUNTS]}
-    agents = {name: eb.make_agent(name) for name in ("full_brake", "e_v2x_bm")}
-    result = eb.evaluate(sample, agents, scenario=scenario, aftermath=False)
-    for name in agents:
-        harms[name] = [float(result.outcome(name).ledger.world_harm(count).mean()) for count in HARM_COUNTS]
+    worlds, game = scenario.sample(WORLDS, SEED), eb.open_game(scenario)[1]
+    table = search_list(game, worlds, budget=BUDGET, threads=1, chunks=file.with_suffix(".search"))
+    harms = {"joint optimum": [float(table.harm[count].mean()) for count in TITLES]}
+    result = eb.evaluate(scenario, "full_brake,e_v2x_bm", episodes=WORLDS, seed=SEED)
+    for name, own in result.columns.items():
+        harms[name] = [float(own[column].mean()) for column in ("first_impact_harm", "total_harm")]
     return write(file, {"level": level, "harms": harms})
 
 
@@ -351,7 +364,7 @@ def table(found: Results) -> list[list[str]]:
             curves = curves_of(found, level, algorithm)
             if len(curves):
                 decisions, spent = curves[:, -1, :2].mean(axis=0)
-                reached = [interquartile_mean([last]).in_words() for last in curves[:, -1, 2:].T]
+                reached = [interquartile_mean(last).in_words() for last in curves[:, -1, 2:].T]
                 rows.append([f"`{level}`", label, f"{decisions:,.0f}", f"{spent:.0f} s", *reached])
         if harms:
             least = [f"{harm:.2f}" for harm in harms["joint optimum"]]
@@ -368,7 +381,7 @@ def draw(found: Results) -> Figure:
             curves = curves_of(found, level, algorithm)
             if len(curves):
                 style, spent = series_style(number + 1), curves[:, :, 1].mean(axis=0)
-                middles = [interquartile_mean([harm], resamples=2000) for harm in curves[:, :, 2].T]
+                middles = [interquartile_mean(harm, resamples=2000) for harm in curves[:, :, 2].T]
                 axes.plot(spent, [each.value for each in middles], label=label.replace("`", ""), **style)
                 low, high = np.transpose([each.interval or (each.value, each.value) for each in middles])
                 band(axes, spent, low, high, style)

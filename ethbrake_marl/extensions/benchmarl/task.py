@@ -1,13 +1,16 @@
 """A scenario as a TorchRL environment and as a BenchMARL task; needs ``pip install ethbrake-marl[marl]``.
 
-The learners of a world are one group of TorchRL, whose episode ends for all at the same time. ``state``, the input of a
-central critic, is the full state of the line (``episode.full_state``). Letters in shapes: n worlds, L learners, F
-features of an observation, S of the state.
+The environment simulates ``n`` worlds together. All learners of a world form one group in TorchRL, and the episode of a
+world ends for all its learners at the same time. ``state``, the input of a central critic, is the full state of the
+line (``episode.full_state``).
+
+Letters in shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,33 +21,33 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from ethbrake_marl.episode.full_state import full_state, state_features
-from ethbrake_marl.episode.reward import Reward
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.shield import MODES
 from ethbrake_marl.faces.spaces import FeatureBox
-from ethbrake_marl.faces.stream import Stream
+from ethbrake_marl.faces.stream import Stream, chosen_seed
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.scenario import Scenario
 
 GROUP = "learners"
 
 
 class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the extra is not installed
-    """``n`` worlds of one scenario.
+    """TorchRL environment with ``n`` worlds of one scenario and ``L`` learners.
 
     Shapes: observation [n, L, F], action [n, L, 1] (with discrete actions [n, L]), reward [n, L, 1], state [n, S], done
     [n, 1].
 
     Args:
-        scenario: must have a learner; all learners observe the same features.
+        scenario: the scenario, which must have a learner; all learners observe the same features.
         n: number of worlds.
-        seed: of the stream of worlds.
-        reward: a name such as ``harm``, or weights of terms.
-        horizon_is_end: an episode at the horizon is terminated, not truncated.
-        shield: mode of a shield around the learners, such as ``step``; None: no shield.
+        seed: seed from which the worlds are drawn.
+        reward: reward of the learners: a name such as ``harm``, or the weights of the reward's terms.
+        horizon_is_end: True: an episode that reaches the horizon is terminated; False: it is truncated.
+        shield: mode of the learners' shield, such as ``step``. None: no shield.
         actions: number of discrete actions, for algorithms such as QMIX; None: actions are numbers in [-1, 1].
 
     """
@@ -53,74 +56,74 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: AnyScenario,
         n: int,
         seed: int,
-        reward: Reward,
+        reward: Any = "harm",
         horizon_is_end: bool = True,
         shield: str | None = None,
         actions: int | None = None,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))
-        self.scenario, self.game = open_game(scenario, reward=reward)
-        if shield is not None:
-            if shield not in MODES:
-                raise unknown_name("shield mode", shield, MODES)
-            self.game = self.game._replace(shield=MODES[shield](None))
-        self.horizon_is_end, self.actions, self.learners = horizon_is_end, actions, self.game.rules.learners
-        if not len(self.learners) or len({self.game.views[body] for body in self.learners}) > 1:
+        loaded, game = open_game(scenario, reward=reward)
+        self.learners, self.horizon_is_end, self.actions = game.rules.learners, horizon_is_end, actions
+        self.of_state = loaded.horizon_s, loaded.has_obstacle
+        views = {game.views[i] for i in self.learners}
+        if len(views) != 1:
             raise InvalidInput(
-                f"scenario {scenario.name!r}: must have at least one learner, and all learners must observe the same"
-                " features"
+                f"scenario {loaded.name!r}: its {len(self.learners)} learners have {len(views)} different observations;"
+                " must have one or more learners, which all observe the same features"
             )
-        self.stream, self._of_state = Stream(self.scenario, self.game), (scenario.horizon_s, scenario.has_obstacle)
-        self.stream.seed, rows = seed, (n, len(self.learners))
-        seen = _bound(FeatureBox(self.game.views[self.learners[0]].features), rows)
-        state = _bound(FeatureBox(state_features(scenario.vehicles, *self._of_state)), (n,))
+        self.game = game if shield is None else game._replace(shield=MODES[shield](None))
+        self.stream = Stream(loaded, self.game)
+        self.stream.seed = chosen_seed(seed)
+        rows = n, len(self.learners)
+        seen = _bound(FeatureBox(views.pop().features), rows)
+        whole = _bound(FeatureBox(state_features(loaded.vehicles, *self.of_state)), (n,))
         self.observation_spec = Composite(
-            {GROUP: Composite({"observation": seen}, shape=rows), "state": state}, shape=(n,)
+            {GROUP: Composite({"observation": seen}, shape=rows), "state": whole}, shape=(n,)
         )
         space = action_space(actions)
         action = Bounded(-1.0, 1.0, shape=(*rows, 1)) if actions is None else Categorical(space.n, shape=rows)
         self.action_spec = Composite({GROUP: Composite({"action": action}, shape=rows)}, shape=(n,))
-        reward_of_each = Composite({"reward": Unbounded(shape=(*rows, 1))}, shape=rows)
-        self.reward_spec = Composite({GROUP: reward_of_each}, shape=(n,))
+        rewards = Composite({"reward": Unbounded(shape=(*rows, 1))}, shape=rows)
+        self.reward_spec = Composite({GROUP: rewards}, shape=(n,))
         flags = ("done", "terminated", "truncated")
-        self.done_spec = Composite({name: Categorical(2, dtype=torch.bool, shape=(n, 1)) for name in flags}, shape=(n,))
+        flag = {name: Categorical(2, dtype=torch.bool, shape=(n, 1)) for name in flags}
+        self.done_spec = Composite(flag, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Begin the next episodes, in all worlds or where ``_reset`` in ``tensordict`` is True."""
-        asked = None if tensordict is None else tensordict.get("_reset", None)
-        if asked is None:
+        """Start the next episode in all worlds, or in those where the mask ``_reset`` in ``tensordict`` is True."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
             self.episode = self.stream.draw(self.batch_size[0])
-        elif asked.any():
-            rows = np.flatnonzero(asked.numpy().reshape(-1))
-            self.episode = self.episode.put(rows, self.stream.draw(len(rows)))
-        return TensorDict(self._observe_all(), batch_size=self.batch_size)
+        else:
+            rows = np.flatnonzero(mask.numpy().reshape(-1))
+            self.episode = self.episode.put(rows, self.stream.draw(len(rows)), donate=True)
+        return TensorDict(self._observe(), batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
-        given = tensordict[GROUP, "action"].numpy()
-        if self.actions is None:
-            given = given[:, :, 0].clip(-1.0, 1.0)
-        actions = checked_actions(given, given.shape, "the learners", self.actions)
+        shape = self.batch_size[0], len(self.learners)
+        actions = checked_actions(tensordict[GROUP, "action"].numpy(), shape, "the learners", self.actions)
         self.episode, step = self.game.step(self.episode, actions, donate=True)
-        content, ended = self._observe_all(), self.episode.ended
-        reward = step.reward[:, self.learners - 1, np.newaxis].astype(np.float32)
-        content[GROUP]["reward"] = torch.from_numpy(reward)
-        terminated = ended & (self.episode.at_rest | self.horizon_is_end)
-        for name, flag in (("done", ended), ("terminated", terminated), ("truncated", ended & ~terminated)):
+        terminated, truncated = step.terminated, step.truncated
+        if self.horizon_is_end:
+            terminated, truncated = terminated | truncated, np.zeros_like(truncated)
+        content = self._observe()
+        content[GROUP]["reward"] = torch.from_numpy(step.reward[:, self.learners - 1, np.newaxis].astype(np.float32))
+        for name, flag in (("done", self.episode.ended), ("terminated", terminated), ("truncated", truncated)):
             content[name] = torch.from_numpy(flag[:, np.newaxis])
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Let the next episodes be the first ones of another seed."""
+        """Let the next reset begin with world 0 of ``seed``; do nothing if it is None."""
         if seed is not None:
-            self.stream.seed, self.stream.next = seed, 0
+            self.stream.seed, self.stream.next = chosen_seed(seed), 0
 
-    def _observe_all(self) -> dict[str, Any]:
+    def _observe(self) -> dict[str, Any]:
         seen = torch.from_numpy(self.game.observe_alike(self.episode, self.learners))
         own = TensorDict({"observation": seen}, batch_size=seen.shape[:2])
-        return {GROUP: own, "state": torch.from_numpy(full_state(self.episode, *self._of_state))}
+        return {GROUP: own, "state": torch.from_numpy(full_state(self.episode, *self.of_state))}
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
@@ -128,9 +131,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     Args:
         name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
-        config: mapping with the keys ``scenario``, ``reward`` and ``horizon_is_end``, and optionally ``shield`` and
-            ``actions``. ``scenario`` is the name of a shipped scenario, the path of a scenario file, a mapping with the
-            content of such a file, or a ``Scenario``. The other values are passed to ``LineEnv``.
+        config: mapping with the key ``scenario``, and optionally ``reward``, ``horizon_is_end``, ``shield`` and
+            ``actions``: the arguments of ``LineEnv``.
 
     """
 
@@ -145,15 +147,14 @@ class LineTask(TaskClass):  # type: ignore[misc]
         Raises ``InvalidInput`` if the task has continuous actions and BenchMARL wants discrete actions, or the other
         way round.
         """
-        config, actions = self.config, self.config.get("actions")
+        actions = self.config.get("actions")
         if continuous_actions != (actions is None):
             raise InvalidInput(
                 f"task {self.name}: continuous_actions = {continuous_actions} contradicts actions = {actions}; for"
                 " continuous actions, set actions to None; for discrete actions, set actions to the number of actions"
                 " (at least 2)"
             )
-        settings = config["reward"], config["horizon_is_end"], config.get("shield"), actions
-        return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
+        return partial(LineEnv, n=num_envs, seed=seed or 0, **self.config)
 
     def supports_continuous_actions(self) -> bool:
         """Return True if the key ``actions`` in ``config`` is None or missing."""
@@ -164,7 +165,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
-        """Return the largest number of decisions in an episode; ``env`` is unused."""
+        """Return the largest number of decisions in an episode."""
         scenario: Scenario = self.config["scenario"]
         return round(scenario.horizon_s / scenario.time_step_s) + 1
 
@@ -173,8 +174,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return False
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
-        """Return ``{"learners": names}``: one group with the names of all learners. ``env`` is unused."""
-        scenario = self.config["scenario"]
+        """Return ``{"learners": names}``: one group with the names of all learners."""
+        scenario: Scenario = self.config["scenario"]
         return {GROUP: [scenario.vehicle_names[body - 1] for body in scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
 from ethbrake_marl.cli.command import ForceOption, JobsOption, JsonOption, Out, SettingsOption, example
-from ethbrake_marl.extensions.studies.commands import FolderOption
-from ethbrake_marl.first_edition.agents.spec import split_specs
-from ethbrake_marl.first_edition.training.commands import read_task
 from ethbrake_marl.registry import Part
 
 DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front if the scenario has one learner
 
 
 def front_command(
-    output: FolderOption,
+    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")],
     scenario: Annotated[
         str, typer.Option(metavar="NAME|PATH", help="Scenario; the search controls its learners.")
     ] = "paper-random",
@@ -60,6 +58,8 @@ def front_command(
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
 
+        from ethbrake_marl.cli.settings import read_settings
+        from ethbrake_marl.errors import InvalidInput
         from ethbrake_marl.extensions.fronts.figures import front_figure
         from ethbrake_marl.extensions.fronts.front import least_largest, search_front
         from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolume_sheet
@@ -67,26 +67,29 @@ def front_command(
         from ethbrake_marl.extensions.report.style import picture_bytes
         from ethbrake_marl.files.store import check_folder
         from ethbrake_marl.files.yaml import parse_yaml
-        from ethbrake_marl.first_edition.physics.state import checked_numbers
+        from ethbrake_marl.names import split_specs
 
-        task = read_task(scenario, settings)
-        chosen = task.scenario
+        changes = read_settings(settings, of_command=("harm_count",))
+        chosen, count = changes.change_scenario(scenario), changes.command.get("harm_count", "first")
+        if count not in ("first", "total"):
+            raise InvalidInput(f"harm_count = {count!r}: must be 'first' or 'total'")
+        rows: Any
         if weights is None:
             N = chosen.vehicles
             rows = np.concatenate([weight_grid(N, steps), np.ones((1, N)), corners(N)])
         else:
-            rows = checked_numbers("weights", [parse_yaml(f"[{text}]", "--weights").content for text in weights])
+            rows = [parse_yaml(f"[{text}]", "--weights").content for text in weights]
         check_folder(output, ("front.json", "front.png"), force=force)
-        sample = chosen.sample(episodes, seed)
-        beside_it = DEFAULT_AGENTS if agents is None and len(chosen.learners) == 1 else agents or ""
-        others = [spec for spec in split_specs(beside_it) if spec != "full_brake"] if beside_it else []
+        drawn = chosen.draw(episodes, seed)
+        names = DEFAULT_AGENTS if agents is None and len(chosen.learners) == 1 else agents or ""
+        others = [spec for spec in split_specs(names) if spec != "full_brake"] if names else []
         front = search_front(
-            chosen, sample.worlds, rows, harm_count=task.harm_count, budget=budget, threads=jobs or 1,
-            agents=others, on_progress=lambda done, total: out.progress("front", done, total),
+            chosen, drawn.worlds, rows, count=count, budget=budget, threads=jobs or 1, agents=others,
+            on_progress=lambda done, total: out.progress("front", done, total),
         )  # fmt: skip
-        largest = least_largest(chosen, sample.worlds, front, budget=budget, threads=jobs or 1)
-        beside = {"full_brake": full_braking(chosen, sample), "maximin": largest}
-        results = front_results(front, chosen, sample, beside, seed)
+        largest = least_largest(chosen, drawn.worlds, front, budget=budget, threads=jobs or 1)
+        beside = {"full_brake": full_braking(chosen, drawn), "maximin": largest}
+        results = front_results(front, chosen, drawn, beside, seed)
         results |= {"budget": budget, "settings": list(settings or ())}
         output.mkdir(parents=True, exist_ok=True)
         out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")

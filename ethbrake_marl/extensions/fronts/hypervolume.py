@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.first_edition.physics.state import Bools, Floats
+from ethbrake_marl.motion.layout import Bools, Floats
 
 MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of the dimensions less one
 

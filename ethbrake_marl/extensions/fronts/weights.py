@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import comb
+from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.motion.layout import Floats
 
 MOST = 1_000  # largest number of choices of weights
 
@@ -52,3 +54,12 @@ def corners(vehicles: int) -> Floats:
     which vehicle i has almost the same harm.
     """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
+
+
+def weight_table(rows: Sequence[Sequence[Any]]) -> Floats:
+    """Return choices of weights as an array, [W, N]. Raises ``InvalidInput`` unless all are as many numbers."""
+    numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for row in rows for each in row)
+    if not numbers or len({len(row) for row in rows}) != 1:
+        shown = "; ".join(",".join(map(str, row)) for row in rows)
+        raise InvalidInput(f"weights {shown:.80}: must be numbers, the same count in each choice, for instance 1,4,1")
+    return np.array(rows, np.float64)

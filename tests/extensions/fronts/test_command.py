@@ -39,12 +39,13 @@ def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, 
     [
         ("--weights 1,1", ("shape (1, 2)", "each of the 3 vehicles", "1,4,1")),
         ("--weights 1,-1,1", ("harm_weight[1]", "-1")),
-        ("--weights 1,x,1", ("'x'", "must be a number")),
+        ("--weights 1,x,1", ("weights 1,x,1: must be numbers",)),
         ("--weights 1,,1", ("--weights", "not valid")),
         ("--agents nobody", ("unknown agent 'nobody'",)),
         ("--scenario cooperation-4-all --agents full_brake,coast", ("agents can drive only one learner",)),
         ("--steps 50", ("1,326 choices of weights", "at most 1,000")),
-        ("--set roles.vehicle_2=full_brake", ("learner",)),
+        ("--set roles.vehicle_2=full_brake", ("has no learner",)),
+        ("--set harm_count=last", ("must be 'first' or 'total'",)),
     ],
 )
 def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple[str, ...]) -> None:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-import ethbrake_marl.first_edition as eb
+import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.fronts.front import search_front
 from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
@@ -30,7 +30,7 @@ def test_corners__put_one_vehicle_first() -> None:
 def test_weights__that_are_none_are_refused(row: list[float]) -> None:
     scenario = eb.load_scenario("paper-random")
     with pytest.raises(InvalidInput, match="weight"):
-        search_front(scenario, scenario.sample(1, 7).worlds, [[1.0, 0.0, 0.0], row])
+        search_front(scenario, scenario.sample(1, 7), [[1.0, 0.0, 0.0], row])
 
 
 @pytest.mark.parametrize(("vehicles", "steps"), [(3, 50), (8, 50), (3, 1_000_000)])
