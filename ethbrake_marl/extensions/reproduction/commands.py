@@ -13,7 +13,6 @@ from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.registry import Part
 
 REMAINS = "finished trainings remain; repeat the command to continue"
-PAPER_EPISODES = 10_000
 
 
 def reproduce_command(
@@ -32,10 +31,8 @@ def reproduce_command(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")] = Path("runs/reproduction"),
     episodes: Annotated[
         int,
-        typer.Option(
-            help="Largest number of worlds for a figure or table; the paper uses 10,000.", min=2, max=PAPER_EPISODES
-        ),
-    ] = PAPER_EPISODES,
+        typer.Option(help="Largest number of worlds for a figure or table; the paper uses 10,000.", min=2, max=10_000),
+    ] = 10_000,
     cost: Annotated[
         bool, typer.Option("--cost", help="Print how much work is left and how long it will take, and exit.")
     ] = False,
@@ -67,10 +64,10 @@ def reproduce_command(
         out.note(items.cost(settings, chosen))
         if cost:
             return
-        finished = items.reproduce(settings, chosen, str(this_machine()), force=out.force)
-        if finished is None:
+        results = items.reproduce(settings, chosen, str(this_machine()), force=out.force)
+        if results is None:
             out.interrupted(f"interrupted; {REMAINS}")
-        out.result(items.plain(finished), items.overview(finished))
+        out.result(items.plain(results), items.overview(results))
         out.note(f"page: {output / items.PAGE}")
 
 

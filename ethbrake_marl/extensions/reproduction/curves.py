@@ -1,4 +1,4 @@
-"""Harm against distance and delay: the paper's figures ``Fig:Harm-ivds``, ``Fig:harm-delay`` and ``Fig:hybrid illu``."""
+"""Harm against distance and delay: the figures ``Fig:Harm-ivds``, ``Fig:harm-delay`` and ``Fig:hybrid illu``."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def reproduce_delays(settings: Settings) -> Made:
                 for name in next(iter(groups.values()))
             }
             sheets.append(harm_sheet(where, groups, "one world has no interval." if episodes == 1 else about(result)))
-            verdicts += [  # "both SAC and PPO consistently achieve the lowest harm values across all tested delay setting"
+            verdicts += [  # "consistently achieve the lowest harm values across all tested delay setting"
                 judge_statement(
                     f"{policy} harms less than non-ethical and E-V2X-BM at every delay ({where})",
                     less_in_each(groups, policy, NON_ETHICAL, *BASELINES),
@@ -179,7 +179,7 @@ def drive_hybrid(name: str, settings: Settings, reading: Reading) -> Result:
 
 
 def reproduce_illustration(settings: Settings) -> Made:
-    """Reproduce the illustration of the hybrid, which "consistently selects the strategy that results in lower harm"."""
+    """Reproduce the illustration of the hybrid, which "consistently selects the strategy [of] lower harm"."""
     curves, verdicts = {}, []
     for reading in READINGS:
         result = drive_hybrid(DISTANCE, settings, reading)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,7 +14,6 @@ from ethbrake_marl.extensions.report.style import GREY, band, finish, in_our_sty
 from ethbrake_marl.files.sheet import Estimate
 
 ARROW_S = 1.0  # between arrows: ten steps, as in the paper
-ROW_CHARACTERS = 52  # in a line of a row's label
 VEHICLE_2 = 1  # column of arrays
 
 
@@ -90,24 +88,3 @@ def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], caption: 
             axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)
         name_axes(axes, title)
     return finish(figure, caption, every[0], columns=4)
-
-
-@in_our_style
-def changes_figure(changes: Mapping[str, Mapping[str, Estimate]], x_label: str, caption: str) -> Figure:
-    """Draw the effects of changes with intervals: a row for each change -> a marker for each strategy -> effect."""
-    rows = list(changes)
-    labels = list(changes[rows[0]])
-    figure, (axes,) = new_panels((9.4, 0.3 * len(rows) + 1.6))
-    axes.axvline(0.0, color=GREY, linewidth=0.9)
-    for number, label in enumerate(labels):
-        style, shift = series_style(number), 0.16 * (0.5 * (len(labels) - 1) - number)
-        y = np.arange(len(rows) - 1, -1, -1) + shift
-        low, high = zip(*(each[label].ends for each in changes.values()), strict=True)
-        axes.hlines(y, low, high, color=str(style["color"]), linewidth=1.4)
-        values = [each[label].value for each in changes.values()]
-        axes.plot(
-            values, y, linestyle="none", marker=style["marker"], markersize=4.5, color=style["color"], label=label
-        )
-    axes.set_yticks(range(len(rows)), [textwrap.fill(row, ROW_CHARACTERS) for row in rows[::-1]], fontsize=8)
-    name_axes(axes, x=x_label)
-    return finish(figure, caption, axes, columns=3)

@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import re
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ethbrake_marl import __version__
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.errors import InvalidInput, count_of, unknown_name
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.reproduction.curves import reproduce_delays, reproduce_distance, reproduce_illustration
 from ethbrake_marl.extensions.reproduction.learning import reproduce_curves
-from ethbrake_marl.extensions.reproduction.made import Item, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Item, Made, Settings
 from ethbrake_marl.extensions.reproduction.register import reproduce_gaps
 from ethbrake_marl.extensions.reproduction.tables import reproduce_hybrid_table, reproduce_random_table
 from ethbrake_marl.extensions.reproduction.trainings import HIGH, LOW, STOPPED, seconds_left, train
 from ethbrake_marl.extensions.reproduction.trajectories import reproduce_accelerations, reproduce_trajectories
-from ethbrake_marl.extensions.reproduction.verdicts import Verdict, summarise
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.files.store import write_output
@@ -32,12 +29,12 @@ ITEMS = (
     Item(
         "learning-high", ("fig:ppo_sac_high_latency",), "Learning curves at high delay",
         "Returns of PPO and SAC in training under large communication delays.",
-        partial(reproduce_curves, HIGH), 10, (HIGH, LOW),
+        partial(reproduce_curves, HIGH), 1, (HIGH, LOW),
     ),
     Item(
         "learning-low", ("fig:ppo_sac_low_latency",), "Learning curves at low delay",
         "Returns of PPO and SAC in training under small communication delays.",
-        partial(reproduce_curves, LOW), 10, (HIGH, LOW),
+        partial(reproduce_curves, LOW), 1, (HIGH, LOW),
     ),
     Item(
         "harm-distance", ("Fig:Harm-ivds",), "Harm over total distance",
@@ -58,12 +55,12 @@ ITEMS = (
     Item(
         "hybrid-illustration", ("Fig:hybrid illu",), "Illustration of the hybrid",
         "Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of both, against total distance.",
-        reproduce_illustration, 20, always=(STOPPED,),
+        reproduce_illustration, 15, (STOPPED,),
     ),
     Item(
         "hybrid-table", ("Table:hybrid",), "E-V2X-BM, DRL and hybrid in 5,000 episodes",
         "Collisions and harm of E-V2X-BM, of a policy that has not converged, and of the hybrid.",
-        reproduce_hybrid_table, 20, always=(STOPPED,),
+        reproduce_hybrid_table, 15, (STOPPED,),
     ),
     Item(
         "random-table", ("Table:Random",), "Four strategies in 10,000 random episodes",
@@ -72,22 +69,14 @@ ITEMS = (
     ),
     Item(
         "gaps", (), "What the paper leaves open",
-        "Every quantity that the paper leaves open, our default, and how far the headline moves when it changes.",
+        "Every quantity that the paper leaves open, our default, and the random test with another value.",
         reproduce_gaps, 30,
     ),
 )  # fmt: skip
 
-RECORD, PAGE, RESULTS = "reproduction.json", "README.md", "results.json"
+RECORD, PAGE = "reproduction.json", "README.md"
 
 PAPER = "*How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning*"
-
-
-class Finished(NamedTuple):
-    """An item, what was made of it, and its verdict."""
-
-    item: Item
-    made: Made
-    verdict: Verdict
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
@@ -106,66 +95,57 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 def groups_of(settings: Settings, items: Sequence[Item]) -> list[str]:
     """Return the groups of trainings that the items need."""
-    every = [name for item in items for name in (*item.always, *(item.trained if settings.full else ()))]
+    every = [name for item in items for name in item.trained if settings.full or name == STOPPED]
     return list(dict.fromkeys(every))
 
 
 def cost(settings: Settings, items: Sequence[Item]) -> str:
     """Return what is to do, and how long it takes."""
-    scale = min(settings.episodes / 10_000, 1.0)
     training_s = seconds_left(settings.folder, groups_of(settings, items))
-    seconds = sum(item.most_s for item in items) * max(scale, 0.1)
-    text = f"to do: {len(items)} of {len(ITEMS)} items, at most about {seconds:.0f} s of one core"
+    seconds = sum(item.most_s for item in items)
+    text = f"to do: {count_of(len(items), 'item')}, at most about {seconds:.0f} s of one core"
     return f"{text}; trainings before them about {training_s / 60.0:.1f} min of one core" if training_s else text
 
 
-def reproduce(settings: Settings, items: Sequence[Item], machine: str, *, force: bool = False) -> list[Finished] | None:
-    """Train what is missing, make the items, and write page, figures and data. Return None if Ctrl-C stopped a training.
+def reproduce(
+    settings: Settings, items: Sequence[Item], machine: str, *, force: bool = False
+) -> dict[Item, Made] | None:
+    """Train what is missing, make the items, and write page, figures and tables. None: Ctrl-C stopped a training.
 
     The folder may have results of the same settings, which are replaced; with ``force``, of others. Trainings stay.
     Raises ``InvalidInput`` for a folder with other settings, and ``AlreadyExists`` for one with other files.
     """
     folder = settings.folder
-    question = {"format": "ethbrake-reproduction", "episodes": settings.episodes, "version": __version__}
     if force and (folder / RECORD).is_file():
         (folder / RECORD).unlink()
-    names = [item.name for item in ITEMS]
     study = StudyFolder(
-        folder, "a reproduction", question, record=RECORD, advice="give another folder (--output), or replace its results"
-        " (--force)", beside=("trainings", RESULTS, PAGE, *names), writes=(PAGE, RESULTS),
-    )  # fmt: skip
+        folder,
+        "a reproduction",
+        {"format": "ethbrake-reproduction", "episodes": settings.episodes, "version": __version__},
+        record=RECORD,
+        advice="give another folder (--output), or replace its results (--force)",
+        beside=("trainings", PAGE, *(item.name for item in ITEMS)),
+        writes=(PAGE,),
+    )
     with study.work():
         if not train(settings, groups_of(settings, items)):
             return None
-        begun, finished = time.process_time(), []
+        results = {}
         for number, item in enumerate(items):
             settings.tell(Progress(f"items: {item.name}", number, len(items)))
-            made = item.make(settings)
+            results[item] = made = item.make(settings)
             write_item(folder / item.name, made)
-            finished.append(Finished(item, made, summarise(made.verdicts)))
-        made_by = {
-            "command": command(settings, items),
-            "version": __version__,
-            "physics_digest": physics_digest(),
-            "machine": machine,
-            "made_utc": datetime.now(UTC).isoformat(timespec="seconds"),
-            "processor_s": round(time.process_time() - begun, 1),
-        }
-        write_output(folder / RESULTS, json_text({**made_by, "items": plain(finished)}), force=True)
-        write_output(folder / PAGE, page(made_by, finished).encode(), force=True)
-        return finished
+        today = datetime.now(UTC).date().isoformat()
+        made_by = f"`{command(settings, items)}` on {today} ({machine}; physics {physics_digest()})"
+        write_output(folder / PAGE, page(made_by, results).encode(), force=True)
+        return results
 
 
 def command(settings: Settings, items: Sequence[Item]) -> str:
     """Return the command line that makes the same."""
     names = [item.name for item in items] if len(items) < len(ITEMS) else []
-    fewer = ["--episodes", str(settings.episodes)] if settings.episodes < 10_000 else []
+    fewer = ["--episodes", str(settings.episodes)] if settings.episodes < PAPER_EPISODES else []
     return " ".join(["ethbrake reproduce", *names, "--full" if settings.full else "--quick", *fewer])
-
-
-def slug(title: str) -> str:
-    """Return the name of a file for a title."""
-    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def write_item(place: Path, made: Made) -> None:
@@ -175,54 +155,45 @@ def write_item(place: Path, made: Made) -> None:
         for ending in (".svg", ".pdf"):
             write_picture(place / f"{drawn.stem}{ending}", drawn.figure, force=True)
     for sheet in made.sheets:
-        write_output(place / f"{slug(sheet.title)}.csv", sheet.csv().encode(), force=True)
-        write_output(place / f"{slug(sheet.title)}.tex", f"{sheet.latex()}\n".encode(), force=True)
-    for stem, sheet in made.data.items():
+        stem = re.sub(r"[^a-z0-9]+", "-", sheet.title.lower()).strip("-")
         write_output(place / f"{stem}.csv", sheet.csv().encode(), force=True)
+        write_output(place / f"{stem}.tex", f"{sheet.latex()}\n".encode(), force=True)
 
 
-def json_text(content: Any) -> bytes:
-    """Return plain data as the bytes of a JSON file."""
-    return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
-
-
-def plain(finished: Sequence[Finished]) -> list[dict[str, Any]]:
-    """Return items as plain data."""
+def plain(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
+    """Return results as plain data."""
     return [
         {
             "name": item.name,
             "labels": list(item.labels),
             "title": item.title,
-            "verdict": verdict._asdict(),
+            "verdict": made.verdict._asdict(),
             "comparisons": [each._asdict() for each in made.verdicts],
             "tables": {sheet.title: sheet.json() for sheet in made.sheets},
             "notes": list(made.notes),
+            "version": __version__,
+            "physics_digest": physics_digest(),
         }
-        for item, made, verdict in finished
+        for item, made in results.items()
     ]
 
 
-def overview(finished: Sequence[Finished]) -> Sheet:
+def overview(results: Mapping[Item, Made]) -> Sheet:
     """Return the verdict on each item."""
-    rows = [(item.name, verdict.outcome, verdict.because) for item, _, verdict in finished]
+    rows = [(item.name, made.verdict.outcome, made.verdict.because) for item, made in results.items()]
     return Sheet("", ("Item", "Verdict", "Because"), rows)
 
 
-def page(made_by: dict[str, Any], finished: Sequence[Finished]) -> str:
-    """Return the page with all items as Markdown."""
-    parts = [
-        "# The paper, reproduced",
-        f"Figures and tables of {PAPER}, our results beside the paper's numbers and statements. Made by"
-        f" `{made_by['command']}` on {made_by['made_utc'][:10]} ({made_by['machine']}).",
-        overview(finished).markdown(),
-    ]
-    for item, made, verdict in finished:
+def page(made_by: str, results: Mapping[Item, Made]) -> str:
+    """Return the page with all results as Markdown. ``made_by``: the command, the day, the machine."""
+    lead = f"Figures and tables of {PAPER}, and our results beside its numbers and statements. Made by {made_by}."
+    parts = ["# The paper, reproduced", lead, overview(results).markdown()]
+    for item, made in results.items():
         labels = f" In the paper's source: {', '.join(f'`{label}`' for label in item.labels)}." if item.labels else ""
-        parts += [f"## {item.title}", item.what + labels, f"**{verdict.outcome}**: {verdict.because}", *made.notes]
-        for drawn in made.figures:
-            parts.append(f"![{drawn.title}. {drawn.text}]({item.name}/{drawn.stem}.svg)")
+        parts += [f"## {item.title}", item.what + labels, f"**{made.verdict.outcome}**: {made.verdict.because}"]
+        parts += made.notes
+        parts += [f"![{each.title}. {each.text}]({item.name}/{each.stem}.svg)" for each in made.figures]
         for sheet in made.sheets:
             parts += [f"### {sheet.title}", sheet.markdown(), *filter(None, [sheet.note])]
-        compared = Sheet("", ("Comparison", "Verdict", "Because"), made.verdicts)
-        parts += ["### Comparisons", compared.markdown()]
+        parts += ["### Comparisons", Sheet("", ("Comparison", "Verdict", "Because"), made.verdicts).markdown()]
     return "\n\n".join(parts).replace("H*", r"H\*") + "\n"

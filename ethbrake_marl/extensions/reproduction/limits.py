@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from functools import cache
 
-import numpy as np
-
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.first_edition.scenario.schema import Scenario as Old
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
 from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.extensions.reproduction.verdicts import Verdict
+from ethbrake_marl.extensions.reproduction.verdicts import Verdict, summarise
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.progress import OnProgress
 
@@ -46,8 +45,12 @@ class Made(NamedTuple):
     verdicts: Sequence[Verdict]  # one for each comparison with the paper, at least one
     sheets: Sequence[Sheet] = ()  # tables
     figures: Sequence[Drawn] = ()
-    data: Mapping[str, Sheet] = MappingProxyType({})  # stem of a CSV file -> longer tables, which are not shown
     notes: Sequence[str] = ()  # what was run
+
+    @property
+    def verdict(self) -> Verdict:
+        """All verdicts in one."""
+        return summarise(self.verdicts)
 
 
 class Item(NamedTuple):
@@ -59,8 +62,7 @@ class Item(NamedTuple):
     what: str
     make: Callable[[Settings], Made]
     most_s: float  # processor time with as many worlds as in the paper, without trainings
-    trained: tuple[str, ...] = ()  # groups of trainings that it uses with ``full``
-    always: tuple[str, ...] = ()  # groups that it always needs; seconds
+    trained: tuple[str, ...] = ()  # groups of trainings; without ``full``, only what takes seconds is trained
 
 
 def about(result: Result) -> str:

@@ -1,4 +1,4 @@
-"""The register: what the paper leaves open, our default, and how far the random test moves with another value."""
+"""The register: what the paper leaves open, our default, and what the random test gives with another value."""
 
 from __future__ import annotations
 
@@ -6,23 +6,21 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
-
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.statistics import difference, mean, rate
+from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
-from ethbrake_marl.extensions.reproduction.figures import changes_figure
-from ethbrake_marl.extensions.reproduction.made import POLICIES, Drawn, Made, Settings, about
+from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings, about
 from ethbrake_marl.extensions.reproduction.readings import COUPLED, FOUR, NON_ETHICAL, PPO, RANDOM, REALISED, drive
-from ethbrake_marl.extensions.reproduction.verdicts import HARM, PERCENT, Less, Verdict, compare_number
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet
+from ethbrake_marl.extensions.reproduction.verdicts import PERCENT, Verdict, compare_number
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.worlds.catalogue import load_scenario
 
 WORLDS = 2_000
 SHOWN = (NON_ETHICAL, REALISED, COUPLED, PPO)
+ORDER = (PPO, COUPLED, NON_ETHICAL)  # from little harm to much
 HARMS = {"first": "first_impact_harm", "total": "total_harm", "sampled": "sampled_harm"}  # count -> column
 
 
@@ -95,98 +93,73 @@ GAPS = (
     Gap("ends of the cosine, number of decisions", "table:params: cosine, no numbers", "3e-4 to 3e-5; in the recipes",
         otherwise="not measured: one training each takes minutes; docs/train.md compares recipes"),
 )  # fmt: skip
+DEFAULTS = Gap("our defaults", "", "")
 
 
-@dataclass(frozen=True)
-class Headline:
-    """What the random test gives with one set of values."""
+def measure(alternative: Alternative, episodes: int) -> tuple[Result, dict[str, Floats]]:
+    """Drive the random test with another value; return the harm of each strategy, [n] m2/s2, beside the result.
 
-    result: Result = field(repr=False)
-    harm: Mapping[str, Floats]  # strategy -> [n] m2/s2
-
-    def change(self, base: Headline, name: str) -> Estimate:
-        """Return the change of the mean harm of a strategy from ``base``, by world where the worlds are the same."""
-        own, other = self.harm[name], base.harm[name]
-        gaps = [(self.result.worlds[each], base.result.worlds[each]) for each in ("gap_1_m", "gap_2_m")]
-        if all(np.array_equal(*pair) for pair in gaps):
-            return difference(own, other)
-        return Less.of_lists(name, own, other).difference
-
-    def collisions(self, name: str) -> Estimate:
-        """Return the collision rate of a strategy."""
-        return rate(self.result[name]["collided"])
-
-
-def measure(alternative: Alternative, episodes: int) -> Headline:
-    """Drive the random test with another value. What predicts nothing has its first-impact harm in its place."""
+    What predicts nothing has its first-impact harm in place of the predicted one.
+    """
     scenario = load_scenario(RANDOM).replace(**alternative.changes)
     agents = {name: FOUR[name] for name in SHOWN} | {PPO: alternative.ppo}
     measures = ["sampled_harm"] if alternative.count == "sampled" else []
     result = drive(scenario, agents, episodes, alternative.seed, measures)
-    column = HARMS.get(alternative.count, HARMS["first"])
-    harm = {name: result[name][column] for name in SHOWN}
+    harm = {name: result[name][HARMS.get(alternative.count, HARMS["first"])] for name in SHOWN}
     if alternative.count == "predicted":
         harm[REALISED] = result[REALISED]["predicted_harm"]
-    return Headline(result, harm)
+    return result, harm
 
 
 def reproduce_gaps(settings: Settings) -> Made:
     """Measure every alternative of the register."""
-    episodes = min(WORLDS, settings.episodes)
-    base = measure(Alternative("default"), episodes)
     asked = [(gap, each) for gap in GAPS for each in gap.alternatives]
-    headlines: list[tuple[Gap, Alternative, Headline]] = []
-    for number, (gap, each) in enumerate(asked):
-        settings.tell(Progress("open quantities", number, len(asked)))
-        headlines.append((gap, each, measure(each, episodes)))
-    rows = {f"{gap.name}: {each.value}": headline for gap, each, headline in headlines}
-    changes = {row: {name: headline.change(base, name) for name in SHOWN} for row, headline in rows.items()}
-    verdicts, notes, printed = [], [], {row.agent: row for row in PAPER_ROWS if row.table == "random test"}
-    for agent, name in (("Non-E", NON_ETHICAL), ("E-V2X-BM", REALISED), ("Hybrid PPO", PPO)):
-        others = {row: mean(headline.harm[name]) for row, headline in rows.items()}
-        what = f"{agent}, average harm of Table:Random, one open quantity changed at a time"
-        verdicts.append(compare_number(what, printed[agent].average_harm, mean(base.harm[name]), others=others))
-    order = (PPO, COUPLED, NON_ETHICAL)
-    means = {row: [float(headline.harm[name].mean()) for name in order] for row, headline in rows.items()}
+    measured = []
+    for number, (gap, each) in enumerate([(DEFAULTS, Alternative("")), *asked]):
+        settings.tell(Progress("open quantities", number, len(asked) + 1))
+        measured.append((gap, each, *measure(each, min(WORLDS, settings.episodes))))
+    base, *_ = measured
+    others = {f"{gap.name}: {each.value}": harm for gap, each, _, harm in measured[1:]}
+    printed = {row.agent: row.average_harm for row in PAPER_ROWS if row.table == "random test"}
+    verdicts = [
+        compare_number(
+            f"{agent}, average harm of Table:Random, one open quantity changed at a time",
+            printed[agent],
+            mean(base[3][name]),
+            others={row: mean(harm[name]) for row, harm in others.items()},
+        )
+        for agent, name in (("Non-E", NON_ETHICAL), ("E-V2X-BM", REALISED), ("Hybrid PPO", PPO))
+    ]
+    means = {row: [float(harm[name].mean()) for name in ORDER] for row, harm in others.items()}
     broken = [row for row, each in means.items() if each != sorted(each)]
-    stays = f"in {len(rows) - len(broken)} of {len(rows)} alternatives{'; not with ' * bool(broken)}{'; '.join(broken)}"
-    verdicts.append(Verdict(f"the order stays: {' < '.join(order)}", "differs" if broken else "agrees", stays))
-    for name in SHOWN:
-        most = max(rows, key=lambda row: abs(changes[row][name].value))
-        harm = mean(base.harm[name]).in_words()
-        notes.append(f"What moves {name} ({harm}) most: {most}, by {changes[most][name].in_words()}.")
-    rates = [replace(PERCENT, heading=f"Collisions, {name}") for name in ("E-V2X-BM", PPO)]
+    stays = (
+        f"in {len(means) - len(broken)} of {len(means)} alternatives{'; not with ' * bool(broken)}{'; '.join(broken)}"
+    )
+    verdicts.append(Verdict(f"the order stays: {' < '.join(ORDER)}", "differs" if broken else "agrees", stays))
+    register = [
+        (gap.name, gap.paper, gap.ours, "; ".join(each.value for each in gap.alternatives) or gap.otherwise)
+        for gap in GAPS
+    ]
+    rows = [
+        (
+            *(gap.name, each.value),
+            *(mean(harm[name]) for name in SHOWN),
+            *(rate(result[name]["collided"]).value for name in SHOWN),
+        )
+        for gap, each, result, harm in measured
+    ]
+    rates = [replace(PERCENT, heading=f"Collisions, {name}") for name in SHOWN]
+    note = (
+        f"{about(base[2])} Mean harm (m²/s²) with its 95 % interval, then the collision rate. In the rows of H* inside"
+        f" the hybrid, PPO stands behind Algorithm 1. {POLICIES} They are not trained anew for an alternative."
+    )
     sheets = [
         Sheet(
             "Register of what the paper leaves open",
             ("Quantity", "The paper", "Our default", "Alternatives, or why none is measured"),
-            [
-                (gap.name, gap.paper, gap.ours, "; ".join(each.value for each in gap.alternatives) or gap.otherwise)
-                for gap in GAPS
-            ],
+            register,
             "Labels are those of the paper's source.",
         ),
-        Sheet(
-            "Headline at our defaults",
-            ("Strategy", PERCENT, HARM),
-            [(name, base.collisions(name), mean(base.harm[name])) for name in SHOWN],
-            f"{about(base.result)} First-impact harm, m²/s²; 95 % intervals. {POLICIES}",
-        ),
-        Sheet(
-            "How far the headline moves",
-            ["Quantity", "Default", "Alternative", *map(Column, SHOWN), *rates],
-            [
-                (
-                    *(gap.name, gap.ours, each.value, *(headline.change(base, name) for name in SHOWN)),
-                    *(headline.collisions(name).value for name in (REALISED, PPO)),
-                )
-                for gap, each, headline in headlines
-            ],
-            "Change of the mean harm (m²/s²) with its 95 % interval, paired by world where the worlds are the same;"
-            " then the collision rates in the alternative. In the rows of H* inside the hybrid, PPO stands behind"
-            " Algorithm 1. The policies are not trained anew for an alternative.",
-        ),
+        Sheet("The random test with other values", ("Quantity", "Value", *map(Column, SHOWN), *rates), rows, note),
     ]
-    text = "Change of the mean harm of each strategy on the random test when one open quantity changes."
-    figure = changes_figure(changes, "Change of the mean harm (m²/s²)", text)
-    return Made(verdicts, sheets, [Drawn("gaps", "How far the headline moves", text, figure)], notes=notes)
+    return Made(verdicts, sheets)

@@ -55,7 +55,7 @@ def is_finished(run: Path) -> bool:
 
 
 def trained(folder: Path, group: str) -> dict[str, list[Path]]:
-    """Return the finished runs of a group: recipe -> folder for each seed; a recipe with an unfinished run is left out."""
+    """Return the runs of a group: recipe -> folder for each seed. A recipe with an unfinished run is left out."""
     every = {plan.recipe: runs_of(folder, group, plan) for plan in GROUPS[group]}
     return {recipe: runs for recipe, runs in every.items() if all(map(is_finished, runs))}
 

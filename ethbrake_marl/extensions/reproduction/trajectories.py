@@ -69,7 +69,7 @@ def reproduce_trajectories(settings: Settings) -> Made:
     numbers = map(Column, ("Impacts", "First-impact harm", "Last gap 1 (m)", "Last gap 2 (m)"))
     note = f"One world each: no intervals. Harm in m²/s². {POLICIES}"
     sheet = Sheet("How the episodes end", ("Reading", "Scenario", "Strategy", *numbers), rows, note)
-    return Made(verdicts, [sheet], figures, {"trajectories": motions(records)})
+    return Made(verdicts, [sheet], figures)
 
 
 def reproduce_accelerations(settings: Settings) -> Made:
@@ -153,19 +153,3 @@ def asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
     command, moving = record.command_mps2[acting, VEHICLE_2], record.speeds_mps[acting, VEHICLE_2] > 0.0
     braking = float((command[moving] < 0.0).mean()) if moving.any() else 0.0
     return float(command[0]), float(np.abs(np.diff(command)).sum()), braking
-
-
-def motions(records: Records) -> Sheet:
-    """Return the motion of every episode: a row for each sample."""
-    head = [f"{name}_{i}_{unit}" for name, unit in (("position", "m"), ("speed", "mps")) for i in (1, 2, 3)]
-    head += ["gap_1_m", "gap_2_m", *(f"command_{i}_mps2" for i in (1, 2, 3))]
-    rows = [
-        (reading.name, number, name, round(float(time_s), 9), *row.tolist())
-        for (reading, number, name), each in records.items()
-        for time_s, row in zip(
-            each.time_s,
-            np.column_stack([each.positions_m, each.speeds_mps, each.gaps_m, each.command_mps2]),
-            strict=True,
-        )
-    ]
-    return Sheet("", [*map(Column, ("reading", "scenario", "strategy", "time_s", *head))], rows)
