@@ -51,6 +51,7 @@ class Report:
     figures: Sequence[Part] = ()
     tests: Mapping[str, Test] = field(default_factory=dict)  # by title
     beside: Sequence[Row] = ()  # rows below those of the agents: what somebody else printed
+    notes: Sequence[str] = ()  # about these rows
     remarks: Sequence[str] = ()  # below the first sentence
     settings: Mapping[str, object] = field(default_factory=dict)  # by name
 
@@ -67,7 +68,7 @@ class Report:
         played = drive_shown(compared, focus)
         others = {title: test.compared for title, test in self.tests.items()}
         parameters = compared.table.parameters
-        results = [Part.box("Three words", WORDS), *measured(compared.table, self.beside)]
+        results = [Part.box("Three words", WORDS), *measured(compared.table, self.beside, self.notes)]
         sections = [
             Section("Results", [self.summary, *results] if self.summary else results),
             *self.sections,

@@ -37,15 +37,15 @@ def short_table(table: SummaryTable) -> Part:
     return Part.table(replace(some, title="Means with 95 % intervals, m²/s²"))
 
 
-def measured(table: SummaryTable, beside: Sequence[Row] = ()) -> list[Part]:
-    """Return the conditions, and folded tables of all measures; ``beside`` are rows below those of the agents."""
+def measured(table: SummaryTable, beside: Sequence[Row] = (), notes: Sequence[str] = ()) -> list[Part]:
+    """Return the conditions, and folded tables of all measures; ``beside`` and ``notes`` stand below the agents."""
     sheet = table.sheet()
     whole = replace(sheet.only(sheet.filled()), title="All measures with a column")
     whole = replace(whole, rows=[*whole.rows, *beside])
     more = [] if (asked := table.measures()) is None else [Part.table(asked)]
     title = "Every measure" + (", and the paper's rows" if beside else "")
     line = Part.paragraph(f"{caption(table.parameters)}. Harm in m²/s².", "quiet")
-    return [line, Part.opened(title, [Part.table(whole), *more])]
+    return [line, Part.opened(title, [Part.table(whole), *(Part.paragraph(text, "quiet") for text in notes), *more])]
 
 
 def drive_shown(compared: Compared, focus: str) -> dict[int, Played]:
