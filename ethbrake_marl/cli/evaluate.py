@@ -77,9 +77,7 @@ def evaluate_command(
                     f"{option}: cannot be used with {scenario}, a group of {len(names)} scenarios; name one scenario"
                 )
         count = (GROUP_EPISODES if names else 10_000) if episodes is None else episodes
-        every = {
-            name: _compared(out, name, chosen, agents, count, seed, jobs, ray) for name in names or [scenario]
-        }
+        every = {name: _compared(out, name, chosen, agents, count, seed, jobs, ray) for name in names or [scenario]}
         if report and output is not None:
             write = page_of("evaluation", "--report")
             output.mkdir(parents=True, exist_ok=True)

@@ -68,7 +68,7 @@ class Report(Protocol):
 class Tables:
     """The report where no extension has one: the tables of the evaluation."""
 
-    measures = ("sampled_harm", "vehicle_1_shoved_m")
+    measures: tuple[str, ...] = ("sampled_harm", "vehicle_1_shoved_m")
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
         """Write nothing more."""
@@ -99,8 +99,8 @@ def run_experiment(
     Returns the experiment, and the tables and the text of the report.
     """
     started, tell = time.monotonic(), on_progress or (lambda progress: None)
-    report, count = report or Tables(), recipe.reward.harm_count
-    measures = tuple(name for name in report.measures if name in MEASURES)
+    shown: Report = report or Tables()
+    count, measures = recipe.reward.harm_count, tuple(name for name in shown.measures if name in MEASURES)
     baselines = TEAM_BASELINES if len(scenario.learners) > 1 else BASELINES
     evaluate(scenario, baselines, episodes=1, seed=list_seed, harm_count=count, measures=measures)  # or refuse it now
     trained = train(
@@ -120,7 +120,7 @@ def run_experiment(
         )  # fmt: skip
         write_results(trained.directory, compared.table, compared.result, "csv", force=True)
         experiment = Experiment(trained, compared, measures, started)
-        tables, where = report.write(experiment, tell)
+        tables, where = shown.write(experiment, tell)
     return experiment, tables, where
 
 

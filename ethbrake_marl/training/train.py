@@ -17,7 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.files.plain import read_object
-from ethbrake_marl.names import AGENTS, open_game
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.progress import Progress, Told

@@ -111,7 +111,8 @@ def write_png(films: Films) -> bytes:
     from PIL import Image
 
     last = max(map(len, films.values())) - 1
-    impacts = [(hit.closing_mps, -k) for each in films.values() for k, scene in enumerate(each) for hit in scene.impacts]
+    numbered = [(k, scene) for scenes in films.values() for k, scene in enumerate(scenes)]
+    impacts = [(impact.closing_mps, -k) for k, scene in numbered for impact in scene.impacts]
     hardest = -max(impacts, default=(0.0, 0))[1]  # number of the first scene that shows the hardest impact
     rows = []
     for title, scenes in films.items():

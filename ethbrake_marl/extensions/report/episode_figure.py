@@ -106,7 +106,14 @@ def _gaps(axes: Axes, record: EpisodeRecord) -> None:
     for p, gaps in enumerate(record.gaps_m.T):
         axes.plot(record.time_s, gaps, **_style(p + 2))
     times = record.impacts.time_s[record.impacts.first_impact_harm > 0.0]
-    style = {"marker": "X", "s": 60.0, "facecolor": "black", "edgecolor": "black", "linewidth": 0.8, "zorder": 5}
+    style: dict[str, Any] = {
+        "marker": "X",
+        "s": 60.0,
+        "facecolor": "black",
+        "edgecolor": "black",
+        "linewidth": 0.8,
+        "zorder": 5,
+    }
     axes.scatter(times, np.zeros(len(times)), clip_on=False, **style)
 
 

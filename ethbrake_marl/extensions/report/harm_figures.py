@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -111,7 +112,7 @@ def harm_in_parts(result: Result, known: BestKnown) -> Figure:
             regret, left = known.regret(result, agent, count), 0.0
             parts = (known.harm[count].mean(), (regret * ~known.avoidable).mean(), (regret * known.avoidable).mean())
             for part, (label, colour, hatch) in zip(map(float, parts), PARTS, strict=True):
-                style = {"color": colour, "hatch": hatch, "edgecolor": "#ffffff", "linewidth": 0.5}
+                style: dict[str, Any] = {"color": colour, "hatch": hatch, "edgecolor": "#ffffff", "linewidth": 0.5}
                 axes.barh(k, part, left=left, height=0.62, label=label if k == 0 else None, **style)
                 left += part
         name_axes(axes, x=TITLES[count])

@@ -34,9 +34,7 @@ class Played:
     title: str = ""  # "": "World" and its number
 
 
-def player(
-    worlds: Sequence[Played], *, focus: str = "", shown_first: Sequence[int] = (), folded: bool = False
-) -> Part:
+def player(worlds: Sequence[Played], *, focus: str = "", shown_first: Sequence[int] = (), folded: bool = False) -> Part:
     """Return the player of at least one world, all with the same agents.
 
     ``shown_first``: indices of the agents that are shown at the start; by default the first agent, ``focus``, and those

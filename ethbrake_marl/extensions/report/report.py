@@ -81,8 +81,7 @@ class Report:
             Section("How to read the tables", [Part.facts(compared.table.meanings())]),
             Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
             Section(
-                "Versions",
-                [Part.facts({**parameters["versions"], **{key: parameters[key] for key in IDENTITY[:3]}})],
+                "Versions", [Part.facts({**parameters["versions"], **{key: parameters[key] for key in IDENTITY[:3]}})]
             ),
         ]
         which = "First-impact" if compared.harm_count == "first" else "Total"

@@ -39,7 +39,7 @@ PAGE = "report.html"
 class RunReport:
     """Report of an experiment (``training.experiment.Report``)."""
 
-    measures = (*Tables.measures, MEASURE)
+    measures: tuple[str, ...] = (*Tables.measures, MEASURE)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
         """Write results in the other tests, pictures and page; return tables to print, and where the page is."""

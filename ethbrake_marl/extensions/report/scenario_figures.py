@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from ethbrake_marl.errors import count_of
 from ethbrake_marl.episode.state import NUMBER
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.extensions.rendering.picture import vehicle_colour
 from ethbrake_marl.extensions.rendering.scene import BODY_M
 from ethbrake_marl.extensions.report.style import (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -21,13 +22,14 @@ from ethbrake_marl.extensions.report.page import Part, Section
 from ethbrake_marl.extensions.report.player import SAMPLE_S, Played, player
 from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_rows
 from ethbrake_marl.files.sheet import Column, Row, Sheet, Shown
+from ethbrake_marl.motion.layout import Bools
 from ethbrake_marl.names import open_game
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
 
 SHIELD_WORLDS = 200  # worlds in which shields are compared
 SHORT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the first table
-PERCENT = {"digits": 1, "scale": 100.0, "unit": " %"}
+PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 
 
 def short_table(table: SummaryTable) -> Part:
@@ -125,14 +127,14 @@ def avoidable_section(compared: Compared) -> Section:
     return Section("What was avoidable", [*body, Part.drawing(harm_above(result), title, words)])
 
 
-def _split(compared: Compared, known: BestKnown, where: str, among: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Part:
+def _split(compared: Compared, known: BestKnown, where: str, among: Bools) -> Part:
     part = compared.result.take(among)
     by, rows = part.clusters, []
     for agent, own in part.columns.items():
         regrets = (mean(known.regret(compared.result, agent, count)[among], by) for count in HARM)
         rows.append((agent, rate(own["collided"], by), *(mean(own[harm], by) for harm in HARM.values()), *regrets))
     columns = ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")
-    heads = ["Agent", Column("Collided", **PERCENT), *map(Column, columns)]
+    heads: list[Column | str] = ["Agent", Column("Collided", **PERCENT), *map(Column, columns)]
     return Part.table(Sheet(f"{where}: {count_of(part.n, 'world')}", heads, rows))
 
 
@@ -154,10 +156,15 @@ def shield_section(compared: Compared) -> Section:
             none = rate(own["replaced_none"], by) if "replaced_none" in own else None
             harm = own[HARM[count]]
             rows.append((mode, mean(harm, by), None if mode == "no shield" else difference(harm, alone, by), none))
-        heads = ["Mode", Column("Harm"), Column("Minus no shield", sign="+"), Column("Left alone", **PERCENT)]
+        heads: list[Column | str] = [
+            "Mode",
+            Column("Harm"),
+            Column("Minus no shield", sign="+"),
+            Column("Left alone", **PERCENT),
+        ]
         tables.append(Part.table(Sheet(f"{name}: {'first-impact' if count == 'first' else count} harm", heads, rows)))
     text = (
-        f"Policies with a shield in the first {SHIELD_WORLDS} worlds: without it, with the paper's hybrid (episode), and"
-        " with a certificate for every action (step). Left alone: worlds in which the shield replaced nothing."
+        f"Policies with a shield in the first {SHIELD_WORLDS} worlds: without it, with the paper's hybrid (episode),"
+        " and with a certificate for every action (step). Left alone: worlds in which the shield replaced nothing."
     )
     return Section("Shield", [text, *tables] if tables else ())
