@@ -1,9 +1,8 @@
-"""Figures of harm: means, its distribution, what of it was avoidable, and how it depends on the gaps at the alert."""
+"""Figures of harm: its mean, its distribution, and how it depends on the gaps at the alert."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,11 +30,6 @@ from ethbrake_marl.extensions.report.style import (
 )
 
 POINTS = 250  # of a curve; more would not be visible
-PARTS = (
-    ("best known harm", "#bbbbbb", ""),
-    ("regret, contact unavoidable", COLOURS[2], "//"),
-    ("regret, contact avoidable", COLOURS[1], ".."),
-)
 
 
 @in_our_style
@@ -100,24 +94,6 @@ def harm_above(result: Result) -> Figure:
     panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     note = f"Linear up to 1 m²/s², logarithmic beyond. {line(result)}."
     return finish(figure, note, panels[0], columns=5)
-
-
-@in_our_style
-def harm_in_parts(result: Result, known: BestKnown) -> Figure:
-    """Draw each agent's mean harm in three parts: best known, and regret where contact is, or is not, avoidable."""
-    assert known.avoidable is not None
-    figure, panels = new_panels((10.0, 1.4 + 0.36 * len(result.columns)), columns=2, sharey=True)
-    for axes, count in zip(panels, HARM, strict=True):
-        for k, agent in enumerate(result.columns):
-            regret, left = known.regret(result, agent, count), 0.0
-            parts = (known.harm[count].mean(), (regret * ~known.avoidable).mean(), (regret * known.avoidable).mean())
-            for part, (label, colour, hatch) in zip(map(float, parts), PARTS, strict=True):
-                style: dict[str, Any] = {"color": colour, "hatch": hatch, "edgecolor": "#ffffff", "linewidth": 0.5}
-                axes.barh(k, part, left=left, height=0.62, label=label if k == 0 else None, **style)
-                left += part
-        name_axes(axes, x=TITLES[count])
-    _name_rows(panels[0], list(result.columns))
-    return finish(figure, f"Mean over the worlds. {line(result)}.", panels[0], columns=5)
 
 
 @in_our_style

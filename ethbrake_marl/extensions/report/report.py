@@ -17,7 +17,6 @@ from ethbrake_marl.extensions.report.sections import (
     drive_shown,
     episodes_section,
     measured,
-    shield_section,
     short_table,
     worst_section,
 )
@@ -75,7 +74,6 @@ class Report:
             episodes_section(compared, played, focus),
             worst_section(compared, focus, played),
             avoidable_section(compared),
-            shield_section(compared),
             Section("Figures", self.figures),
             *(self._test(title, test) for title, test in self.tests.items()),
             Section("How to read the tables", [Part.facts(compared.table.meanings())]),

@@ -1,4 +1,4 @@
-"""The sections of a page about compared agents: episodes, worst worlds, what was avoidable, shields, tables."""
+"""The sections of a page about compared agents: tables, episodes, worst worlds, what was avoidable."""
 
 from __future__ import annotations
 
@@ -9,25 +9,21 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episodes
-from ethbrake_marl.evaluation.statistics import difference, mean, rate
+from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
-from ethbrake_marl.extensions.report.harm_figures import harm_above, harm_in_parts
+from ethbrake_marl.extensions.report.harm_figures import harm_above
 from ethbrake_marl.extensions.report.page import Part, Section
 from ethbrake_marl.extensions.report.player import SAMPLE_S, Played, player
 from ethbrake_marl.extensions.report.shown_worlds import choose_shown, worst_rows
 from ethbrake_marl.files.sheet import Column, Row, Sheet, Shown
 from ethbrake_marl.motion.layout import Bools
 from ethbrake_marl.names import open_game
-from ethbrake_marl.shields.algorithm_1 import EpisodeShield
-from ethbrake_marl.shields.step import StepShield
 
-SHIELD_WORLDS = 200  # worlds in which shields are compared
 SHORT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the first table
 PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 
@@ -118,8 +114,6 @@ def avoidable_section(compared: Compared) -> Section:
         for where, among in (("Contact avoidable", known.avoidable), ("Contact unavoidable", ~known.avoidable)):
             if among.any():
                 body.append(_split(compared, known, where, among))
-        about = "Mean harm per world, divided into the best known harm and the regret of each agent."
-        body.append(Part.drawing(harm_in_parts(result, known), "Avoidable and unavoidable harm", about))
     title, words = "Harm world by world", "For each harm x: share of the worlds in which an agent did more harm than x."
     if known is not None:
         title = "Regret world by world"
@@ -136,35 +130,3 @@ def _split(compared: Compared, known: BestKnown, where: str, among: Bools) -> Pa
     columns = ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total")
     heads: list[Column | str] = ["Agent", Column("Collided", **PERCENT), *map(Column, columns)]
     return Part.table(Sheet(f"{where}: {count_of(part.n, 'world')}", heads, rows))
-
-
-def shield_section(compared: Compared) -> Section:
-    """Return what both shields change, in the first worlds, of each policy that has one; empty without shields."""
-    tables: list[str | Part] = []
-    behind = {next(iter(team.drivers.values())).name: team for team in compared.teams.values() if team.shield}
-    for name, team in behind.items():
-        drivers, count = team.drivers, compared.harm_count
-        teams = {"no shield": Team("no shield", drivers)}
-        if len(drivers) == 1:
-            teams["episode"] = Team("episode", drivers, EpisodeShield(drivers, harm_count=count))
-        teams["step"] = Team("step", drivers, StepShield(drivers, harm_count=count))
-        few, seed = min(SHIELD_WORLDS, compared.result.n), compared.result.about["seed"]
-        result = Compared.of(compared.scenario, teams, episodes=few, seed=seed, harm_count=count).result
-        by, alone = result.clusters, result["no shield"][HARM[count]]
-        rows: list[Row] = []
-        for mode, own in result.columns.items():
-            none = rate(own["replaced_none"], by) if "replaced_none" in own else None
-            harm = own[HARM[count]]
-            rows.append((mode, mean(harm, by), None if mode == "no shield" else difference(harm, alone, by), none))
-        heads: list[Column | str] = [
-            "Mode",
-            Column("Harm"),
-            Column("Minus no shield", sign="+"),
-            Column("Left alone", **PERCENT),
-        ]
-        tables.append(Part.table(Sheet(f"{name}: {'first-impact' if count == 'first' else count} harm", heads, rows)))
-    text = (
-        f"Policies with a shield in the first {SHIELD_WORLDS} worlds: without it, with the paper's hybrid (episode),"
-        " and with a certificate for every action (step). Left alone: worlds in which the shield replaced nothing."
-    )
-    return Section("Shield", [text, *tables] if tables else ())
