@@ -50,7 +50,7 @@ class Convergence:
     errors: np.ndarray  # [step, column]
 
     def order(self, column: int) -> float | None:
-        """Return the slope of log |error| over log step, by least squares; None if the error changes its sign or is 0."""
+        """Return the slope of log |error| over log step, by least squares; None if the error is 0 or changes sign."""
         steps = np.array(self.steps_s)
         errors = self.errors[steps <= FITTED_UP_TO_S, column]
         if len(errors) < 2 or not ((errors > 0.0).all() or (errors < 0.0).all()):

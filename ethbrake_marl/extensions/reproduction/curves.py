@@ -10,7 +10,6 @@ import numpy as np
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.statistics import difference, mean
 from ethbrake_marl.extensions.reproduction.figures import estimates_figure
-from ethbrake_marl.extensions.reproduction.limits import least_harm
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Drawn, Made, Settings, about
 from ethbrake_marl.extensions.reproduction.readings import (
     ABOUT_BASELINE,
@@ -103,8 +102,7 @@ def reproduce_distance(settings: Settings) -> Made:
     curves, verdicts = {}, []
     for reading in READINGS:
         result = driven(DISTANCE, reading, FOUR, min(DISTANCE_WORLDS, settings.episodes))
-        harm = harms(result) | {PROVEN: least_harm(reading.scenario(DISTANCE), result)}
-        at, groups = by_distance(result, harm)
+        at, groups = by_distance(result, harms(result, reading.scenario(DISTANCE)))
         curves[reading.name] = at, groups, about(result)
         claims = {
             "non-ethical: the larger the distance, the larger the harm": [
@@ -143,7 +141,7 @@ def reproduce_delays(settings: Settings) -> Made:
                 scenario = reading.scenario(f"paper-delay-{delay}", **changes)
                 result = drive(scenario, FOUR, episodes)
                 _, middle, rear = scenario.model_dump()["latency_s"]
-                groups[f"{delay} ({middle:g}, {rear:g} s)"] = harms(result) | {PROVEN: least_harm(scenario, result)}
+                groups[f"{delay} ({middle:g}, {rear:g} s)"] = harms(result, scenario)
             where = f"{worlds}; {reading.name}"
             panels[reading.name] = {
                 name: {at: mean(harm[name]) for at, harm in zip(DELAYS, groups.values(), strict=True)}
@@ -183,7 +181,7 @@ def reproduce_illustration(settings: Settings) -> Made:
     curves, verdicts = {}, []
     for reading in READINGS:
         result = drive_hybrid(DISTANCE, settings, reading)
-        harm = harms(result)
+        harm = harms(result, reading.scenario(DISTANCE))
         at, groups = by_distance(result, harm)
         curves[reading.name] = at, groups, about(result)
         for name, baseline in ((HYBRID_REALISED, COUPLED), (HYBRID_PREDICTED, REALISED)):

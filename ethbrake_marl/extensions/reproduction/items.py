@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -21,7 +22,7 @@ from ethbrake_marl.extensions.reproduction.trainings import HIGH, LOW, STOPPED, 
 from ethbrake_marl.extensions.reproduction.trajectories import reproduce_accelerations, reproduce_trajectories
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.store import write_output
+from ethbrake_marl.files.store import write_file, write_output
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.progress import Progress
 
@@ -116,12 +117,13 @@ def reproduce(
     Raises ``InvalidInput`` for a folder with other settings, and ``AlreadyExists`` for one with other files.
     """
     folder = settings.folder
+    question = {"format": "ethbrake-reproduction", "episodes": settings.episodes, "version": __version__}
     if force and (folder / RECORD).is_file():
-        (folder / RECORD).unlink()
+        write_file(folder / RECORD, json.dumps(question, indent=2).encode())
     study = StudyFolder(
         folder,
         "a reproduction",
-        {"format": "ethbrake-reproduction", "episodes": settings.episodes, "version": __version__},
+        question,
         record=RECORD,
         advice="give another folder (--output), or replace its results (--force)",
         beside=("trainings", PAGE, *(item.name for item in ITEMS)),

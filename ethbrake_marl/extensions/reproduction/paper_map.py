@@ -75,7 +75,7 @@ def exchange(line: Floats, car: Floats) -> None:
 
 
 def sample(state: State, step_s: float) -> State:
-    """Return worlds at a sample one sample later: impacts, then a step with the commands ``state.wanted`` [n, N + 1]."""
+    """Return worlds at a sample one sample later: impacts, then a step with ``state.wanted`` [n, N + 1] m/s2."""
     line, clock = state.line.copy(), state.clock.copy()
     exchange(line, state.car)
     now, speed, limit = clock[:, TIME, np.newaxis], line[:, SPEED], state.car[:, LIMIT]
@@ -109,14 +109,12 @@ def advance_sampled(alert: State, until_s: float, step_s: float = 0.1) -> State:
     builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2))
     state = begin(alert, np.array([2]), step_s, until_s)
     for wrong, what in (
-        (obstacle, "has an obstacle"),
-        (builds, "has brakes that build up"),
-        (state.collided, "has an impact before Vehicle 2 may act"),
+        (obstacle, "an obstacle"),
+        (builds, "brakes that build up"),
+        (state.collided, "an impact before Vehicle 2 may act"),
     ):
         if wrong.any():
-            raise InvalidInput(
-                f"advance_sampled: world in row {np.argmax(wrong)} {what}, which the paper's map has not"
-            )
+            raise InvalidInput(f"advance_sampled: row {np.argmax(wrong)} has {what}, which the paper's map has not")
     last = np.ceil((until_s - start) / step_s - ON_SAMPLE)
     while (running := state.steps < last).any():
         state = state.put(running, sample(state.take(running), step_s), donate=True)

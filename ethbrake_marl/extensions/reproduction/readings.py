@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from ethbrake_marl.evaluation.evaluate import Result, evaluate
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.named_measures import measures_called
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -83,8 +85,8 @@ def drive(
 
 
 @cache
-def _driven(name: str, reading: Reading, agents: tuple[tuple[str, str], ...], episodes: int, **changes: Any) -> Result:
-    return drive(reading.scenario(name, **changes), dict(agents), episodes)
+def _driven(name: str, reading: Reading, agents: tuple[tuple[str, str], ...], episodes: int) -> Result:
+    return drive(reading.scenario(name), dict(agents), episodes)
 
 
 def driven(name: str, reading: Reading, agents: Mapping[str, str], episodes: int) -> Result:
@@ -92,9 +94,24 @@ def driven(name: str, reading: Reading, agents: Mapping[str, str], episodes: int
     return _driven(name, reading, tuple(agents.items()), episodes)
 
 
-def harms(result: Result) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy, [n] m2/s2; with what E-V2X-BM predicts, where it drives."""
+def harms(result: Result, scenario: Scenario) -> dict[str, Floats]:
+    """Return the first-impact harm of each strategy in the first worlds of its scenario, [n] m2/s2.
+
+    With it stand what E-V2X-BM predicts, where it drives, and a bound that is proven for every strategy.
+    """
     each = {name: columns["first_impact_harm"] for name, columns in result.columns.items()}
-    if "predicted_harm" in result.columns.get(REALISED, {}):
+    if REALISED in result.columns:
         each[PREDICTED] = result[REALISED]["predicted_harm"]
-    return each
+    return each | {PROVEN: least_harm(scenario, result.n)}
+
+
+def least_harm(scenario: Scenario, episodes: int) -> Floats:
+    """Return a lower bound that is proven for every strategy, in the first worlds of the list, [n] m2/s2."""
+    return _least_harm(json.dumps(scenario.declared()), episodes)
+
+
+@cache
+def _least_harm(content: str, episodes: int) -> Floats:
+    scenario = load_scenario(json.loads(content))
+    worlds = scenario.sample(episodes, SEED)
+    return lower_bound(worlds, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm
