@@ -118,7 +118,10 @@ def avoidable_section(compared: Compared) -> Section:
     if known is not None:
         title = "Regret"
         words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."
-    return Section("World by world" if known is None else "What was avoidable", [*body, Part.drawing(harm_above(result), title, words)])
+    return Section(
+        "World by world" if known is None else "What was avoidable",
+        [*body, Part.drawing(harm_above(result), title, words)],
+    )
 
 
 def _split(compared: Compared, known: BestKnown, where: str, among: Bools) -> Part:
