@@ -63,9 +63,9 @@ def test_run__json_prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recip
     (folder / "worlds.csv").write_text("stale")
     answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "60", "--output", folder, "--force", "--json")
     now, then = told_json(answer), json.loads((finished_run / "results.json").read_text())
-    assert now == [
-        {key: value for key, value in row.items() if key not in ("per_world", "results_sha256")} for row in then
-    ]
+    for row in then:
+        del row["per_world"], row["results_sha256"]
+    assert now == then
     assert (folder / "worlds.csv").read_bytes() == (finished_run / "worlds.csv").read_bytes()
     assert "training" in answer.err and str(folder / "report.html") in answer.err
     assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in folder.glob("*.png"))
