@@ -10,7 +10,6 @@ from rich.text import Text
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, ScenarioOption, SettingsOption, StepsOption
 from ethbrake_marl.cli.pages import PAGES
 from ethbrake_marl.cli.train import REMAINS, OutputOption, TrainingSeedOption, changed, run_folder, tell_end
-from ethbrake_marl.errors import InvalidInput
 
 QUICKEST = ("quick", "ppo")  # trains the first of these recipes whose algorithm is installed
 QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # the same for scenarios with several learners
@@ -47,14 +46,14 @@ def run_command(
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn
         from ethbrake_marl.cli.settings import read_settings
+        from ethbrake_marl.names import check_learners
         from ethbrake_marl.training.experiment import HYBRID, POLICY, SHIELDED, run_experiment
         from ethbrake_marl.training.recipe import load_recipe
 
         plan = load_recipe(recipe or quickest())
         changes = read_settings(settings, [*type(plan).model_fields])
         chosen = changes.change_scenario(scenario)
-        if not chosen.learners:
-            raise InvalidInput(f"scenario {chosen.name!r} has no learner; give at least one vehicle the role learner")
+        check_learners(chosen)
         if recipe is None and len(chosen.learners) > 1:
             plan = load_recipe(quickest(several=True))
             changes = read_settings(settings, [*type(plan).model_fields])

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 from ethbrake_marl.agents.drive import Agent, Team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.door import EPISODES, SEED, evaluate
 from ethbrake_marl.evaluation.named_measures import MEASURES
@@ -101,7 +102,7 @@ def run_experiment(
     started, tell = time.monotonic(), on_progress or (lambda progress: None)
     shown: Report = report or Tables()
     count, measures = recipe.reward.harm_count, tuple(name for name in shown.measures if name in MEASURES)
-    baselines = TEAM_BASELINES if len(scenario.learners) > 1 else BASELINES
+    baselines = usable_baselines(scenario, count, list_seed, tell)
     evaluate(scenario, baselines, episodes=1, seed=list_seed, harm_count=count, measures=measures)  # or refuse it now
     trained = train(
         recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
@@ -122,6 +123,24 @@ def run_experiment(
         experiment = Experiment(trained, compared, measures, started)
         tables, where = shown.write(experiment, tell)
     return experiment, tables, where
+
+
+def usable_baselines(scenario: Scenario, harm_count: str, seed: int, tell: OnProgress) -> list[str]:
+    """Return the baselines that can drive in a scenario; why the others cannot is reported as progress.
+
+    Raises the errors of full braking.
+    """
+    baselines = TEAM_BASELINES if len(scenario.learners) > 1 else BASELINES
+    usable = []
+    for number, name in enumerate(baselines):
+        try:
+            evaluate(scenario, name, episodes=1, seed=seed, harm_count=harm_count)
+            usable.append(name)
+        except InvalidInput as error:
+            if name == FULL_BRAKE.name:
+                raise
+            tell(Progress("baselines", number, len(baselines), note=f"this baseline is left out: {error}"))
+    return usable
 
 
 def compared_teams(

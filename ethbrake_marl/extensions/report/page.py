@@ -72,7 +72,8 @@ class Part:
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
         """Return a box that explains words; ``meanings`` maps each word to its meaning."""
-        return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
+        markup = Markup('<aside class="box"><strong>{}</strong>{}</aside>\n')
+        return cls(markup.format(shown(title), cls.facts(meanings).html))
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:

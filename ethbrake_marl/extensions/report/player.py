@@ -92,28 +92,31 @@ def episode_data(record: EpisodeRecord) -> dict[str, Any]:
 def pieces_of(record: EpisodeRecord) -> Floats:
     """Return the motion as pieces of constant acceleration, [k, 1 + 3 N].
 
-    A piece: the time at which it begins (s), place of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2). From
-    a sample before an impact, the acceleration before it goes on to the next sample.
+    A piece: the time at which it begins (s), place of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2). An
+    impact between two samples ends a piece; the next one leads from there to the second sample. If something else
+    happens there as well, such as another impact, places are wrong by millimetres until the second sample.
     """
-    time_s, speeds = record.time_s, record.speeds_mps
-    if len(time_s) == 1:
-        rates = np.zeros_like(speeds)
-    else:
-        rates = np.diff(speeds, axis=0) / np.diff(time_s)[:, np.newaxis]
-        rates = np.concatenate([rates, np.zeros_like(speeds[:1])])
-        struck = np.searchsorted(time_s, record.impacts.time_s, "right") - 1
-        for k in sorted({*struck.tolist()} - {0}):
-            rates[k] = rates[k - 1]
+    time_s, speeds, N = record.time_s, record.speeds_mps, record.speeds_mps.shape[1]
+    rates = np.zeros_like(speeds)
+    rates[:-1] = np.diff(speeds, axis=0) / np.diff(time_s)[:, np.newaxis]
+    struck_s = np.array(sorted({*record.impacts.time_s.tolist()}))
+    struck = np.clip(np.searchsorted(time_s, struck_s, "right") - 1, 0, len(time_s) - 2)
+    for k in np.unique(struck).tolist():
+        rates[k] = rates[k - 1] if k else 0.0
     rows = np.column_stack([time_s, record.positions_m[:, 0], record.gaps_m, speeds, rates])
-    before, t = rows[:-1], np.diff(time_s)[:, np.newaxis]
-    ways = (speeds[:-1] + 0.5 * rates[:-1] * t) * t
-    after = np.column_stack([
-        before[:, 1] + ways[:, 0], record.gaps_m[:-1] + ways[:, :-1] - ways[:, 1:], speeds[:-1] + rates[:-1] * t,
-        rates[:-1],
-    ])  # fmt: skip
-    goes_on = (np.abs(after - rows[1:, 1:]) <= SAME).all(axis=1)
-    pieces: Floats = rows[np.append(True, ~goes_on)]
-    return pieces
+    goes_on = (np.abs(moved(rows[:-1], np.diff(time_s), N) - rows[1:, 1:]) <= SAME).all(axis=1)
+    later = rows[struck + 1]
+    begun = np.column_stack([struck_s, moved(later, struck_s - later[:, 0], N)])
+    pieces: Floats = np.concatenate([rows[np.append(True, ~goes_on)], begun])
+    return pieces[np.argsort(pieces[:, 0], kind="stable")]
+
+
+def moved(pieces: Floats, t: Floats, N: int) -> Floats:
+    """Return what pieces have become ``t`` (s) after their beginning, without the time."""
+    speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
+    ways = (speeds + 0.5 * rates * t) * t
+    gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]
+    return np.column_stack([pieces[:, 1] + ways[:, 0], gaps, speeds + rates * t, rates])
 
 
 def replaced_at_s(record: EpisodeRecord) -> list[float]:

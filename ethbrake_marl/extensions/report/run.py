@@ -96,10 +96,12 @@ def write_figures(experiment: Experiment) -> list[Part]:
         ),
         "trajectories.png": (
             "One episode",
-            f"World {number} of the list, driven by three agents. It is a typical world: among the worlds in which full"
+            f"World {number} of the list, driven by these agents. It is a typical world: among the worlds in which full"
             f" braking collides, the harm that the {learned} avoids is the median here.",
             trajectories({
-                name: record_episode(world, compared.teams[name], game) for name in (*TEAM_BASELINES, learned)
+                name: record_episode(world, team, game)
+                for name, team in compared.teams.items()
+                if name in (*TEAM_BASELINES, learned)
             }),
         ),
     }  # fmt: skip

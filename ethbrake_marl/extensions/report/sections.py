@@ -114,11 +114,14 @@ def avoidable_section(compared: Compared) -> Section:
         for where, among in (("Contact avoidable", known.avoidable), ("Contact unavoidable", ~known.avoidable)):
             if among.any():
                 body.append(_split(compared, known, where, among))
-    title, words = "Harm world by world", "For each harm x: share of the worlds in which an agent did more harm than x."
+    title, words = "Harm", "For each harm x: share of the worlds in which an agent did more harm than x."
     if known is not None:
-        title = "Regret world by world"
+        title = "Regret"
         words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."
-    return Section("What was avoidable", [*body, Part.drawing(harm_above(result), title, words)])
+    return Section(
+        "World by world" if known is None else "What was avoidable",
+        [*body, Part.drawing(harm_above(result), title, words)],
+    )
 
 
 def _split(compared: Compared, known: BestKnown, where: str, among: Bools) -> Part:
