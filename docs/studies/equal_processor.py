@@ -13,20 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ethbrake_marl.extensions.report.seed_curves import seed_curves
+import ethbrake_marl as eb
+from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
 from ethbrake_marl.extensions.report.style import write_picture
-from ethbrake_marl.extensions.reproduction.learning_curves import AXES, LearningCurves
-from ethbrake_marl.extensions.search.best_harm import best_harm
-from ethbrake_marl.first_edition.game.harm import HarmCount
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, load_recipe
-from ethbrake_marl.first_edition.training.run_folder import RunDirectory
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.training.fixed_list import HARM
+from ethbrake_marl.training.job import Job
+from ethbrake_marl.training.recipe import load_recipe
+from ethbrake_marl.training.run import RunFolder
+from ethbrake_marl.training.training import Training
 
-TESTS: dict[str, HarmCount] = {
-    "paper-random": "first",
-    "paper-random-brake-only": "first",
-    "paper-random-obstacle": "total",
-}
+TESTS = {"paper-random": "first", "paper-random-brake-only": "first", "paper-random-obstacle": "total"}
 STEPS = {  # recipe -> decisions in half a minute, measured in a short training
     "quick": 4_400_000,
     "ppo": 1_080_000,
@@ -36,37 +33,45 @@ STEPS = {  # recipe -> decisions in half a minute, measured in a short training
 POINTS, WORLDS, SEED, BUDGET = 12, 2000, 1007, 2000
 
 
-def plan(count: HarmCount, seconds: int) -> list[tuple[TrainingRecipe, int]]:
-    """Return the recipes, each with its number of seeds, for one count of harm."""
-    recipes = []
-    for name in STEPS:
-        recipe, steps = load_recipe(name), STEPS[name] * seconds // 30
-        updates = steps // (recipe.n_envs * recipe.rounds)
-        reward = recipe.reward.model_dump() | {"harm_count": count}
-        measured = {"every_updates": max(updates // POINTS, 1), "worlds": WORLDS, "seed": SEED}
-        recipes.append((recipe.replace(total_steps=steps, reward=reward, evaluation=measured), 1))
-    return recipes
+def job_of(test: str, count: str, name: str, seconds: int, folder: Path) -> Job:
+    """Return the training by one recipe for one count of harm."""
+    recipe, steps = load_recipe(name), STEPS[name] * seconds // 30
+    measured = {"every_updates": max(steps // (recipe.n_envs * recipe.rounds) // POINTS, 1), "worlds": WORLDS}
+    recipe = recipe.replace(
+        total_steps=steps,
+        reward=recipe.reward.model_dump() | {"harm_count": count},
+        evaluation={**measured, "seed": SEED},
+    )
+    return Job(Training.of(recipe, test), folder / test / name)
+
+
+def curve_of(run: RunFolder, count: str) -> SeedCurve:
+    """Return harm against the processor time of the training, without evaluations (s)."""
+    spent = read_object(run.status)["cpu_s"]
+    rows = [row for row in run.rows() if row.get("eval/total_harm")]
+    harm = [float(row[f"eval/{HARM[count]}"]) for row in rows]
+    return SeedCurve(np.array([spent[str(int(row["steps"]))] for row in rows]), np.array([harm]))
 
 
 if __name__ == "__main__":
     seconds, folder, picture = int(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3])
     panels, known = {}, {}
     for test, count in TESTS.items():
-        curves = LearningCurves(load_scenario(test), plan(count, seconds), folder / test, "cpu")
-        if not curves.train():
-            raise SystemExit(1)
-        curves.write()
         label = f"{test}: {'first-impact' if count == 'first' else 'total'} harm (m²/s²)"
-        panels[label] = curves.curves()[RunDirectory.HARM[count]]
-        worlds = load_scenario(test).sample(WORLDS, SEED).worlds
-        least = best_harm(load_scenario(test), worlds, counts=[count], budget=BUDGET, threads=1).best[count].harm
-        known[label] = float(np.mean(least))
-        for name, curve in panels[label].items():
+        best = f"best_harm:{BUDGET}"
+        result = eb.evaluate(test, best, episodes=WORLDS, seed=SEED, harm_count=count)
+        known[label] = float(np.mean(result[best][HARM[count]]))
+        panels[label] = {}
+        for name in STEPS:
+            job = job_of(test, count, name, seconds, folder)
+            if not job.finish():
+                raise SystemExit(1)
+            curve = panels[label][name] = curve_of(RunFolder(job.folder), count)
             harm = curve.values[0]
             cells = [f"{each:.3f}" for each in (harm[-1], harm.min(), harm.min() / known[label])]
-            print(f"| `{test}` | {count} | `{name}` | {curve.steps[-1]:.0f} s | {' | '.join(cells)} |")
+            print(f"| `{test}` | {count} | `{name}` | {curve.steps[-1]:.0f} s | {' | '.join(cells)} |", flush=True)
         print(f"best known: {known[label]:.3f}", flush=True)
     caption = f"One training per recipe; harm on the fixed list of the trainings, {WORLDS:,} worlds of seed {SEED}."
-    axis = AXES["cpu"][1]
+    axis = "Processor time of the training (s)"
     figure = seed_curves(panels, logarithmic=[*panels], caption=caption, x_label=axis, known=known)
     write_picture(picture, figure, force=True)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
+
+if TYPE_CHECKING:
+    from ethbrake_marl.training.recipe import TrainingRecipe
 
 NO_SETTING = {"name", "title", "description", "source"}  # words, which cannot be set
 
@@ -28,6 +31,10 @@ class Settings(NamedTuple):
             return scenario
         content = scenario.model_dump(mode="json", exclude_none=True) | scenario.declared()
         return scenario.replace(**Override.put(content, self.scenario))
+
+    def change_recipe(self, recipe: TrainingRecipe) -> TrainingRecipe:
+        """Return the recipe with these settings."""
+        return recipe.replace(**Override.put(recipe.model_dump(mode="json"), self.recipe)) if self.recipe else recipe
 
 
 def read_settings(

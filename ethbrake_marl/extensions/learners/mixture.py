@@ -18,7 +18,6 @@ from stable_baselines3.common.utils import update_learning_rate
 from torch import nn
 from torch.nn.functional import mse_loss, softplus
 
-from ethbrake_marl.episode.objectives import OBJECTIVES
 from ethbrake_marl.episode.play import played
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import EthBrakeError
@@ -229,10 +228,9 @@ class MixtureModel(VineModel):
         generator = np.random.default_rng(self.recipe.seed)
         attention, longest = (max(round(s / self.game.rules.time_step_s), 1) for s in (ATTENTION_S, LONGEST_WHILE_S))
         best, least = np.full((start.n, attention + longest), -1.0), explored.harm.copy()
-        is_line = self.objectives[self.game.rules.learners[0] - 1].kind is OBJECTIVES["total"]
         for _ in range(self.plan.templates):
             plans = random_templates(generator, start.n, attention, longest)
-            last, _ = played(self.game, start, plans[:, :, np.newaxis], count, least if is_line else math.inf)
+            last, _ = played(self.game, start, plans[:, :, np.newaxis], count)
             harm = self.harm(last, count)[:, 0]
             better = harm < least
             best[better], least[better] = plans[better], harm[better]
