@@ -54,7 +54,7 @@ GAPS = (
     Gap("restitution e", "eq:12: e in [0, 1], typically at most 0.3; not said for its tests", "0.1",
         _of("restitution", 0.0, 0.2, 0.3, 0.5)),
     Gap("time step Δt", "sec:optimization_problem: a sampling period, no number", "0.1 s",
-        _of("time_step_s", 0.05, 0.2, unit=" s")),
+        _of("time_step_s", 0.05, 0.2, unit=" s between decisions")),
     Gap("impacts at samples or exact", "dynamics2: at samples", "at their exact time; each impact once",
         (Alternative("the paper's map at 0.1 s, harm at every sample of an overlap (eq:Jharmn)", count="sampled"),)),
     Gap("horizon N", "Jfunc: N steps, no number", "8 s", _of("horizon_s", 5.0, 16.0, unit=" s")),
