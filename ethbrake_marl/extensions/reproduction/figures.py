@@ -47,7 +47,7 @@ def estimates_figure(
 
 
 def in_pairs(panels: int, height_in: float, x: str, y: str) -> tuple[Figure, list[Axes]]:
-    """Return a figure with two panels in a row, all on the same scales."""
+    """Return a figure with two panels in a row, all on the same scales; ``panels`` is even."""
     rows = (panels + 1) // 2
     figure, every = new_panels((10.0, height_in * rows + 1.0), rows, 2, sharex=True, sharey=True)
     for axes in every[::2]:
