@@ -10,24 +10,16 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.report.style import picture_bytes
-from ethbrake_marl.extensions.reproduction import strategies, tables as tables_module, verdicts
-from ethbrake_marl.extensions.reproduction.folder import Reproduction
-from ethbrake_marl.extensions.reproduction.making import choose_items
-from ethbrake_marl.extensions.reproduction.strategies import FULL_BRAKE, NAMES
-from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise
 from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
 from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
 from ethbrake_marl.first_edition.game.objectives import scored
 from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
 from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
 
-sampling, price, equal_time, message_contents, team_curves, equilibria = (
-    load(f"../studies/{name}")
-    for name in ("sampling", "price", "equal_time", "message_contents", "team_curves", "equilibria")
+price, equal_time, message_contents, team_curves, equilibria = (
+    load(f"../studies/{name}") for name in ("price", "equal_time", "message_contents", "team_curves", "equilibria")
 )
 
 
@@ -38,15 +30,6 @@ BASE = load_scenario("cooperation-2-paper")
 
 
 PNG = b"\x89PNG"
-
-
-@pytest.mark.parametrize("agent", sampling.CONTROLS)
-def test_sampling__prints_the_errors_that_the_page_tells(agent):
-    study = sampling.convergence(PAPER.sample(2000, 7).worlds, agent, steps_s=(0.2, 0.1, 0.05, 0.02))
-    exact, *_, coarse = sampling.table(study).partition("| 0.05 |")[0].split("| 0.1 | ")
-    told = [re.search(r"mean harm (\S+)", exact)[1], coarse.split(" | ")[0]]
-    assert [figure for figure in told if figure not in MADE_AGAIN] == []
-    assert picture_bytes(sampling.draw([study]), "study.png").startswith(PNG)
 
 
 def test_price__is_nothing_where_everything_is_known():
@@ -156,63 +139,7 @@ def text_of(*names: str) -> list[str]:
     return [(DOCS / f"{name}.md").read_text("utf-8") for name in names]
 
 
-(MADE_AGAIN,) = text_of("extensions/reproduction")
 (COOPERATION,), (TRAIN,) = text_of("cooperation"), text_of("train")
-
-
-# docs/results/reproduction.md says what the worlds give.
-
-
-def committed(heading: str, agent: str) -> list[str]:
-    """An agent's row in the table below a heading of the results page, without intervals."""
-    (row,) = (row for row in table_of("results/reproduction", heading) if row[0] == agent)
-    return [cell.split(" [")[0] for cell in row[1:]]
-
-
-def test_paper__its_5000_worlds_cannot_come_from_the_speeds_of_the_figure_of_distances() -> None:
-    printed = next(row for row in PAPER_ROWS if row.table == "hybrid test" and row.agent == "E-V2X-BM").average_harm
-    at_figure, at_random = (
-        optimise_pairwise(load_scenario(name).sample(5_000, 7).worlds, 1).harm.mean()
-        for name in ("paper-distance", "paper-random")
-    )
-    assert (f"{at_figure:.2f}", f"{at_random:.2f}") == ("3.07", "9.38") and printed > 3.0 * at_figure
-    for heading, cells in {"### Speeds 20, 18, 20 m/s, as stated": ("67.7 %", "12.88", "3.07"),
-                           "### Speeds 18 to 22 m/s, as stated": ("65.5 %", "19.13", "9.38")}.items():  # fmt: skip
-        row = committed(heading, "E-V2X-BM, realised")
-        assert [row[column] for column in (0, 1, 3)] == list(cells)
-
-
-@pytest.mark.parametrize(("spec", "name"), [("full_brake", "Non-ethical (full braking)"), ("ppo", "PPO")])
-def test_paper__harms_at_three_delays_are_as_committed(spec: str, name: str) -> None:
-    row = committed("### Gaps of 7 m, speeds of 20, 18 and 20 m/s", name)
-    state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}
-    for told, delay in zip(row, ("low", "middle", "high"), strict=True):
-        scenario = load_scenario(f"paper-delay-{delay}")
-        worlds = worlds_from_table(scenario, state)
-        outcome = eb.evaluate(worlds, make_lineup([spec], scenario), scenario=scenario).outcome(spec)
-        assert told == f"{outcome.first_impact_harm.mean():.2f}"
-
-
-def test_paper__full_braking_over_the_total_distance_is_as_committed() -> None:
-    scenario = load_scenario("paper-distance")
-    result = eb.evaluate(scenario.sample(5_000, 7), make_lineup(["full_brake"], scenario), scenario=scenario)
-    groups = np.digitize(result.worlds.gaps_m.sum(axis=1), (12.0, 14.0, 16.0, 18.0))
-    harm = result.outcome("full_brake").first_impact_harm
-    told = committed("### Harm by total distance, as stated", NAMES[FULL_BRAKE])
-    assert told == [f"{harm[groups == group].mean():.2f}" for group in range(5)]
-
-
-def test_reproduction__trajectories_and_full_braking_are_as_committed(tmp_path: Path) -> None:
-    (item,) = choose_items(["trajectories"])
-    (table,) = item.make(Reproduction("quick", tmp_path)).tables
-    told = [[cell.in_words for cell in row[1:]] for row in table.shown() if row[0].in_words == "as stated"]
-    assert told == table_of("results/reproduction", "### How the episodes end")[1:]
-    for reading, heading in zip(strategies.READINGS, ("### As stated", "### Vehicle 2 acts at 0.2 s"), strict=True):
-        scenario = reading.scenario("paper-random")
-        agents = strategies.lineup(scenario, FULL_BRAKE)
-        found = strategies.drive_list(scenario, agents, 10_000, Reproduction("quick", tmp_path))
-        rate = tables_module.collision_rate(found.outcome(NAMES[FULL_BRAKE]).collided)
-        assert committed(heading, NAMES[FULL_BRAKE])[0] == verdicts.PERCENT.show(rate).in_words.split(" [")[0]
 
 
 # docs/cooperation.md, and the methods for several learners in docs/train.md

@@ -3,21 +3,17 @@
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-import ethbrake_marl.first_edition as eb
+from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.extensions.report.harm_figures import harm_against_total_gap
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
-from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-AGENTS = ("full_brake", "e_v2x_bm", "constant:3+step", "ppo")
-PAPER = eb.load_scenario("paper-random")
 
 
 @pytest.fixture(scope="module")
@@ -69,19 +65,9 @@ def wait_until(page: Any, condition: str) -> None:
 
 
 @pytest.fixture(scope="session")
-def compared() -> eb.Evaluation:
-    """Four agents in 120 worlds, one of them behind a shield."""
-    return eb.evaluate(PAPER.sample(120, 7), make_lineup(AGENTS, PAPER), scenario=PAPER, seed=7)
-
-
-@pytest.fixture(scope="session")
-def report_file(compared: eb.Evaluation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def report_file(compared: Compared, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ``compared``."""
-    figure = Part.drawing(harm_against_total_gap(compared), "Harm against the gap", "Mean harm by gap.")
-    report = Report(
-        "paper-random: four agents", eb.summarise(compared), compared, figures=[figure],
-        summary="A report for the tests.", settings={"Seed": 7}, versions={"numpy": "2"},
-    )  # fmt: skip
+    figure = Part.drawing(harm_against_total_gap(compared.result), "Harm against the gap", "Mean harm by gap.")
     path = tmp_path_factory.mktemp("report") / "report.html"
-    replace(report.driven(make_lineup(AGENTS, PAPER)), shield=None).write(path)
+    Report("paper-random: four agents", compared, figures=[figure], settings={"Seed": 7}).write(path)
     return path

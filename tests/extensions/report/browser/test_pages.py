@@ -6,13 +6,13 @@ from typing import Any
 
 import pytest
 
-import ethbrake_marl.first_edition as eb
+import ethbrake_marl as eb
+from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.reproduction.folder import Reproduction
-from ethbrake_marl.extensions.reproduction.making import choose_items, make_items
-from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
-from tests.extensions.report.browser.conftest import AGENTS, PAPER, wait_until
-from tests.extensions.report.test_report import whole_page
+from tests.extensions.report.browser.conftest import wait_until
+from tests.extensions.report.conftest import AGENTS, compared_by
+from tests.extensions.report.test_page import whole_page
 from tests.fixtures.page import HOSTILE
 
 pytestmark = pytest.mark.slow
@@ -26,20 +26,10 @@ def report_page(open_page: Open, report_file: Path) -> Any:
     return open_page(report_file.as_uri())
 
 
-@pytest.fixture(scope="module")
-def reproduction_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The page of three items of the paper made again in few worlds."""
-    settings = Reproduction("quick", tmp_path_factory.mktemp("reproduction") / "out", 10)
-    make_items(settings, choose_items(["harm-distance", "accelerations", "gaps"]))
-    return settings.folder / "index.html"
-
-
 def write_report(path: Path, names: tuple[str, ...], **settings: Any) -> Path:
     """A report of agents by these names in few worlds."""
-    specs = [f"constant:{k}.5" for k in range(1, len(names) + 1)]
-    agents = dict(zip(names, make_lineup(specs, PAPER).values(), strict=True))
-    found = eb.evaluate(PAPER.sample(12, 7), agents, scenario=PAPER, seed=7)
-    Report("t", eb.summarise(found), found, focus=names[0], **settings).driven(agents).write(path)
+    found = compared_by("paper-random", {name: f"constant:{k + 1}.5" for k, name in enumerate(names)}, 12)
+    Report("t", found, focus=names[0], **settings).write(path)
     return path
 
 
@@ -47,11 +37,11 @@ def write_report(path: Path, names: tuple[str, ...], **settings: Any) -> Path:
 def long_names_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report whose agents are called by the files they come from."""
     names = ("my_agent_file_with_a_long_name_of_a_policy.py:drive+step", "x" * 120)
-    versions = {names[0]: "1", names[1]: "y" * 64}
-    return write_report(tmp_path_factory.mktemp("long") / "report.html", names, versions=versions)
+    settings = {names[0]: "1", names[1]: "y" * 64}
+    return write_report(tmp_path_factory.mktemp("long") / "report.html", names, settings=settings)
 
 
-@pytest.mark.parametrize("name", ["report_file", "reproduction_file", "long_names_file"])
+@pytest.mark.parametrize("name", ["report_file", "long_names_file"])
 def test_page__never_scrolls_sideways_and_is_no_giant(open_page: Open, name: str, request: Any) -> None:
     path = request.getfixturevalue(name)
     page = open_page(path.as_uri())
@@ -64,7 +54,6 @@ def test_page__never_scrolls_sideways_and_is_no_giant(open_page: Open, name: str
             " !e.closest('.wide, .drawing, svg, .skip')).map((e) => e.outerHTML.slice(0, 80))"
         )
         assert outside == [], width
-    assert name != "reproduction_file" or page.evaluate("document.querySelectorAll('figure img').length") == 3
     assert path.stat().st_size <= MOST_BYTES
 
 
@@ -98,9 +87,9 @@ def counts(page: Any) -> list[tuple[int, float, float]]:
 
 
 def test_player__ends_with_the_ledger_in_fifty_worlds_and_counts_never_fall(
-    report_page: Any, compared: eb.Evaluation
+    report_page: Any, compared: Compared
 ) -> None:
-    row_of = {int(number): row for row, number in enumerate(compared.index)}
+    row_of = {int(number): row for row, number in enumerate(compared.result.worlds["world"])}
     for shown in ((0, 1, 2), (1, 2, 3)):
         report_page.evaluate(f"{PLAYER}.shown = {list(shown)}")
         for k in range(50):
@@ -113,20 +102,21 @@ def test_player__ends_with_the_ledger_in_fifty_worlds_and_counts_never_fall(
                 assert all(a[0] <= b[0] and a[2] <= b[2] for a, b in zip(before, now, strict=True))
                 before = now
             row = row_of[report_page.evaluate(f"{PLAYER}.data.worlds[{k}].number")]
-            outcomes = [compared.outcome(AGENTS[agent]) for agent in shown]
+            outcomes = [compared.result[AGENTS[agent]] for agent in shown]
             assert before == [
-                (each.impacts[row], each.first_impact_harm[row], each.total_harm[row]) for each in outcomes
+                (each["impacts"][row], each["first_impact_harm"][row], each["total_harm"][row]) for each in outcomes
             ]
 
 
-def test_player__places_are_those_of_the_recorded_episode(report_page: Any, compared: eb.Evaluation) -> None:
-    row = compared.index.tolist().index(report_page.evaluate(f"{PLAYER}.data.worlds[0].number"))
-    record = eb.record_episode(compared.worlds.take([row]), eb.make_agent("full_brake"), scenario=PAPER)
+def test_player__places_are_those_of_the_recorded_episode(report_page: Any, compared: Compared) -> None:
+    number, (scenario, game) = report_page.evaluate(f"{PLAYER}.data.worlds[0].number"), eb.open_game("paper-random")
+    world = scenario.sample(1, 7, first=number)
+    record = record_episode(world, compared.teams["full_brake"], game, 0.005)
     report_page.evaluate(f"{PLAYER}.shown = [0]; {PLAYER}.build()")
-    for k in range(0, len(record.time_s), 7):
+    for k in range(0, len(record.time_s), 27):
         state = report_page.evaluate(f"stateAt({PLAYER}.episodes()[0], {float(record.time_s[k])!r})")
         told = [state["front"], *state["gaps"], *state["speeds"]]
-        assert told == pytest.approx([record.positions_m[k, 0], *record.gaps_m[k], *record.speeds_mps[k]], abs=1e-9)
+        assert told == pytest.approx([record.positions_m[k, 0], *record.gaps_m[k], *record.speeds_mps[k]], abs=1e-5)
 
 
 def test_player__is_worked_by_keys_alone(report_page: Any) -> None:
