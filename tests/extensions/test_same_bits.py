@@ -13,7 +13,6 @@ REMAINS = {
     ("recorded/states.py", "np.sin"): ROUNDED,
     ("rendering/picture.py", "math.cos"): DRAWN,
     ("rendering/picture.py", "math.sin"): DRAWN,
-    ("report/player.py", "**"): SQUARES,
     ("reproduction/trajectories.py", "**"): SQUARES,
     ("studies/falsification.py", "**"): SEARCHED,
     ("studies/falsification.py", "rng.standard_normal"): SEARCHED,
