@@ -295,7 +295,7 @@ def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | Non
 
 def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any]:
     """Return the function of a Python file that makes an agent."""
-    function = load_from_file(os.path.expanduser(match["file"]), match["name"], reads=settings.policy)
+    function = load_from_file(match["file"], match["name"], reads=settings.policy)
     if not callable(function):
         raise InvalidInput(
             f"file {match['file']!r}: {match['name']!r} is not a function; write FILE.py:FUNCTION, where FUNCTION makes"

@@ -132,6 +132,9 @@ def prepare_streams() -> None:
     error. Output that bypasses Python's stdout, such as that of a library or child process, goes to stderr. Warnings of
     this package are printed in one line. A message is printed before the first compilation of kernels.
     """
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # closed by the caller: nobody reads it
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
         if sys.stdout is sys.__stdout__ and sys.stderr is not None:
@@ -283,4 +286,5 @@ def whole_command() -> Any:
         with_installed(whole.commands[name], name)
     installed = [name for name in points(COMMANDS.group) if "." not in name]
     whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
+    whole.commands["doctor"] = whole.commands.pop("doctor")  # the last one of the help
     return whole

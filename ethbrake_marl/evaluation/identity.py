@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.state import NUMBER, State
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.files.python_file import files_run
 from ethbrake_marl.registry import versions_used
 
@@ -23,9 +23,9 @@ WORDS = ("name", "title", "description", "source")  # keys of a scenario that do
 
 
 def worlds_sha256(worlds: State) -> str:
-    """Return the SHA-256 of worlds at the alert: all their arrays, little-endian, and their numbers."""
+    """Return the SHA-256 of worlds at the alert: all their arrays, little-endian, whatever their numbers are."""
     digest = hashlib.sha256()
-    for array in (worlds.line, worlds.car, worlds.know, worlds.wanted, worlds.clock[:, NUMBER]):
+    for array in (worlds.line, worlds.car, worlds.know, worlds.wanted):
         digest.update(f"{array.shape}".encode())
         digest.update(np.ascontiguousarray(array, "<f8").data)
     return digest.hexdigest()

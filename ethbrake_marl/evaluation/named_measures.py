@@ -92,6 +92,8 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
 
 
 def _called(name: str) -> list[Measure]:
+    if name in MEASURES and name in TERMS:
+        raise AlreadyExists(f"measure {name!r}: a measure and a term of the reward have this name; rename one of them")
     if name in MEASURES:
         return [MEASURES[each] for each in MEASURES.load(name)]
     if name in _REWARDED:

@@ -66,7 +66,7 @@ def write_results(
     ``name``: other name of the first file. ``more``: plain data that every object gets, such as settings. Raises
     ``AlreadyExists`` if a file exists and ``force`` is false, and ``MissingExtra`` for Parquet without pyarrow.
     """
-    target, objects = Path(folder), [{**each, **(more or {})} for each in table.to_json()]
+    target, objects = Path(folder).expanduser(), [{**each, **(more or {})} for each in table.to_json()]
     written = [check_target(target / name, force=force)]
     if result is not None and rows is not None:
         file = check_target(target / f"{WORLDS}.{rows}", force=force)
@@ -91,7 +91,8 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
     Truth values are 1 and 0, a missing value is empty. Raises the errors of ``write_results``.
     """
     table = {name: each.astype(np.int64) if each.dtype == np.bool_ else each for name, each in result.arrays().items()}
-    ending = Path(path).suffix.lower()
+    path = Path(path).expanduser()
+    ending = path.suffix.lower()
     if ending == ".parquet":
         with naming_extras():
             import pyarrow
@@ -117,7 +118,7 @@ def read_result(path: str | Path) -> Saved:
 
     Raises ``InvalidInput``, in one line, for another file, and for one that was edited or damaged.
     """
-    file = Path(path)
+    file = Path(path).expanduser()
     try:
         content = parse_strict_json(read_plain(file, MOST_BYTES))
     except ValueError as error:

@@ -31,7 +31,7 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
     SHA-256 is recorded if it exists. Raises ``InvalidInput`` if the Python file is missing, raises an error (the
     message gives the line number), has changed since it ran, or does not define ``name``.
     """
-    _, module = _run_file(Path(path), f"file {path!r}")
+    _, module = _run_file(Path(path).expanduser(), f"file {path!r}")
     if not hasattr(module, name):
         raise InvalidInput(
             f"file {path!r}: does not define {name!r}; write FILE.py:NAME with a name that the file defines"

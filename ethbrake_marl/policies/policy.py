@@ -17,7 +17,6 @@ from safetensors import SafetensorError
 
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.files.arrays import ArrayRow, check_arrays, safetensors_headers
 from ethbrake_marl.files.model import first_mistake
 from ethbrake_marl.files.store import new_folder, write_file
 from ethbrake_marl.policies.actor import Actor
@@ -93,7 +92,7 @@ class Policy:
         With ``replace`` an existing folder is deleted once the new one is written.
         """
         manifest = self.manifest.model_copy(update={"manifest_sha256": _own_sha256(self.manifest)})
-        with new_folder(Path(folder), replace=replace) as partial:
+        with new_folder(Path(folder).expanduser(), replace=replace) as partial:
             write_file(partial / WEIGHTS, serialised(self.tensors))
             write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
 
@@ -120,14 +119,19 @@ def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
 
     Raises ``ValueError`` for a tensor whose name or shape is not the network's, or an entry that is not finite.
     """
-    check_arrays(
-        safetensors_headers(data), [ArrayRow(name, "F32", shape) for name, shape in network.tensors.items()], "tensor"
-    )
     try:
         tensors = safetensors.numpy.load(data)
-    except SafetensorError as error:
+    except (SafetensorError, KeyError, TypeError) as error:  # a damaged file, a type that numpy has not
         raise ValueError(f"not a safetensors file ({error})") from None
+    wanted = network.tensors
+    for name in sorted(wanted.keys() ^ tensors.keys()):
+        raise ValueError(f"tensor {name!r}: {'is missing' if name in wanted else 'must not be in this file'}")
     for name, tensor in tensors.items():
+        if tensor.dtype != np.float32 or tensor.shape != wanted[name]:
+            raise ValueError(
+                f"tensor {name!r} has type {tensor.dtype} and shape {list(tensor.shape)}; must have type float32 and"
+                f" shape {list(wanted[name])}"
+            )
         if not np.isfinite(tensor).all():
             raise ValueError(f"tensor {name!r}: contains a number that is not finite")
         tensor.setflags(write=False)

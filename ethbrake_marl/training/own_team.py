@@ -20,7 +20,8 @@ from ethbrake_marl.training.algorithm import ACTIVATIONS
 
 CONTRACT = (
     "must have the attributes mean, an nn.Sequential of linear layers with ReLU (or with Tanh) between them, from the"
-    " observation to one action, and log_std, [1]"
+    " observation to one action, and log_std, [1]; any other network drives without being saved, by"
+    " eb.policy_agent(network)"
 )
 
 

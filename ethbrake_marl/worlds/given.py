@@ -12,8 +12,10 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import suggestion
 from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.checks import LEAST_WEIGHT
 from ethbrake_marl.worlds.derived import obstacle_gap, world_values
+from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.roles import deceleration_of
 from ethbrake_marl.worlds.rules import OPTIONAL, RECORDING, RULES, USUAL, Entry, table_columns
 from ethbrake_marl.worlds.sampling import state_of
@@ -41,14 +43,14 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
     return _worlds(scenario, columns, where)
 
 
-def worlds_from_table(scenario: Scenario, columns: Any) -> State:
+def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """Return worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
     ``columns`` may also be a pandas or polars data frame, or a pyarrow table. Rows are paired by position. Gaps and
     speeds are needed; any other column of ``given_columns`` may follow. What has no column has the scenario's value,
     which must be fixed. Raises ``InvalidInput`` with column and row (from 0).
     """
-    where = "initial states"
+    scenario, where = load_scenario(scenario), "initial states"
     names = getattr(columns, "column_names", None) or getattr(columns, "columns", columns)  # of pyarrow, or a frame
     if not hasattr(columns, "__getitem__") or isinstance(columns, str | Sequence):
         raise InvalidInput(
@@ -70,12 +72,12 @@ def worlds_from_table(scenario: Scenario, columns: Any) -> State:
     return _worlds(scenario, dict(zip(entries, arrays, strict=True)), where, lambda row: f", row {row}")
 
 
-def read_worlds(scenario: Scenario, path: str | Path) -> State:
+def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
     """Return the worlds of a CSV file with a header, with the columns of ``worlds_from_table``.
 
     Raises ``InvalidInput`` with file, line and column.
     """
-    file = CsvFile.read(Path(path).expanduser())
+    scenario, file = load_scenario(scenario), CsvFile.read(Path(path).expanduser())
     entries = _entries(file.header, scenario, f"{file.path}, line 1")
     table = np.array(file.cells(file.header), np.float64)
     columns = dict(zip(entries, table.T, strict=True))

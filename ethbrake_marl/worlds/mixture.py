@@ -35,11 +35,15 @@ class Member(Part):
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a scenario file with other values; a new way to declare gaps replaces the old way."""
+    """Return the content of a scenario file with other values; a new way to declare gaps replaces the old way.
+
+    A key that becomes None is left out.
+    """
     old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
     if "speeds_mps" in changes:
         old.add("speed_deviations_mps")
-    return {**{key: value for key, value in content.items() if key not in old}, **changes}
+    kept = {key: value for key, value in content.items() if key not in old}
+    return {key: value for key, value in {**kept, **changes}.items() if value is not None}
 
 
 def build_members(

@@ -337,6 +337,7 @@ class Scenario(Part):
         """Return the scenario with other values: ``replace(mass_t=2.0)``, in each member if it is a mixture.
 
         A new way to declare gaps, speeds or an obstacle (``time_gaps_s``) takes the place of the old one (``gaps_m``).
+        A key that becomes None has its default again.
         """
         return Scenario(**changed_content(self.declared(), changes))
 

@@ -1,16 +1,15 @@
 """``ethbrake doctor``: what it finds wrong, what it compiles."""
 
-import dataclasses
 from unittest.mock import Mock
 
 import pytest
 from packaging.requirements import Requirement
 
+from ethbrake_marl.agents import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
-from ethbrake_marl.first_edition.agents.e_v2x_bm import pairwise
-from ethbrake_marl.first_edition.physics import advance as advance_module
-from ethbrake_marl.first_edition.scenario import catalogue
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.worlds import catalogue
 from tests.fixtures.commands import Command, told_json
 
 
@@ -51,19 +50,15 @@ def test_dependencies__too_old_missing_and_untested_ones_are_told(monkeypatch) -
 
 
 def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings(monkeypatch) -> None:
-    exact, optimum = advance_module.advance, pairwise.optimise_pairwise
+    exact, optimum = State.harm, pairwise.pairwise
 
-    def doubled(*args, **kwargs):
-        worlds, impacts = exact(*args, **kwargs)
-        return worlds, dataclasses.replace(impacts, total_harm=2.0 * impacts.total_harm)
-
-    def shifted(worlds, vehicle):
-        best = optimum(worlds, vehicle)
+    def shifted(alert, body):
+        best = optimum(alert, body)
         return best._replace(deceleration_mps2=best.deceleration_mps2 + 1e-4)
 
-    monkeypatch.setattr(pairwise, "optimise_pairwise", shifted)
+    monkeypatch.setattr(pairwise, "pairwise", shifted)
     assert not found("baseline")[0]
-    monkeypatch.setattr(advance_module, "advance", doubled)
+    monkeypatch.setattr(State, "harm", lambda state, count: 2.0 * exact(state, count))
     ok, told = found("physics")
     assert not ok and "harm 40 (exact: 20)" in told
     monkeypatch.setattr(catalogue, "list_scenarios", Mock(side_effect=OSError("gone")))

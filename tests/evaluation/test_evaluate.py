@@ -140,6 +140,11 @@ def test_term_of_ones_own__is_summed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 3.0 < result["moving_1"][0] <= 3.8
     with refused("already in use", AlreadyExists):
         register_measure("moving", doc(lambda game, alert, last: last.time_s))
+    monkeypatch.setattr(MEASURES, "loaded", dict(MEASURES.loaded))
+    register_measure("still", doc(lambda game, alert, last: last.time_s))
+    register_term("still", doc(lambda before, step, after: step.time_step_s * ~after.collided))
+    with refused("measure 'still': a measure and a term of the reward have this name", AlreadyExists):
+        measures_called("still")
 
 
 def test_names_of_measures() -> None:
@@ -263,7 +268,14 @@ def test_identity__changes_with_worlds_and_scenario_alone() -> None:
     assert one == again and one["worlds_sha256"] != other["worlds_sha256"]
     assert one["scenario_sha256"] == other["scenario_sha256"] and len(one["physics_digest"]) == 16
     assert {"python", "ethbrake-marl", "numba", "numpy"} <= one["versions"].keys()
-    slow = game_of("paper-random")[0].replace(horizon_s=5.0)
+    scenario, game = game_of("paper-random")
+    drawn = scenario.draw(5, 7)
+    listed, given = (
+        evaluate(each, teams(GENTLE), game).about
+        for each in (drawn, drawn.worlds._replace(clock=0 * drawn.worlds.clock))
+    )
+    assert listed["worlds_sha256"] == given["worlds_sha256"]
+    slow = scenario.replace(horizon_s=5.0)
     assert evaluated(slow.declared(), 5).about["scenario_sha256"] != one["scenario_sha256"]
 
 

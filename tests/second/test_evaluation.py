@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.evaluation import statistics as new

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 import ethbrake_marl.first_edition.scenario as first
 from ethbrake_marl.first_edition.agents.driving import script_agents
 from ethbrake_marl.first_edition.physics.messages import Messages

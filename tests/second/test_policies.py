@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ethbrake_marl as eb
+import ethbrake_marl.first_edition as eb
 from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.observe import View

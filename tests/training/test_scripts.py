@@ -132,11 +132,17 @@ def agent_of(actor: OwnActor) -> eb.Agent:
     [
         (
             {"vehicle_2": torch.nn.Linear(27, 1)},
-            r"actor of vehicle_2 = Linear: must have mean, .*policy_agent\(network\)",
+            r"actor of vehicle_2, a Linear, must have the attributes mean, .*policy_agent\(network\)",
         ),
-        ({"vehicle_2": OwnActor(torch.nn.Sigmoid())}, "must have mean, an nn.Sequential of linear layers with ReLU"),
-        ({"vehicle_3": OwnActor(torch.nn.ReLU())}, "actors of vehicle_3; must be those of vehicle_2"),
-        ({}, "must be those of vehicle_2"),
+        (
+            {"vehicle_2": OwnActor(torch.nn.Sigmoid())},
+            "must have the attributes mean, an nn.Sequential of linear layers with ReLU",
+        ),
+        (
+            {"vehicle_3": OwnActor(torch.nn.ReLU())},
+            "actors of vehicle_3; must have one of each learner of the environment, vehicle_2",
+        ),
+        ({}, "actors of nobody; must have one of each learner"),
     ],
 )
 def test_save_team__names_what_an_actor_must_be(actors: dict[str, Any], message: str, tmp_path: Path) -> None:

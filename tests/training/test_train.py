@@ -58,7 +58,7 @@ def test_train__leaves_a_folder_whose_policy_is_the_best_on_the_list(tmp_path: P
     assert policy.manifest.learners == ("vehicle_2",) and policy.manifest.seeds == {"training": 0, "evaluation": 7}
 
     scenario, game = game_of("paper-random")
-    assert result.agent == f"ppo@{run}"
+    assert result.agent == f"policy@{run}"
     ended = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent), scenario))
     assert ended.harm("first").mean() == pytest.approx(min(harm), rel=1e-12)
 
