@@ -23,8 +23,6 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 pytest_plugins = [
     f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "evaluation", "policies", "registered")
 ]
-if (Path(__file__).parent / "extensions" / "proofs").exists():
-    pytest_plugins.append("tests.extensions.proofs.remembered")
 
 # Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
 typer.main.get_command_from_info = functools.cache(typer.main.get_command_from_info)

@@ -12,31 +12,26 @@ import shlex
 import shutil
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.search.best_harm import fold_episodes, search_list, task_problem
-from ethbrake_marl.extensions.search.limits import Unproven, prove, unproven_because
-from ethbrake_marl.extensions.search.regret import Between
-from ethbrake_marl.extensions.search.shipped import shipped_tables
-from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
+from ethbrake_marl.extensions.search.best_harm import lowered, search_list
+from ethbrake_marl.extensions.search.pricing import COUNTS, problem_of
+from ethbrake_marl.extensions.search.tables import BestHarmTable, shipped_tables
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
-from ethbrake_marl.first_edition.agents.spec import split_specs
-from ethbrake_marl.first_edition.evaluation.identity import result_identity
-from ethbrake_marl.first_edition.evaluation.lineup import make_agents
-from ethbrake_marl.first_edition.evaluation.trial import load_runnable
-from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
-from ethbrake_marl.first_edition.physics.left_out import leaving_out_failed
-from ethbrake_marl.first_edition.physics.state import Ints, Worlds
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.scenario.task import Task
-from ethbrake_marl.first_edition.training.settings import read_settings
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.names import make_teams, open_game
+from ethbrake_marl.worlds.catalogue import load_scenario
+
+NO_HARM = 1e-3  # less total harm (m2/s2), an impact at 0.03 m/s, counts as next to none
 
 
 def main(words: list[str]) -> None:
@@ -47,7 +42,7 @@ def main(words: list[str]) -> None:
     add("--scenario", default="paper-random")
     add("--episodes", type=int, default=10_000, help="worlds of the list")
     add("--seed", type=int, default=7, help="seed of the list")
-    add("--harm-count", choices=HARM_COUNTS, help="harm to minimise; default: both")
+    add("--harm-count", choices=COUNTS, help="harm to minimise; default: both")
     add("--vehicles", metavar="A,B,...", help="vehicles to control together; default: the learners")
     add("--budget", type=int, default=100_000, help="candidate profiles per world and count")
     add("--search-seed", type=int, default=0)
@@ -55,14 +50,15 @@ def main(words: list[str]) -> None:
     add("--start", type=Path, metavar="FILE.npz", help="a table to start from; no world gets more harm")
     add("--agents", default="", metavar="A,B,...", help="agents to try after the search; less harm counts")
     add("--output", type=Path, metavar="FILE.npz", help="the table to write")
-    add("--set", action="append", metavar="KEY=VALUE", help="a changed value of the scenario; repeatable")
     given = parser.parse_args(words)
     if given.shipped:
-        print(shipped_bounds()[1].markdown())
+        print(shipped_bounds(shipped_tables()).markdown())
         return
-    table, figures = search(given, " ".join(["docs/studies/best_harm.py", shlex.join(words)]))
-    for name, value in figures.items():
-        print(f"{name:36} {f'{value:.4f}' if isinstance(value, float) else value}")
+    table = search(given, " ".join(["docs/studies/best_harm.py", shlex.join(words)]))
+    for key, value in ((key, value) for key, value in table.header.items() if key != "after"):
+        print(f"{key:28} {value}")
+    for count, harm in table.harm.items():
+        print(f"{f'best known harm, {count}':28} {harm.mean():.4f} m2/s2, {(harm == 0.0).mean():.1%} of worlds without")
     if given.output is not None:
         table.save(given.output)
         shutil.rmtree(parts_beside(given.output))
@@ -74,121 +70,73 @@ def parts_beside(output: Path) -> Path:
     return output.with_name(f".{output.name}.parts")
 
 
-def search(given: argparse.Namespace, command: str) -> tuple[BestHarmTable, dict[str, object]]:
-    """Return the table that the arguments ask for, and its mean harms and proven values by name."""
+def search(given: argparse.Namespace, command: str) -> BestHarmTable:
+    """Return the table that the arguments ask for."""
     if given.output is not None:
         check_target(given.output)
-    chosen = load_runnable(given.scenario, read_settings(given.set).scenario)
-    names = None if given.vehicles is None else [name.strip() for name in given.vehicles.split(",")]
-    controlled = None if names is None else chosen.with_learners(names).learners
-    if controlled is None and not chosen.learners:
-        raise InvalidInput(f"scenario {chosen.name!r} has no learner; give vehicles to control: --vehicles vehicle_2")
-    sample = chosen.sample(given.episodes, given.seed)
-    counts = HARM_COUNTS if given.harm_count is None else (given.harm_count,)
-    specs = [spec.strip() for spec in split_specs(given.agents)] if given.agents else []
-    if specs and (len(chosen.learners) != 1 or controlled not in (None, chosen.learners)):
-        raise InvalidInput("--agents need a scenario with exactly one learner, and no --vehicles")
-    lineups = {each: make_agents(specs, chosen, harm_count=each) for each in counts}
+    scenario, game = open_game(given.scenario, given.vehicles and given.vehicles.split(","))
+    if not scenario.learners:
+        raise InvalidInput(f"scenario {scenario.name!r} has no learner; give vehicles to control: --vehicles vehicle_2")
+    alert = scenario.sample(given.episodes, seed=given.seed)
+    counts = COUNTS if given.harm_count is None else (given.harm_count,)
+    teams = {count: make_teams(given.agents, scenario, harm_count=count) if given.agents else {} for count in counts}
     table = search_list(
-        chosen, sample, chunks=None if given.output is None else parts_beside(given.output), counts=counts,
-        vehicles=controlled, budget=given.budget, seed=given.search_seed, threads=given.threads,
+        game, alert, chunks=None if given.output is None else parts_beside(given.output), counts=counts,
+        budget=given.budget, seed=given.search_seed, threads=given.threads,
         known=None if given.start is None else BestHarmTable.load(given.start),
     )  # fmt: skip
-    for name in lineups[counts[0]]:
-        table = fold_episodes(table, chosen, sample.worlds, name, {each: lineups[each][name] for each in counts})
+    for name in teams[counts[0]]:
+        table = lowered(table, game, alert, {count: teams[count][name] for count in counts}, name)
     header = {**table.header, "episodes": given.episodes, "list_seed": given.seed, "command": command}
-    table = replace(table, header=header)
-    figures: dict[str, object] = {key: value for key, value in header.items() if key != "after"}
-    for each, best in table.best.items():
-        counted = "first_impact" if each == "first" else "total"
-        figures[f"best_known_{counted}_harm"] = float(best.harm.mean())
-        figures["harmless_rate"] = float((best.harm == 0.0).mean())
-    proven = proven_of_table(sample.worlds, Task(chosen, controlled or chosen.learners), table)
-    if proven is not None:
-        inside = {f"between_{name}": value for name, value in (proven.pop("between") or {}).items()}
-        figures |= {name: value for name, value in {**proven, **inside}.items() if value is not None}
-    return table, figures
+    return BestHarmTable(table.identity, table.harm, table.profiles, header)
 
 
-# The proven bounds of a list of worlds, beside the least harm known there.
-#
 # *Contact proven* is not *impact proven*. In the worlds between the two, every command leads to contact, but perhaps
 # not to an impact. Either leaning without an impact is possible there, or the proof is loose. The harm of the best
 # known profiles in these worlds shows which: almost no harm, or much harm.
 
 
-def proven_of_table(worlds: Worlds, task: Task, table: BestHarmTable) -> dict[str, Any] | None:
-    """Return what is proven about the worlds of a list; None if no harm is proven.
-
-    The result has the mean proven harm (m2/s2, valid for both counts), the shares of worlds with proven contact and
-    with proven impact, and ``Between``, which uses the least harms of the table. Undecided values are None. Worlds that
-    cannot be advanced are left out.
-    """
-
-    def of(rows: Ints) -> dict[str, Any] | None:
-        some = worlds.take(rows)
-        proof, identity = prove(some, task), task_problem(some, task).identity
-        if isinstance(proof, Unproven) or proof.harm is None or proof.impact is None:
-            return None
-        known = (table.harm(identity, harm_count) for harm_count in HARM_COUNTS)
-        contact, impact = proof.contact, proof.impact
-        return {
-            "proven_harm": float(proof.harm.mean()),
-            "contact_proven_rate": None if contact is None else float(contact.mean()),
-            "impact_proven_rate": float(impact.mean()),
-            "between": None if contact is None else asdict(Between.of(contact, impact, *known)),
-        }
-
-    return leaving_out_failed(of, np.arange(worlds.n))[0]
+def proven(game: Game, alert: State, first: Floats, total: Floats) -> list[Any]:
+    """Return mean proven harm, rates of proven contact and impact, and of worlds between; and what is known there."""
+    try:
+        bound, verdict = proven_harm(game, alert, alert), avoidable(game, alert, alert)
+    except InvalidInput:
+        return [None] * 6
+    assert isinstance(bound, dict) and isinstance(verdict, dict)
+    between = ~verdict[""] & ~bound["impact"]
+    there = [float(first[between].mean()), float((total[between] < NO_HARM).mean())] if between.any() else [None, None]
+    rates = (float(each.mean()) for each in (~verdict[""], bound["impact"], between))
+    return [float(bound[""].mean()), *rates, *there]
 
 
-def shipped_bounds(tables: Iterable[BestHarmTable] | None = None) -> tuple[list[dict[str, Any]], Sheet]:
-    """Return best known harm, proven harm and gap of every shipped table, as plain data and as a sheet of means.
+def shipped_bounds(tables: Iterable[BestHarmTable]) -> Sheet:
+    """Return best known harm, proven harm and the gap of every table, as a sheet of means.
 
     gap = (best known harm - proven harm) / best known harm. The header of a table names a shipped scenario and a list
-    of its worlds. Raises ``InvalidInput`` if the table does not contain these worlds.
+    of its worlds. Raises ``InvalidInput`` if the table holds none of these worlds.
     """
     harm, share = partial(Column, digits=3), partial(Column, digits=1, scale=100.0, unit=" %")
     columns = (
-        "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"), harm("best known, total"),
-        share("gap"), share("contact proven"), share("impact proven"), share("between"),
-        harm("best known there, first"), share("next to none there"),
+        "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"),
+        harm("best known, total"), share("gap"), share("contact proven"),
+        share("impact proven"), share("between"), harm("best known there, first"),
+        share("next to none there"),
     )  # fmt: skip
-    plain, rows = [], []
-    for table in shipped_tables() if tables is None else tables:
+    rows = []
+    for table in tables:
         header = table.header
-        scenario = load_scenario(header["scenario"])
-        names, seed = tuple(header["vehicles"]), int(header["list_seed"])
-        task = Task(scenario, tuple(scenario.vehicle_names.index(name) for name in names))
-        sample = scenario.sample(int(header["episodes"]), seed)
-        table.check_holds_any(task_problem(sample.worlds, task).identity)
-        why = unproven_because(sample.worlds, task)
-        proven = None if why is not None else proven_of_table(sample.worlds, task, table)
-        known = {c: float(table.best[c].harm.mean()) if c in table.best else None for c in HARM_COUNTS}
-        gaps: dict[str, float | None] = dict.fromkeys(known)
-        for harm_count, best in known.items():
-            if proven is not None and best is not None:
-                gaps[harm_count] = 1.0 - proven["proven_harm"] / best if best > 0.0 else 0.0
-        plain.append({
-            **result_identity("best-harm", scenario, sample),
-            "scenario": scenario.name,
-            "vehicles": names,
-            "list_seed": seed,
-            "worlds": len(table.identity),
-            **{f"best_known_{harm_count}": best for harm_count, best in known.items()},
-            "proven": proven,
-            "nothing_proven_because": why,
-            **{f"gap_{harm_count}": gap for harm_count, gap in gaps.items()},
-        })  # fmt: skip
-        means = proven or {}
-        inside = means.get("between") or {}
+        scenario, game = open_game(load_scenario(header["scenario"]), header["vehicles"])
+        alert = scenario.sample(int(header["episodes"]), seed=int(header["list_seed"]))
+        table.check_holds_any(problem_of(game, alert).identity)
+        first, total = table.harm["first"], table.harm["total"]
+        least, *rates = proven(game, alert, first, total)
+        means = [float(np.mean(each)) for each in (first, total)]
+        gaps = [None if least is None else 1.0 - least / mean for mean in means]
         rows.append((
-            f"{scenario.name} (seed {seed}){f': {why}' if why else ''}", f"{len(table.identity):,}",
-            means.get("proven_harm"), known["first"], gaps["first"], known["total"], gaps["total"],
-            means.get("contact_proven_rate"), means.get("impact_proven_rate"),
-            inside.get("rate"), inside.get("mean_first"), inside.get("harmless_rate"),
+            f"{scenario.name} (seed {header['list_seed']})", f"{alert.n:,}", least, means[0], gaps[0], means[1],
+            gaps[1], *rates,
         ))  # fmt: skip
-    return plain, Sheet("", columns, rows)
+    return Sheet("", columns, rows)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ A kernel is a function on arrays of numbers, compiled by numba. Kernels use + - 
 without fast-math: a world has the same bits in every batch and on every processor.
 
 Numba keeps the machine code of a function, and does not notice when a function that it calls changes. The folder of the
-machine code is therefore named by the digest of all sources of kernels.
+machine code is therefore named by the digest of the core's kernels and of all kernels beside it.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).parents[1]
 SOURCES = ("motion", "episode")  # folders with the core's kernels
+_MARK = b"motion.compiling import"  # in every other file with kernels
 LEAST_FREE_BYTES = 50_000_000
 TEMPORARY = "ethbrake_marl-"
 
@@ -54,13 +55,15 @@ def large(function: Function) -> Function:
 
 @cache
 def folder_of(file: str) -> Path:
-    """Return the folder with the machine code of the kernels in ``file``.
+    """Return the folder with the machine code of the kernels in ``file``, which may call those of the files beside it.
 
     If the user's cache cannot be written, or its disk is full, this is a temporary folder, to which machine code that
     may only be read (a container's image) is copied. Warns if there is none to copy.
     """
     digest = hashlib.sha256()
-    for path in sorted({Path(file), *(path for name in SOURCES for path in (PACKAGE / name).glob("*.py"))}):
+    beside = {path for path in Path(file).parent.glob("*.py") if _MARK in path.read_bytes()}
+    core = {path for name in SOURCES for path in (PACKAGE / name).glob("*.py")}
+    for path in sorted({Path(file)} | beside | core):
         digest.update(path.name.encode() + path.read_bytes())
     kept, temporary = cache_home() / digest.hexdigest()[:16], _temporary() / digest.hexdigest()[:16]
     if _has_room(kept):

@@ -73,6 +73,8 @@ def test_machine_code__is_loaded_until_a_source_changes(place: Place) -> None:
     answer, other, loaded, warned = place.ask()
     assert (answer, loaded, warned) == (62.0, False, "")
     assert other != folder
+    (place.folder / "beside.py").write_text(KERNELS.format(factor=5.0))  # a kernel that it may call
+    assert place.ask()[1] != other
 
 
 def test_two_processes__may_compile_at_once(place: Place) -> None:

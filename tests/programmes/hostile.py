@@ -30,7 +30,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.search.best_harm import best_harm
-from ethbrake_marl.extensions.search.tables import BestHarmTable, table_bytes
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.names import open_game
 from ethbrake_marl.first_edition.policies.shipped import shipped_policies
 from ethbrake_marl.first_edition.scenario.tables import read_worlds
 from ethbrake_marl.first_edition.training.session import train
@@ -167,8 +168,8 @@ class Touch:
 @cache
 def good_table() -> bytes:
     """Return a valid table of best known harm, of three worlds."""
-    scenario = eb.load_scenario("paper-random")
-    return table_bytes(best_harm(scenario, scenario.sample(3, 7).worlds, budget=1, threads=1))
+    scenario, game = open_game("paper-random")
+    return best_harm(game, scenario.sample(3, seed=7), budget=1, threads=1).content()
 
 
 def tables() -> dict[str, bytes]:

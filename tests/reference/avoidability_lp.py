@@ -20,8 +20,8 @@ import numpy as np
 from scipy import sparse
 from scipy.optimize import linprog
 
-from ethbrake_marl.first_edition.physics.motion import solo_motion
-from ethbrake_marl.first_edition.physics.state import Floats, Worlds
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.motion.layout import LIMIT, Floats
 
 
 class LinearVerdict(NamedTuple):
@@ -32,22 +32,22 @@ class LinearVerdict(NamedTuple):
     margin_m: float  # the largest smallest gap, at the ends of steps
 
 
-def avoidable_by_lp(world: Worlds, controlled: Sequence[int], K: int) -> LinearVerdict:
+def avoidable_by_lp(world: State, controlled: Sequence[int], K: int) -> LinearVerdict:
     """Whether ``controlled`` vehicles (indices from 0) of one world can together avoid all contact, by ``K`` steps.
 
     The margin is off by at most ``h^2 max(a + a_u)`` as long as the best profile changes its command no more than six
     times; a verdict within that tolerance is not ``certain``. The horizon is the last standstill or latency of all,
     plus ``limit / a`` of each controlled vehicle. The world moves forward, and has no obstacle.
     """
-    vehicles, cars, speeds = world.vehicles, sorted(controlled), world.speeds_mps[0]
-    braking, driving = vehicles.braking_capacity_mps2[0], vehicles.driving_capacity_mps2[0]
-    limit = np.maximum(vehicles.speed_limit_mps[0], speeds)
-    onset = np.maximum(vehicles.latency_s[0] - world.time_s[0], 0.0)  # from now
+    cars, speeds = sorted(controlled), world.speeds_mps[0]
+    braking, driving = world.braking_capacity_mps2[0], world.driving_capacity_mps2[0]
+    limit = np.maximum(world.car[0, LIMIT, 1:], speeds)
+    onset = np.maximum(world.latency_s[0] - world.time_s[0], 0.0)  # from now
     horizon = np.max(onset + speeds / braking) + np.sum(limit[cars] / braking[cars])
     step = horizon / K
     time = step * np.arange(K + 1)
     start = -np.concatenate([[0.0], np.cumsum(world.gaps_m[0])])
-    alone = [start[i] + ways(speeds[i], -braking[i], onset[i], time) for i in range(world.N)]
+    alone = [start[i] + ways(speeds[i], braking[i], onset[i], time) for i in range(world.vehicles)]
 
     # The unknowns of a car are K + 1 positions, K + 1 speeds and K changes of speed; last of all comes m.
     columns = len(cars) * (3 * K + 2) + 1
@@ -64,7 +64,7 @@ def avoidable_by_lp(world: Worlds, controlled: Sequence[int], K: int) -> LinearV
     m = sparse.kron(np.ones((K + 1, 1)), sparse.eye_array(1, columns, k=columns - 1), format="csr")
     places = {i: sparse.eye_array(K + 1, columns, k=c * (3 * K + 2)).tocsr() for c, i in enumerate(cars)}
     rows, right, fixed = [], [], math.inf  # of gaps that can be changed: m - gap <= right; and of those that cannot
-    for p in range(world.N - 1):
+    for p in range(world.vehicles - 1):
         free = time > min((onset[i] for i in (p, p + 1) if i in cars), default=math.inf)
         fixed = min(fixed, np.min((alone[p] - alone[p + 1])[~free], initial=math.inf))
         gap = places.get(p, nothing) - places.get(p + 1, nothing)
@@ -80,6 +80,7 @@ def avoidable_by_lp(world: Worlds, controlled: Sequence[int], K: int) -> LinearV
     return LinearVerdict(margin >= 0.0, abs(margin) > step**2 * np.max(braking + driving), margin)
 
 
-def ways(speed: float, command: float, onset: float, time: Floats) -> Floats:
-    """How far a vehicle has come at each of the times if it follows one command from its onset on."""
-    return np.array([solo_motion(speed, command, onset, math.inf, t)[1] if t > 0.0 else 0.0 for t in time.tolist()])
+def ways(speed: float, braking: float, onset: float, time: Floats) -> Floats:
+    """How far a vehicle has come at each of the times if it coasts until its onset, then brakes to rest."""
+    braked = np.clip(time - onset, 0.0, speed / braking)
+    return np.minimum(time, onset) * speed + (speed - 0.5 * braking * braked) * braked

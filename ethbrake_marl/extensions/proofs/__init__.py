@@ -10,19 +10,18 @@ These arguments have the same meaning in all files, unless a docstring says othe
 vehicle, f the controlled vehicle and r the rear vehicle; v is a speed (m/s), a > 0 a braking capacity and u >= 0 a
 driving capacity (m/s2). Time 0 is the moment at which the controlled vehicle may act; all times are in s after time 0.
 
-- ``at``: state of one world at time 0, [LINE.WIDTH]; ``line.LINE`` says what each number is.
+- ``at``: one world at time 0, [COLUMNS]; ``line`` says what each number is.
 - ``kind``: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
 - ``time``: time of the contact.
 - ``early``, ``late``: earliest and latest time of the first contact.
-- ``soft``, ``hard``: smallest and largest closing speed of the first contact, m/s. ``closing`` is another name of
+- ``soft``, ``hard``: smallest and largest closing speed of the first contact (m/s). ``closing``: another name of
   ``hard``.
 - ``end``: end of the decision step in which the first contact happens; the command cannot change before ``end``.
-- ``lack``: smallest amount, m/s2, by which the command until ``end`` differs from the extreme command.
-- ``floor``: known lower bound on the harm of the pair that does not have the first contact, m2/s2.
-- ``best``: smallest harm that the search has reached so far, m2/s2.
-- ``enough``: lower bound on the harm that is proven in another way, m2/s2. A function returns 0 if the harm that it
+- ``lack``: smallest amount (m/s2) by which the command until ``end`` differs from the extreme command.
+- ``floor``: known lower bound on the harm of the pair that does not have the first contact (m2/s2).
+- ``best``: smallest harm that the search has reached so far (m2/s2).
+- ``enough``: lower bound on the harm that is proven in another way (m2/s2). A function returns 0 if the harm that it
   proves for some first contact is not above ``enough``.
-- ``plan``, ``other``: working memory for the motions of two vehicles, arrays from ``plans.empty_plan``; overwritten.
-- ``heap``: working memory for the search of ``branch_and_bound``, [CELLS, HEAP_WIDTH]: one row for each cell, which
-  here is a set of first contacts; overwritten.
+- ``cells``: memory for the search of ``branch_and_bound``, [CELLS, CELL_COLUMNS], overwritten; a row is a set of first
+  contacts.
 """

@@ -1,72 +1,66 @@
-"""Columns of the arrays that describe worlds in the proofs, and the motion of a front or rear vehicle that nothing
-pushes.
+"""One world as the proofs see it: the controlled vehicle and its two neighbours, in one row of numbers.
 
-``at`` is the state of one world: a row of such an array, [LINE.WIDTH]. Times are in s after the moment of this state.
+The columns of ``at`` count from the moment of the state: L is the front vehicle (leader), F the controlled vehicle
+(follower), R the rear vehicle; V is a speed (m/s), A a braking capacity and U a driving capacity (m/s2). A neighbour
+that is missing is infinitely far away.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
-from ethbrake_marl.first_edition.physics.jit import compiled
-from ethbrake_marl.first_edition.physics.motion import BOUND, solo_motion
-from ethbrake_marl.first_edition.physics.state import Floats
+import numpy as np
 
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.motion.compiling import kernel
+from ethbrake_marl.motion.drive import solo
+from ethbrake_marl.motion.impact import TOUCH_MPS
+from ethbrake_marl.motion.layout import BRAKING, DRIVING, FAR_M, GAP, LATENCY, LIMIT, MASS, SPEED, Floats
 
-class _Line(NamedTuple):
-    """Index of each column in the arrays that describe worlds at the moment at which the controlled vehicle may act.
+GAP_L, V_L, A_L, ONSET_L = range(4)  # gap to the front vehicle (m); ONSET: time from which a vehicle may act (s)
+V_F, A_F, U_F, LIMIT_F, ONSET_F = range(4, 9)  # LIMIT: speed up to which it drives (m/s)
+GAP_R, V_R, A_R, ONSET_R = range(9, 13)  # gap to the rear vehicle (m)
+FRONT_SHARE = 13  # m_l / (m_l + m_f), with the masses m
+REAR_SHARE = 14  # m_r / (m_f + m_r)
+BOUNCE = 15  # coefficient of restitution
+TIME_STEP = 16  # time between decisions, the first of which is now (s); 0: commands may change at any time
+COLUMNS = 17
 
-    L marks the front vehicle (leader), F the controlled vehicle (follower), R the rear vehicle. V is a speed (m/s), A a
-    braking capacity and U a driving capacity (m/s2).
-    """
+FRONT_FIRST, REAR_FIRST = 0.0, 1.0  # neighbour of the first contact; floats: numba compiles again for each integer
 
-    GAP_L: int = 0  # gap to the front vehicle, m
-    V_L: int = 1  # speed of the front vehicle, m/s
-    A_L: int = 2  # braking capacity of the front vehicle, m/s2
-    V_F: int = 3  # speed of the controlled vehicle, m/s
-    A_F: int = 4  # braking capacity of the controlled vehicle, m/s2
-    U_F: int = 5  # driving capacity of the controlled vehicle, m/s2
-    LIMIT_F: int = 6  # speed limit of the controlled vehicle, m/s
-    GAP_R: int = 7  # gap to the rear vehicle, m
-    V_R: int = 8  # speed of the rear vehicle, m/s
-    A_R: int = 9  # braking capacity of the rear vehicle, m/s2
-    ONSET_R: int = 10  # time from which on the rear vehicle brakes, s
-    FRONT_SHARE: int = 11  # m_l / (m_l + m_f), with the masses m
-    REAR_SHARE: int = 12  # m_r / (m_f + m_r), with the masses m
-    RESTITUTION: int = 13  # coefficient of restitution
-    TIME_STEP: int = 14  # time between decisions, s; the first decision is now. 0 if commands may change at any time
-    WIDTH: int = 15  # number of columns
-
-
-LINE = _Line()
-
-FRONT_FIRST, REAR_FIRST = 0, 1  # neighbour with which the controlled vehicle has its first contact
-
+AHEAD_M = 1e-9  # an overlap below this is no contact with the other neighbour
+TOUCHING_M = 1e-9  # a smaller gap counts as contact, because of rounding
+TOUCH_HARM = 2.0 * TOUCH_MPS * TOUCH_MPS  # largest harm of two contacts that are no impacts (m2/s2)
+LARGE = 1e6  # more than the harm of any impact (m2/s2)
 HALVINGS = 60
 
-AHEAD_M = 1e-9  # an overlap below this does not count as contact with the other neighbour
 
-
-@compiled
-def leader(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and travelled distance (m) of the front vehicle at ``time`` if no other vehicle pushes it."""
-    speed, way, _ = solo_motion(at[LINE.V_L], -at[LINE.A_L], 0.0, math.inf, time)
+@kernel
+def leader(at, time):
+    """Return speed (m/s) and way (m) of the front vehicle at ``time`` if nothing pushes it and it brakes from now."""
+    speed, way, _ = solo(at[V_L], -at[A_L], 0.0, math.inf, time)
     return speed, way
 
 
-@compiled
-def follower(at: Floats, time: float) -> tuple[float, float]:
-    """Return speed (m/s) and travelled distance (m) of the rear vehicle at ``time`` if no other vehicle pushes it."""
-    speed, way, _ = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, time)
+@kernel
+def follower(at, time):
+    """Return speed (m/s) and way (m) of the rear vehicle at ``time`` if nothing pushes it."""
+    speed, way, _ = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, time)
     return speed, way
 
 
-LARGE = 1e6  # m2/s2; more than the harm of any impact
-
-FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
-
-# largest harm of two contacts that do not count as impacts, m2/s2
-TOUCH_HARM = 2.0 * BOUND.TOUCH_SPEED_MPS * BOUND.TOUCH_SPEED_MPS
-
-TOUCHING_M = 1e-9  # a smaller gap counts as contact, because of rounding
+def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
+    """Return the worlds as the vehicle ``body`` (1: Vehicle 1) meets them, [n, COLUMNS]."""
+    line, car, at = state.line, state.car, np.zeros((state.n, COLUMNS))
+    onset = np.maximum(car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0)
+    at[:, [GAP_L, GAP_R]] = FAR_M
+    at[:, [V_F, A_F, U_F]] = np.stack([line[:, SPEED, body], car[:, BRAKING, body], car[:, DRIVING, body]], axis=1)
+    at[:, LIMIT_F], at[:, ONSET_F] = car[:, LIMIT, body], onset[:, body]
+    at[:, BOUNCE], at[:, TIME_STEP] = state.restitution, time_step_s
+    sides = [(body - 1, body - 1, GAP_L, FRONT_SHARE), (body + 1, body, GAP_R, REAR_SHARE)]
+    for other, pair, first, share in sides:
+        if 1 <= other <= state.vehicles:
+            columns = line[:, GAP, pair], line[:, SPEED, other], car[:, BRAKING, other], onset[:, other]
+            at[:, first : first + 4] = np.stack(columns, axis=1)
+            at[:, share] = car[:, MASS, other] / (car[:, MASS, other] + car[:, MASS, body])
+    return at

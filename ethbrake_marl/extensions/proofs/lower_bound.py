@@ -1,155 +1,188 @@
 """``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
 
-``proofs/__init__.py`` explains the arguments that functions share.
+docs/internals/proofs/lower-bound.md has the proof; ``proofs/__init__.py`` explains the arguments that functions share.
 """
 
 from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.episode.step import advance_worlds, failure
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.proofs.avoidability import avoidability, largest_behind, spare_gap
-from ethbrake_marl.extensions.proofs.branch_and_bound import CELLS, HEAP_WIDTH, least_harm
+from ethbrake_marl.extensions.proofs.avoidability import Avoidability, avoidability, largest_behind, spare_gap
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, least_harm
 from ethbrake_marl.extensions.proofs.followers import after
 from ethbrake_marl.extensions.proofs.line import (
-    BOUNDS,
-    COMBINED_BOUND,
-    FRONT_BOUND,
+    A_F,
+    A_L,
+    A_R,
     FRONT_FIRST,
+    GAP_L,
+    GAP_R,
     HALVINGS,
     LARGE,
-    LINE,
-    REAR_BOUND,
+    LIMIT_F,
+    ONSET_F,
+    ONSET_R,
     REAR_FIRST,
+    TIME_STEP,
     TOUCH_HARM,
     TOUCHING_M,
+    U_F,
+    V_F,
+    V_L,
+    V_R,
+    rows_of,
 )
 from ethbrake_marl.extensions.proofs.meetings import (
+    before_rear,
+    behind_leader,
     braking_to_rear,
+    driving_first,
     gentlest_front,
     meet_front,
     meet_rear,
+    rest_of_rear,
     stays_ahead,
     stays_behind,
 )
-from ethbrake_marl.extensions.proofs.onset import (
-    LEAST_PART,
-    LowerBound,
-    at_onset_of,
-    check_asked,
-    onset_states,
-    rounding,
-)
-from ethbrake_marl.extensions.proofs.plans import empty_plan, fill_braking, fill_drive_then_brake, walk
-from ethbrake_marl.first_edition.game.harm import HarmCount
-from ethbrake_marl.first_edition.physics.jit import by_parts, compiled
-from ethbrake_marl.first_edition.physics.motion import solo_motion
-from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.extensions.proofs.plans import braking, walk
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.drive import solo
+from ethbrake_marl.motion.layout import LIMIT, Bools, Floats, scratch_for
 
+LEAST_TIME_STEP_S = 1e-3  # shorter steps between decisions would take too long
+
+# Bounds are lowered by so many spacings of doubles at the largest squared speed of a world. A segment of motion or a
+# round of impacts changes a squared closing speed by at most 8 of them, and an episode has at most 500 of these.
+BOUND_EPS = 2.0**12
+EPS = 2.0**-52
+
+_AT_ONCE = 100  # worlds that a thread bounds together
 _GRAZE_S = 1e-3  # largest rounding error in the time of a contact at closing speed 0
-
 _PARTS = 8  # number of parts into which the times of soft contacts are divided
 
+FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 
-@compiled
-def rear_bound(at: Floats, plan: Floats, other: Floats) -> tuple[float, float]:
-    """Return the smallest squared closing speed (m2/s2) at the first contact of the rear pair, and the latest time (s)
-    of this contact.
 
-    If the controlled vehicle drives fully, the first contact of the rear pair happens exactly at the returned time with
-    the returned squared closing speed. The returned time is infinite if full drive avoids this contact.
-    """
-    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], math.inf, at[LINE.A_F])
-    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
-    _, time, squared = walk(
-        at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
-    )
+class LowerBound(NamedTuple):
+    """Proven lower bounds on the harm of each world; every array is [n], in m2/s2."""
+
+    harm: Floats  # no command does less
+    early: Floats  # harm before the controlled vehicle may act
+    front_pair: Floats  # bound of the front pair alone, after the early harm
+    rear_pair: Floats  # bound of the rear pair alone, after the early harm
+    combined: Floats  # bound of both pairs together; 0 if nothing is proven
+    contact: Avoidability  # can contact be avoided? The combined bound uses it
+
+    @property
+    def impact_proven(self) -> Bools:
+        """Whether every command certainly leads to an impact, [n]; False: none is proven, it may be unavoidable."""
+        return np.asarray(self.harm > 0.0)
+
+
+@kernel
+def front_bound(at):
+    """Return the smallest squared closing speed (m2/s2) at the front pair's first contact, and its latest time (s)."""
+    _, time, squared = behind_leader(at, braking(0.0, at[A_F]), at[V_F] / at[A_F])
+    if at[A_F] < at[A_L] and at[V_F] < at[V_L]:
+        squared = min(squared, 2.0 * (at[A_L] - at[A_F]) * at[GAP_L])
     return squared, time
 
 
-@compiled(apart=True)
-def is_first(kind: int, at: Floats, time: float, plan: Floats, other: Floats) -> bool:
-    """Return whether the gentlest first contact (smallest closing speed) with the neighbour ``kind`` at ``time`` comes
-    before any contact with the other neighbour.
+@kernel
+def rear_bound(at):
+    """Return the same of the rear pair. Full drive attains both; the time is infinite if it avoids the contact."""
+    _, time, squared = before_rear(at, driving_first(at, math.inf), rest_of_rear(at))
+    return squared, time
+
+
+@large
+def last_first(kind, at, first, last):
+    """Return the latest time (s), at most ``last``, at which a contact can come before any with the other neighbour.
+
+    By bisection, from ``first`` (s), at which it is possible. The later the contact in front, the shorter the vehicle
+    drives, so the rear vehicle comes nearer; the later the contact behind, the shorter it brakes, so it comes nearer to
+    the front vehicle.
     """
-    if kind == FRONT_FIRST:
-        return stays_ahead(at, gentlest_front(at, time)[1], time, plan, other)
-    return stays_behind(at, braking_to_rear(at, time), time, plan, other)
-
-
-@compiled(apart=True)
-def last_first(kind: int, at: Floats, first: float, last: float, plan: Floats, other: Floats) -> float:
-    """Return the latest time (s), at most ``last``, at which a contact with the neighbour ``kind`` can come before any
-    contact with the other neighbour.
-
-    The function finds this time by bisection, beginning with ``first`` (s), a time at which such a contact is possible.
-    The later the first contact, the nearer is the other neighbour. The later the contact with the front vehicle, the
-    shorter the controlled vehicle drives, so the rear vehicle comes nearer. The later the contact with the rear
-    vehicle, the shorter the controlled vehicle brakes, so the controlled vehicle comes nearer to the front vehicle.
-    """
-    if is_first(kind, at, last, plan, other):
-        return last
-    for _ in range(HALVINGS):
-        middle = 0.5 * (first + last)
-        if is_first(kind, at, middle, plan, other):
-            first = middle
+    time = last
+    for _ in range(HALVINGS + 1):
+        if kind == FRONT_FIRST:
+            is_first = stays_ahead(at, gentlest_front(at, time)[1], time)
         else:
-            last = middle
-    return last
+            is_first = stays_behind(at, braking_to_rear(at, time), time)
+        if is_first:
+            first = time
+        else:
+            last = time
+        if first == last:
+            break
+        time = 0.5 * (first + last)
+    return first
 
 
-@compiled(apart=True)
-def last_meeting(at: Floats, first: float, plan: Floats, other: Floats) -> tuple[float, float, bool]:
-    """Return the latest time (s) of a contact with the front vehicle, and the latest time (s) at which a contact with
-    the front vehicle can come before the rear vehicle arrives.
+@large
+def last_meeting(at, first):
+    """Return the latest time (s) of a contact with the front vehicle, and the latest one before the rear vehicle comes.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed. ``first`` is the earliest time (s) of a contact with the front vehicle.
     """
-    touches = spare_gap(at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F]) >= 0.0
-    last = meet_front(at, 0.0, plan, other)
+    touches = spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0
+    last = meet_front(at, 0.0)
     if touches:
-        last = largest_behind(
-            at[LINE.GAP_L], at[LINE.V_L], at[LINE.A_L], at[LINE.V_F], at[LINE.A_F], at[LINE.U_F], at[LINE.LIMIT_F]
-        )[1]
-    end = last_first(FRONT_FIRST, at, first, last, plan, other)
+        last = largest_behind(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])[1]
+    end = last_first(FRONT_FIRST, at, first, last)
     return last, end, touches and end == last
 
 
-@compiled(apart=True)
-def front_first(
-    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
-) -> float:
-    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the front vehicle or
-    with both neighbours at once.
-
-    In a contact of all three vehicles at once, the closing speeds of the two pairs add up to W, the closing speed of
-    the rear vehicle relative to the front vehicle. The closing speed of the front pair is at least the smallest closing
-    speed that is possible at the time of this contact. The result covers a contact of all three vehicles at a time t
-    only if a first contact with the front vehicle is possible at the time t.
+@large
+def soft_harm(kind, at, early, late, floor, best):
+    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late`` with any
+    closing speed.
     """
-    first = meet_front(at, math.inf, plan, other)
-    if (
-        first == math.inf and at[LINE.GAP_L] <= TOUCHING_M
-    ):  # the vehicle stands in contact with the leader, so the rear vehicle hits both at once
-        return min(best, rear_bound(at, plan, other)[0])
-    if first == math.inf or not stays_ahead(at, first, first, plan, other):
+    soft = 0.0
+    while soft * soft < best:
+        hard = soft + 0.02 * (1.0 + soft)
+        best = min(best, soft * soft + max(after(kind, at, early, late, hard, late, 0.0), floor))
+        soft = hard
+    return best
+
+
+@kernel
+def outer_contact(at):
+    """Return time (s) and squared closing speed (m2/s2) at which the rear vehicle would reach the front vehicle."""
+    rear = braking(at[ONSET_R], at[A_R])
+    return walk(at[GAP_L] + at[GAP_R], at[V_L], braking(0.0, at[A_L]), at[V_R], rear, math.inf)[1:]
+
+
+@large
+def front_first(at, floor, best, enough, cells):
+    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all at once.
+
+    In a contact of all three vehicles, the closing speeds of the two pairs add up to W, that of the rear vehicle
+    relative to the front vehicle, and the front pair's is at least the smallest that is possible at this time. It is
+    covered only at times at which a first contact with the front vehicle is possible.
+    """
+    first = meet_front(at, math.inf)
+    if first == math.inf and at[GAP_L] <= TOUCHING_M:
+        return min(best, rear_bound(at)[0])  # it stands in contact with the leader, so the rear vehicle hits both
+    if first == math.inf or not stays_ahead(at, first, first):
         return best
-    last, end, leans = last_meeting(at, first, plan, other)
-    best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, plan, other, heap)
+    last, end, leans = last_meeting(at, first)
+    best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, cells)
     if leans:
-        best = soft_harm(FRONT_FIRST, at, last, last, floor, best, plan, other)
-        stand = at[LINE.V_L] / at[LINE.A_L]
+        best = soft_harm(FRONT_FIRST, at, last, last, floor, best)
+        stand = at[V_L] / at[A_L]
         if last < stand:
-            best = soft_harm(FRONT_FIRST, at, stand, stand, floor, best, plan, other)
-    fill_braking(plan, 0.0, at[LINE.A_L])
-    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
-    _, time, squared = walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)
+            best = soft_harm(FRONT_FIRST, at, stand, stand, floor, best)
+    time, squared = outer_contact(at)
     if time == math.inf or (time > end + _GRAZE_S and not leans):
         return best
     least = gentlest_front(at, min(time, last))[0] if time > first else 0.0
@@ -158,198 +191,199 @@ def front_first(
     return min(best, front * front + rear * rear)
 
 
-@compiled(apart=True)
-def soft_harm(
-    kind: int, at: Floats, early: float, late: float, floor: float, best: float, plan: Floats, other: Floats
-) -> float:
-    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late`` with any
-    closing speed.
-    """
-    soft = 0.0
-    while soft * soft < best:
-        hard = soft + 0.02 * (1.0 + soft)
-        follows = max(after(kind, at, early, late, hard, late, 0.0, plan, other), floor)
-        best = min(best, soft * soft + follows)
-        soft = hard
-    return best
-
-
-@compiled(apart=True)
-def rear_first(
-    at: Floats, floor: float, best: float, enough: float, plan: Floats, other: Floats, heap: Floats
-) -> float:
+@large
+def rear_first(at, floor, best, enough, cells):
     """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle."""
-    high = max(at[LINE.V_F] / at[LINE.A_F], at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R])
-    first = meet_rear(at, high, plan, other)
-    if first == math.inf or not stays_behind(at, first, first, plan, other):
+    high = max(at[V_F] / at[A_F], rest_of_rear(at))
+    first = meet_rear(at, high)
+    if first == math.inf or not stays_behind(at, first, first):
         return best
-    last = meet_rear(at, 0.0, plan, other)
-    if last < math.inf:
-        end = last_first(REAR_FIRST, at, first, last, plan, other)
-        return least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
-    low, top = 0.0, high
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + top)
-        if meet_rear(at, middle, plan, other) < math.inf:
-            top = middle
-        else:
-            low = middle
-    last = meet_rear(at, top, plan, other)
-    end = last_first(REAR_FIRST, at, first, last, plan, other)
-    best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, plan, other, heap)
-    if end < last:
+    last, low, top = meet_rear(at, 0.0), 0.0, high
+    avoids = last == math.inf
+    if avoids:
+        for _ in range(HALVINGS):
+            middle = 0.5 * (low + top)
+            if meet_rear(at, middle) < math.inf:
+                top = middle
+            else:
+                low = middle
+        last = meet_rear(at, top)
+    end = last_first(REAR_FIRST, at, first, last)
+    best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, cells)
+    if not avoids or end < last:
         return best
-    late = max(last_soft(at, high, plan, other), last) + _GRAZE_S
+    late = max(last_soft(at, high), last) + _GRAZE_S
     part = (late - last) / _PARTS
     for k in range(_PARTS):
-        best = soft_harm(REAR_FIRST, at, last + k * part, last + (k + 1) * part, floor, best, plan, other)
+        best = soft_harm(REAR_FIRST, at, last + k * part, last + (k + 1) * part, floor, best)
     return best
 
 
-@compiled(apart=True)
-def last_soft(at: Floats, rest: float, plan: Floats, other: Floats) -> float:
+@large
+def last_soft(at, rest):
     """Return a time (s) after which no first contact with the rear vehicle is possible.
 
-    Until its first contact, the rear vehicle passes neither the front vehicle nor the controlled vehicle. Suppose that
-    the rear vehicle brakes harder than the controlled vehicle, by b (m/s2). If the rear vehicle already braked at the
-    time t seconds before the contact, the rear vehicle was faster at that time than the controlled vehicle by at least
-    ``b t`` (m/s). ``rest`` is the time (s) at which controlled and rear vehicle have both come to rest under full
-    braking.
+    Until its first contact, the rear vehicle passes neither vehicle. If it brakes harder than the controlled vehicle,
+    by b (m/s2), and already braked t seconds before the contact, it was then faster by at least ``b t`` (m/s). ``rest``
+    is the time (s) at which controlled and rear vehicle have both come to rest under full braking.
     """
-    fill_braking(plan, 0.0, at[LINE.A_L])
-    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
-    last = min(
-        max(rest, at[LINE.V_L] / at[LINE.A_L]),
-        walk(at[LINE.GAP_L] + at[LINE.GAP_R], at[LINE.V_L], plan, at[LINE.V_R], other, math.inf)[1],
-    )
-    if at[LINE.A_F] >= at[LINE.A_R]:
-        return float(last)
-    harder, onset, closing = at[LINE.A_R] - at[LINE.A_F], at[LINE.ONSET_R], at[LINE.V_R] - at[LINE.V_F]
-    gap = max(at[LINE.GAP_R] + (0.5 * at[LINE.U_F] * onset - closing) * onset, 0.0)
-    ahead = max(closing + at[LINE.A_F] * onset, 0.0)
-    return float(min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder))))
+    last = min(max(rest, at[V_L] / at[A_L]), outer_contact(at)[0])
+    if at[A_F] >= at[A_R]:
+        return last
+    harder, onset, closing = at[A_R] - at[A_F], at[ONSET_R], at[V_R] - at[V_F]
+    gap = max(at[GAP_R] + (0.5 * at[U_F] * onset - closing) * onset, 0.0)
+    ahead = max(closing + at[A_F] * onset, 0.0)
+    return min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder)))
 
 
-@compiled(apart=True)
-def last_rest(at: Floats) -> tuple[float, float]:
-    """Return the time (s) by which all harm that the combined bound counts has happened, and the time (s) at which the
-    rear vehicle comes to rest if it brakes fully and no other vehicle pushes it.
+@kernel
+def last_rest(at):
+    """Return the time (s) by which all harm that the combined bound counts has happened."""
+    stand = rest_of_rear(at)
+    way = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
+    room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
+    rest = at[ONSET_R] + at[V_R] / min(at[A_R], at[A_F])
+    return max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[A_F]))
+
+
+@large
+def combined_bound(at, until, front, rear, cells):
+    """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact, first in front or behind.
+
+    0 if some of the harm that it counts may come after the horizon ``until`` (s). ``front`` and ``rear`` are bounds on
+    the harm of each pair alone (m2/s2).
     """
-    stand = at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
-    way = solo_motion(at[LINE.V_R], -at[LINE.A_R], at[LINE.ONSET_R], math.inf, stand)[1]
-    room = at[LINE.GAP_L] + at[LINE.V_L] * at[LINE.V_L] / (2.0 * at[LINE.A_L]) + at[LINE.GAP_R] - way
-    rest = at[LINE.ONSET_R] + at[LINE.V_R] / min(at[LINE.A_R], at[LINE.A_F])
-    return max(rest, stand + math.sqrt(2.0 * max(room, 0.0) / at[LINE.A_F])), stand
-
-
-@compiled(apart=True)
-def combined_bound(
-    at: Floats, until: float, front: float, rear: float, plan: Floats, other: Floats, heap: Floats
-) -> float:
-    """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact.
-
-    The first contact may be with the front or the rear vehicle. The result is 0 if some of the harm that the bound
-    counts may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds on the harm of each pair
-    alone (m2/s2).
-    """
-    if not last_rest(at)[0] < until:
+    if not last_rest(at) < until:
         return 0.0
-    step, least = at[LINE.TIME_STEP], 0.0
+    step, least = at[TIME_STEP], 0.0
     for time_step in (0.0, step):  # a bound for all commands also holds for commands that change at decisions only
-        at[LINE.TIME_STEP] = time_step
-        best = front_first(at, rear, LARGE, front + rear, plan, other, heap)
-        best = rear_first(at, front, best, front + rear, plan, other, heap)
+        at[TIME_STEP] = time_step
+        best = front_first(at, rear, LARGE, front + rear, cells)
+        best = rear_first(at, front, best, front + rear, cells)
         least = max(least, best - TOUCH_HARM if best < LARGE else 0.0)
         if step <= 0.0:
             break
     return least
 
 
-@compiled
-def bound_worlds(
-    states: Floats, until: Floats, has_front: Bools, has_rear: Bools, unavoidable: Bools, out: Floats
-) -> None:
-    """Compute lower bounds on the harm of ``n`` worlds: for each pair alone, and for both pairs together.
+@large
+def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
+    """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2): of each pair alone, and of both together.
 
-    Args:
-        states: [n, LINE.WIDTH] worlds; ``line.LINE`` names the columns.
-        until: [n] horizon, s; later harm does not count.
-        has_front: [n] True if the controlled vehicle has a front vehicle and the next impact of this pair counts.
-        has_rear: [n] the same for the rear vehicle.
-        unavoidable: [n] True if contact is unavoidable; the combined bound is 0 in all other worlds.
-        out: [n, BOUNDS] output: the columns FRONT_BOUND, REAR_BOUND and COMBINED_BOUND, m2/s2.
-
+    ``rows`` [n, COLUMNS] at the start; later harm than ``until`` [n] (s) does not count. ``has_front`` and ``has_rear``
+    [n]: whether there is this neighbour and the pair's next impact counts. ``unavoidable`` [n]: contact is.
     """
-    plan, other, heap = empty_plan(), empty_plan(), np.empty((CELLS, HEAP_WIDTH))
-    for k in range(states.shape[0]):
-        front, rear = 0.0, 0.0
+    for k in range(len(out)):
+        for column in range(BOUNDS):
+            out[k, column] = 0.0
         if has_front[k]:
-            # least squared closing speed at the front pair's first contact, and the latest time of that contact
-            at = states[k]
-            fill_braking(plan, 0.0, at[LINE.A_L])
-            fill_braking(other, 0.0, at[LINE.A_F])
-            _, time, squared = walk(
-                at[LINE.GAP_L], at[LINE.V_L], plan, at[LINE.V_F], other, at[LINE.V_F] / at[LINE.A_F]
-            )
-            if at[LINE.A_F] < at[LINE.A_L] and at[LINE.V_F] < at[LINE.V_L]:
-                squared = min(squared, 2.0 * (at[LINE.A_L] - at[LINE.A_F]) * at[LINE.GAP_L])
-            front = squared if time < until[k] and squared > TOUCH_HARM else 0.0
+            squared, time = front_bound(rows[k])
+            out[k, FRONT_BOUND] = squared if time < until[k] and squared > TOUCH_HARM else 0.0
         if has_rear[k]:
-            squared, time = rear_bound(states[k], plan, other)
-            rear = squared if time < until[k] and squared > TOUCH_HARM else 0.0
-        out[k, FRONT_BOUND], out[k, REAR_BOUND], out[k, COMBINED_BOUND] = front, rear, 0.0
+            squared, time = rear_bound(rows[k])
+            out[k, REAR_BOUND] = squared if time < until[k] and squared > TOUCH_HARM else 0.0
         if unavoidable[k]:
-            out[k, COMBINED_BOUND] = combined_bound(states[k], until[k], front, rear, plan, other, heap)
+            out[k, COMBINED_BOUND] = combined_bound(rows[k], until[k], out[k, FRONT_BOUND], out[k, REAR_BOUND], cells)
 
 
 def lower_bound(
-    worlds: Worlds,
-    vehicle: int = 1,
-    *,
-    harm_count: HarmCount = "first",
-    horizon_s: float = 8.0,
-    scripts: Mapping[int, str] | None = None,
-    time_step_s: float | None = None,
+    state: State, body: int = 2, *, count: str = "first", horizon_s: float = 8.0, time_step_s: float | None = None
 ) -> LowerBound:
-    """Return a proven lower bound on the harm of every world, over all commands of one vehicle.
+    """Return a proven lower bound on the harm of every episode, over all commands of the vehicle ``body`` from now on.
 
-    The fields of the result satisfy ``harm = early + max((front_pair + rear_pair), combined)``. Each term of this
-    formula is lowered by the largest possible rounding error (``rounding``). ``combined`` is 0 in worlds in which
-    contact can be avoided. Harm that may come only after ``horizon_s`` counts as 0. The function covers the same lines
-    as ``avoidability``, without an obstacle ahead.
+    ``harm = early + max(front_pair + rear_pair, combined)``; each term is lowered by the largest possible rounding
+    error (``rounding``). ``early`` includes what has already happened. ``combined`` is 0 where contact can be avoided.
+    Harm that may come only after ``horizon_s`` counts as 0. Proven for the lines of ``avoidability``, without an
+    obstacle.
 
     Args:
-        worlds: the ``n`` worlds in their present state.
-        vehicle: index of the controlled vehicle, from 0.
-        harm_count: ``first`` or ``total``. With ``first``, only the first impact of each pair counts: if a pair has had
-            an impact before now, no later impact of this pair counts.
+        state: the n episodes now.
+        body: the controlled vehicle (1: Vehicle 1); all others brake fully.
+        count: ``first`` (of each pair only the first impact) or ``total``.
         horizon_s: time until which harm counts, s after the alert.
-        scripts: script of each vehicle that is not controlled, by index; only full_brake is allowed. None: all of them
-            brake fully.
-        time_step_s: time between two decisions, s. With a number, the bound is larger than with None, but it holds only
-            for commands that change at decisions: when the vehicle may act, and every ``time_step_s`` after that, as
-            for every agent. The computation then takes ten times as long. None: commands may change at any time.
+        time_step_s: time between two decisions (s), the first when the vehicle may act, as for every agent. The bound
+            is larger than with None, but holds only for commands that change at decisions, and takes ten times as long.
+            None: commands may change at any time.
 
-    Raises ``InvalidInput`` for lines that ``avoidability`` does not cover, for an unknown ``harm_count``, for a time
-    step below ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.
+    Raises ``InvalidInput`` for lines that ``avoidability`` does not cover, for an unknown count, for a time step below
+    ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.
 
     """
-    check_asked(harm_count, horizon_s, time_step_s)
-    if (ahead := np.isfinite(worlds.obstacle_gap_m)).any():
+    verdict = avoidability(state, body)
+    start = state.time_s + rows_of(state, body)[:, ONSET_F]
+    _check_asked(state, start, count, horizon_s, time_step_s)
+    now = _at_start(state, start)
+    counts = (now.speeds_mps[:, 1:] >= 0.0) & (now.speeds_mps[:, :-1] >= 0.0) & ((count == "total") | ~now.pair_hit)
+    none = np.zeros(state.n, np.bool_)
+    has_front = counts[:, body - 2] if body > 1 else none
+    has_rear = counts[:, body - 1] if body < state.vehicles else none
+    unavoidable = has_front & has_rear & (verdict.reason >= 2)
+    rows, until, out = rows_of(now, body, time_step_s or 0.0), horizon_s - start, np.empty((state.n, BOUNDS))
+
+    def bound(first: int) -> None:
+        part = slice(first, first + _AT_ONCE)
+        cells = np.empty((CELLS, CELL_COLUMNS))
+        bound_worlds(rows[part], until[part], has_front[part], has_rear[part], unavoidable[part], cells, out[part])
+
+    with ThreadPoolExecutor(os.cpu_count() or 1) as threads:
+        list(threads.map(bound, range(0, state.n, _AT_ONCE)))
+    parts = (now.harm(count), out[:, FRONT_BOUND], out[:, REAR_BOUND], out[:, COMBINED_BOUND])
+    early, front, rear, combined = (np.maximum(part - rounding(state, body), 0.0) for part in parts)
+    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
+
+
+def _check_asked(state: State, start: Floats, count: str, horizon_s: float, time_step_s: float | None) -> None:
+    if count not in ("first", "total"):
+        raise InvalidInput(f"lower_bound: count = {count!r}: must be 'first' or 'total'")
+    if not (isinstance(horizon_s, int | float) and (start <= horizon_s).all() and horizon_s < math.inf):
+        raise InvalidInput(
+            f"lower_bound: horizon_s = {horizon_s!r}: must be a finite number of at least {start.max():g} (s): by then"
+            " the controlled vehicle may act in every world"
+        )
+    if time_step_s is not None and not (
+        isinstance(time_step_s, int | float) and LEAST_TIME_STEP_S <= time_step_s < math.inf
+    ):
+        raise InvalidInput(
+            f"lower_bound: time_step_s = {time_step_s!r}: must be a finite number of at least {LEAST_TIME_STEP_S:g}"
+            " (s), or None"
+        )
+    if (ahead := np.isfinite(state.obstacle_gap_m)).any():
         raise InvalidInput(
             f"lower_bound: world {int(np.argmax(ahead))} has an obstacle ahead; the bound is proven without an obstacle"
         )
-    verdict = avoidability(worlds, vehicle, scripts=scripts)
-    at_onset, start, early, counts = at_onset_of(worlds, vehicle, harm_count, horizon_s)
-    none = np.zeros(worlds.n, dtype=np.bool_)
-    has_front = counts[:, vehicle - 1] if vehicle > 0 else none
-    has_rear = counts[:, vehicle] if vehicle < worlds.N - 1 else none
-    unavoidable = has_front & has_rear & (verdict.reason >= 2)
-    out = np.empty((worlds.n, BOUNDS))
-    states = onset_states(at_onset, vehicle, time_step_s)
-    arguments: tuple[Any, ...] = (states, horizon_s - start, has_front, has_rear, unavoidable, out)
-    threads = min(os.cpu_count() or 1, worlds.n // LEAST_PART + 1)
-    by_parts(lambda part: bound_worlds(*(array[part] for array in arguments)), worlds.n, threads)
-    parts = (early, *(out[:, column] for column in (FRONT_BOUND, REAR_BOUND, COMBINED_BOUND)))
-    early, front, rear, combined = (np.maximum(part - rounding(worlds, vehicle), 0.0) for part in parts)
-    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
+
+
+def _at_start(state: State, start: Floats) -> State:
+    """Return the episodes at the start, when the controlled vehicle may act; until then all brake fully."""
+    line, clock, wanted = state.line.copy(), state.clock.copy(), np.zeros(state.wanted.shape)
+    wanted[:, 1:] = -state.braking_capacity_mps2
+    failed = advance_worlds(line, state.car, state.time_s.copy(), start, wanted, scratch_for(line.shape[2]))
+    if failed >= 0:
+        raise failure(state, failed, state.time_s[failed], start[failed])
+    clock[:, TIME] = start
+    return state._replace(line=line, clock=clock)
+
+
+def rounding(state: State, body: int) -> Floats:
+    """Return the largest difference between a bound and the harm in the engine that rounding can cause, [n] m2/s2.
+
+    A squared closing speed is ``D = w^2 + 2 b g``, with closing speed w, closing acceleration b and gap g. Let ``V`` be
+    the largest speed in the line, ``G`` the sum of its gaps, ``A`` the largest closing acceleration and ``a`` the
+    weakest brakes. The term ``w^2`` of D is at most ``V^2``. No gap grows beyond ``G + V^2 / (2 a)``. Therefore all
+    terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
+
+    In a segment of motion, the computation rounds each speed twice and each gap five times. In a round of impacts,
+    rounding changes each speed by up to 8 eps of the largest speed. Rounding in one of them changes D by at most
+    8 eps S (eps = 2^-52). These errors add up and do not multiply, because the proofs compare a motion only with the
+    formulas for this same motion. ``BOUND_EPS`` allows for 500 segments and rounds of impacts. This is enough: an
+    episode of 8 s has 80 steps, and the computation of the bound itself rounds a few hundred times.
+
+    If the controlled vehicle may drive, V is at least its speed limit, and A includes its driving capacity.
+    """
+    driving = state.driving_capacity_mps2[:, body - 1]
+    limits = np.where(driving > 0.0, state.car[:, LIMIT, body], 0.0)
+    fastest = np.maximum(state.speeds_mps.max(axis=1), limits)
+    closing = state.braking_capacity_mps2.max(axis=1) + driving
+    weakest = state.braking_capacity_mps2.min(axis=1)
+    scale = fastest * fastest * (1.0 + closing / weakest) + 2.0 * closing * state.gaps_m.sum(axis=1)
+    return np.asarray(BOUND_EPS * EPS * scale)

@@ -1,43 +1,48 @@
-"""Compute the gentlest first contact (smallest closing speed) of the controlled vehicle with a neighbour at a given
-time.
+"""The gentlest first contact (smallest closing speed) of the controlled vehicle with a neighbour at a given time.
 
-Times are measured from the moment at which the controlled vehicle may act. The front vehicle already brakes at time 0.
-The rear vehicle coasts until its latency has elapsed, and then brakes. All speeds and gaps are at least 0.
-docs/internals/proofs/lower-bound.md has the proofs.
-
-``proofs/__init__.py`` explains the arguments that functions share. ``drive`` is how long (s) a vehicle drives before it
-brakes, and ``brake`` how long (s) a vehicle brakes before it drives.
+Times count from the moment at which the controlled vehicle may act. The front vehicle already brakes; the rear vehicle
+coasts until its latency has elapsed, then brakes. ``drive`` is how long (s) a vehicle drives before it brakes,
+``brake`` how long it brakes before it drives. docs/internals/proofs/lower-bound.md has the proofs.
 """
 
 from __future__ import annotations
 
 import math
 
-from ethbrake_marl.extensions.proofs.line import AHEAD_M, FRONT_FIRST, HALVINGS, LINE, follower, leader
-from ethbrake_marl.extensions.proofs.plans import (
-    fill_brake_then_drive,
-    fill_braking,
-    fill_drive_then_brake,
-    time_to_limit,
-    walk,
+from ethbrake_marl.extensions.proofs.line import (
+    A_F,
+    A_L,
+    A_R,
+    AHEAD_M,
+    FRONT_FIRST,
+    GAP_L,
+    GAP_R,
+    HALVINGS,
+    LIMIT_F,
+    ONSET_R,
+    U_F,
+    V_F,
+    V_L,
+    V_R,
+    follower,
+    leader,
 )
-from ethbrake_marl.first_edition.physics.jit import compiled
-from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.extensions.proofs.plans import brake_then_drive, braking, drive_then_brake, time_to_limit, walk
+from ethbrake_marl.motion.compiling import kernel, large
 
 _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speeds are lowered accordingly
 
 
-@compiled(apart=True)
-def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and how long (s) the
-    controlled vehicle drives before it brakes.
+@large
+def gentlest_front(at, time):
+    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and its ``drive``.
 
-    The controlled vehicle reaches the place of the contact at ``time`` with the smallest possible speed if it drives
-    first and then brakes.
+    The vehicle reaches the place of the contact at ``time`` with the smallest possible speed if it drives first and
+    then brakes.
     """
     v_l, way = leader(at, time)
-    place, v, u, a = at[LINE.GAP_L] + way, at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
-    cap = time_to_limit(v, u, at[LINE.LIMIT_F])
+    place, v, u, a = at[GAP_L] + way, at[V_F], at[U_F], at[A_F]
+    cap = time_to_limit(v, u, at[LIMIT_F])
     drive = u if cap > 0.0 else 0.0
     travelled = (v + 0.5 * drive * time) * time
     beyond = 0.5 * drive * max(time - cap, 0.0) * max(time - cap, 0.0)
@@ -52,30 +57,24 @@ def gentlest_front(at: Floats, time: float) -> tuple[float, float]:
     return max(top - a * brake - v_l, 0.0), time - brake
 
 
-@compiled
-def braked_then_driven(at: Floats, brake: float, time: float) -> tuple[float, float]:
-    """Return travelled distance (m) and speed (m/s) of the controlled vehicle at ``time`` if it brakes first and then
-    drives.
-
-    A vehicle that brakes to rest waits there until it drives.
-    """
-    v, u, a = at[LINE.V_F], at[LINE.U_F], at[LINE.A_F]
-    braking = min(brake, v / a)
+@kernel
+def braked_then_driven(at, brake, time):
+    """Return way (m) and speed (m/s) at ``time`` if the vehicle brakes first, at most to rest, and then drives."""
+    v, u, a = at[V_F], at[U_F], at[A_F]
+    braked = min(brake, v / a)
     slow = max(v - a * brake, 0.0)
-    cap = time_to_limit(slow, u, at[LINE.LIMIT_F])
+    cap = time_to_limit(slow, u, at[LIMIT_F])
     drive = u if cap > 0.0 else 0.0
     left = time - brake
     beyond = max(left - cap, 0.0)
-    way = (v - 0.5 * a * braking) * braking + (slow + 0.5 * drive * left) * left - 0.5 * drive * beyond * beyond
+    way = (v - 0.5 * a * braked) * braked + (slow + 0.5 * drive * left) * left - 0.5 * drive * beyond * beyond
     return way, slow + drive * (left - beyond)
 
 
-@compiled(apart=True)
-def braking_to_rear(at: Floats, time: float) -> float:
-    """Return how long (s) the controlled vehicle must brake before it drives, so that it has contact with the rear
-    vehicle at ``time``.
-    """
-    place = follower(at, time)[1] - at[LINE.GAP_R]
+@large
+def braking_to_rear(at, time):
+    """Return ``brake`` of the vehicle that has contact with the rear vehicle at ``time``."""
+    place = follower(at, time)[1] - at[GAP_R]
     low, high = 0.0, time
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
@@ -86,69 +85,69 @@ def braking_to_rear(at: Floats, time: float) -> float:
     return low
 
 
-@compiled(apart=True)
-def gentlest_rear(at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a contact with the rear vehicle at ``time``, and how long (s) the
-    controlled vehicle brakes before it drives.
+@large
+def gentlest(kind, at, time):
+    """Return the smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake``.
 
-    The controlled vehicle reaches the place of the contact at ``time`` with the largest possible speed if it brakes
-    first and then drives. The duration of the braking is returned as infinite if the vehicle reaches its speed limit by
-    ``time``.
+    The vehicle reaches the rear vehicle at ``time`` with the largest possible speed if it brakes first and then drives.
+    ``brake`` is infinite if it reaches its speed limit by then.
     """
+    if kind == FRONT_FIRST:
+        return gentlest_front(at, time)
     brake = braking_to_rear(at, time)
     speed = braked_then_driven(at, brake, time)[1]
-    return max(follower(at, time)[0] - speed, 0.0), brake if speed < at[LINE.LIMIT_F] else math.inf
+    return max(follower(at, time)[0] - speed, 0.0), brake if speed < at[LIMIT_F] else math.inf
 
 
-@compiled(apart=True)
-def gentlest(kind: int, at: Floats, time: float) -> tuple[float, float]:
-    """Return the smallest closing speed (m/s) of a first contact at ``time``, and how long (s) the controlled vehicle
-    drives or brakes first.
-    """
-    return gentlest_front(at, time) if kind == FRONT_FIRST else gentlest_rear(at, time)
+@kernel
+def behind_leader(at, plan, until):
+    """Walk the controlled vehicle with a plan behind the front vehicle."""
+    return walk(at[GAP_L], at[V_L], braking(0.0, at[A_L]), at[V_F], plan, until)
 
 
-@compiled(apart=True)
-def meet_front(at: Floats, drive: float, plan: Floats, other: Floats) -> float:
-    """Return the time (s) at which a controlled vehicle that drives first and then brakes has contact with the front
-    vehicle.
-
-    The result is infinite if there is no contact. If ``drive`` is infinite, the vehicle never brakes.
-    """
-    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
-    fill_braking(other, 0.0, at[LINE.A_L])
-    return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, math.inf)[1]
+@kernel
+def before_rear(at, plan, until):
+    """Walk the controlled vehicle with a plan ahead of the rear vehicle."""
+    return walk(at[GAP_R], at[V_F], plan, at[V_R], braking(at[ONSET_R], at[A_R]), until)
 
 
-@compiled(apart=True)
-def meet_rear(at: Floats, brake: float, plan: Floats, other: Floats) -> float:
-    """Return the time (s) at which a controlled vehicle that brakes first and then drives has contact with the rear
-    vehicle.
-
-    The result is infinite if there is no contact.
-    """
-    fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
-    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
-    return walk(
-        at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, at[LINE.ONSET_R] + at[LINE.V_R] / at[LINE.A_R]
-    )[1]
+@kernel
+def driving_first(at, drive):
+    """Return the plan of the controlled vehicle that drives first and then brakes."""
+    return drive_then_brake(at[V_F], at[U_F], at[LIMIT_F], drive, at[A_F])
 
 
-@compiled(apart=True)
-def stays_ahead(at: Floats, drive: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Return whether a controlled vehicle that drives first and then brakes avoids contact with the rear vehicle until
-    ``until`` (s).
-    """
-    fill_drive_then_brake(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], drive, at[LINE.A_F])
-    fill_braking(other, at[LINE.ONSET_R], at[LINE.A_R])
-    return walk(at[LINE.GAP_R], at[LINE.V_F], plan, at[LINE.V_R], other, until)[0] >= -AHEAD_M
+@kernel
+def braking_first(at, brake):
+    """Return the plan of the controlled vehicle that brakes first and then drives."""
+    return brake_then_drive(at[V_F], at[U_F], at[LIMIT_F], brake, at[A_F])
 
 
-@compiled(apart=True)
-def stays_behind(at: Floats, brake: float, until: float, plan: Floats, other: Floats) -> bool:
-    """Return whether a controlled vehicle that brakes first and then drives avoids contact with the front vehicle until
-    ``until`` (s).
-    """
-    fill_brake_then_drive(plan, at[LINE.V_F], at[LINE.U_F], at[LINE.LIMIT_F], brake, at[LINE.A_F])
-    fill_braking(other, 0.0, at[LINE.A_L])
-    return walk(at[LINE.GAP_L], at[LINE.V_L], other, at[LINE.V_F], plan, until)[0] >= -AHEAD_M
+@kernel
+def rest_of_rear(at):
+    """Return the time (s) at which the rear vehicle comes to rest if nothing pushes it."""
+    return at[ONSET_R] + at[V_R] / at[A_R]
+
+
+@large
+def meet_front(at, drive):
+    """Return when (s) a vehicle that drives first and then brakes meets the front vehicle; infinite: never."""
+    return behind_leader(at, driving_first(at, drive), math.inf)[1]
+
+
+@large
+def meet_rear(at, brake):
+    """Return when (s) a vehicle that brakes first and then drives meets the rear vehicle; infinite: never."""
+    return before_rear(at, braking_first(at, brake), rest_of_rear(at))[1]
+
+
+@large
+def stays_ahead(at, drive, until):
+    """Return whether a vehicle that drives first and then brakes avoids the rear vehicle until ``until`` (s)."""
+    return before_rear(at, driving_first(at, drive), until)[0] >= -AHEAD_M
+
+
+@large
+def stays_behind(at, brake, until):
+    """Return whether a vehicle that brakes first and then drives avoids the front vehicle until ``until`` (s)."""
+    return behind_leader(at, braking_first(at, brake), until)[0] >= -AHEAD_M

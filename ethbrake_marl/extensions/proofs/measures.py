@@ -1,0 +1,61 @@
+"""The measures ``avoidable`` and ``proven_harm``, which are asked for by name: a proof takes longer than an episode."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.measures import Given, Statistic
+from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.lower_bound import LowerBound, lower_bound
+from ethbrake_marl.motion.layout import BRAKING
+from ethbrake_marl.registry import Part
+
+
+def avoidable(game: Game, alert: State, last: State) -> Given:
+    """Whether some commands avoid all contact (proven), and if not, why (``early``, ``front``, ``rear``).
+
+    Of Vehicle 2 in a line of three (or of Vehicles 2 and 3 together), and of either of two; all others brake fully.
+    """
+    verdict = avoidability(alert, _controlled(game, alert, together=True))
+    return {"": verdict.avoidable, "reason": verdict.reason_name}
+
+
+_known: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: all agents drive the same ones
+
+
+def proven_harm(game: Game, alert: State, last: State) -> Given:
+    """Lower bound on the harm, in either count, of all commands that change at decisions; ``impact``: it is above 0."""
+    body, rules = _controlled(game, alert), game.rules
+    asked = np.array([body, rules.horizon_s, rules.time_step_s]).tobytes() + alert.line.tobytes() + alert.car.tobytes()
+    if asked not in _known:
+        bound = lower_bound(alert, body, horizon_s=rules.horizon_s, time_step_s=rules.time_step_s)
+        _known.clear()
+        _known[asked] = bound
+    return {"": _known[asked].harm, "impact": _known[asked].impact_proven}
+
+
+def _controlled(game: Game, alert: State, *, together: bool = False) -> int:
+    """Return the controlled vehicle, or 2 for Vehicles 2 and 3 together. Raises ``InvalidInput`` for any other team."""
+    learners = game.rules.learners.tolist()
+    others = [body for body in range(1, alert.vehicles + 1) if body not in learners]
+    if game.scripts or (alert.wanted[:, others] != -alert.car[:, BRAKING, others]).any():
+        raise InvalidInput(
+            "avoidable, proven_harm: a vehicle that does not learn does not brake fully; all others must"
+        )
+    if len(learners) != 1 and not (together and learners == [2, 3]):
+        names = ", ".join(f"vehicle_{body}" for body in learners)
+        raise InvalidInput(f"avoidable, proven_harm: {names} learn; the proofs cover one controlled vehicle")
+    return int(learners[0])
+
+
+AVOIDABLE = Part(avoidable, shown=(Statistic("avoidable_rate", "rate", "Avoidable", "Avoid-\nable"),))
+PROVEN_HARM = Part(
+    proven_harm, unit="m2/s2",
+    shown=(
+        Statistic("proven_harm", "mean", "Proven harm", "Proven\nharm"),
+        Statistic("impact_proven_rate", "rate", "Impact proven", "Impact\nproven", "impact"),
+    ),
+)  # fmt: skip
