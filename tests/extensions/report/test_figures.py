@@ -106,7 +106,7 @@ def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Compared) ->
     means = [searched.result[agent]["total_harm"].mean() for agent in searched.teams]
     assert [bar.get_width() for bar in axes.patches] == pytest.approx(means)
     best, marks = axes.lines
-    assert best.get_xdata()[0] == pytest.approx(searched.result["ppo"]["limits_best_known_total_harm"].mean())
+    assert best.get_xdata()[0] == pytest.approx(searched.result["ppo"]["best_known_total"].mean())
     assert marks.get_xdata() == pytest.approx(means) and legend(figure) == ["best known", "other test"]
 
 
@@ -115,7 +115,7 @@ def test_harm_above__shares_are_those_of_the_worlds(compared: Compared, searched
         axes = harm_above(one.result).axes[0]
         drawn, values = axes.lines[0], one.result["full_brake"]["first_impact_harm"]
         if label == "Regret":
-            values = values - one.result["full_brake"]["limits_best_known_first_impact_harm"]
+            values = values - one.result["full_brake"]["best_known_first"]
         assert drawn.get_ydata() == pytest.approx([np.mean(values > x) for x in drawn.get_xdata()])
         assert axes.get_xlabel().startswith(label)
 
