@@ -6,7 +6,8 @@ A *report* is what an extension adds: it says which measures it wants, and is gi
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -101,9 +102,12 @@ def run_experiment(
     """
     started, tell = time.monotonic(), on_progress or (lambda progress: None)
     shown: Report = report or Tables()
-    count, measures = recipe.reward.harm_count, tuple(name for name in shown.measures if name in MEASURES)
-    baselines = usable_baselines(scenario, count, list_seed, tell)
-    evaluate(scenario, baselines, episodes=1, seed=list_seed, harm_count=count, measures=measures)  # or refuse it now
+    count, several = recipe.reward.harm_count, len(scenario.learners) > 1
+    first = partial(evaluate, scenario, episodes=1, seed=list_seed, harm_count=count)
+    whole = partial(evaluate, scenario, FULL_BRAKE.name, episodes=episodes, seed=list_seed)
+    baselines = usable("baselines", TEAM_BASELINES if several else BASELINES, first, tell)
+    installed = [name for name in shown.measures if name in MEASURES]
+    measures = tuple(usable("measures", installed, lambda name: whole(measures=name), tell))
     trained = train(
         recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
     )
@@ -125,22 +129,18 @@ def run_experiment(
     return experiment, tables, where
 
 
-def usable_baselines(scenario: Scenario, harm_count: str, seed: int, tell: OnProgress) -> list[str]:
-    """Return the baselines that can drive in a scenario; why the others cannot is reported as progress.
-
-    Raises the errors of full braking.
-    """
-    baselines = TEAM_BASELINES if len(scenario.learners) > 1 else BASELINES
-    usable = []
-    for number, name in enumerate(baselines):
+def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
+    """Return the names that can be used; why others cannot is reported as progress. Raises what full braking raises."""
+    found = []
+    for number, name in enumerate(names):
         try:
-            evaluate(scenario, name, episodes=1, seed=seed, harm_count=harm_count)
-            usable.append(name)
+            use(name)
+            found.append(name)
         except InvalidInput as error:
             if name == FULL_BRAKE.name:
                 raise
-            tell(Progress("baselines", number, len(baselines), note=f"this baseline is left out: {error}"))
-    return usable
+            tell(Progress(what, number, len(names), note=f"{name} is left out: {error}"))
+    return found
 
 
 def compared_teams(

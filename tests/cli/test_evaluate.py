@@ -65,7 +65,7 @@ def test_a_team__goes_behind_the_step_shield_and_no_other(ethbrake: Command) -> 
     )
     check_refused(
         ethbrake("evaluate", "--agents", "pair.py:make"),
-        "team 'pair': drives vehicle_2, vehicle_3; must drive exactly vehicle_2",
+        "team 'pair.py:make': drives vehicle_2, vehicle_3; must drive exactly vehicle_2",
     )
 
 

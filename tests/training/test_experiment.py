@@ -70,7 +70,7 @@ def test_baseline__that_cannot_drive_is_left_out_with_a_word(tmp_path: Path) -> 
     found = quick(tmp_path / "run", "paper-random-buildup", on_progress=lambda progress: notes.append(progress.note))
     assert [*found.compared.teams] == ["full_brake", "e_v2x_bm", "trained policy", "hybrid"]
     (said,) = filter(None, notes)
-    assert said.startswith("this baseline is left out: e_v2x_bm:pairwise: brakes build up gradually")
+    assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise: brakes build up gradually")
 
 
 def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_path: Path) -> None:

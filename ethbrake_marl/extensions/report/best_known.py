@@ -10,9 +10,10 @@ import numpy as np
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
 
-MEASURE = "limits"  # a name for ``evaluate(measures=...)``
+MEASURES = ("limits", "avoidable")  # names for ``evaluate(measures=...)``
 HARM = {"first": "first_impact_harm", "total": "total_harm"}  # count -> column
-AVOIDABLE = "limits_avoidable"  # whether contact is proven avoidable; where it is false, proven unavoidable
+BEST = {count: f"best_known_{count}" for count in HARM}
+AVOIDABLE = "avoidable"  # whether contact is proven avoidable; where it is false, proven unavoidable
 
 
 class BestKnown(NamedTuple):
@@ -25,10 +26,9 @@ class BestKnown(NamedTuple):
     def of(cls, result: Result) -> BestKnown | None:
         """Return what a result knows; None if it was not measured."""
         columns: Mapping[str, Any] = next(iter(result.columns.values()))
-        names = {count: f"{MEASURE}_best_known_{harm}" for count, harm in HARM.items()}
-        if not all(name in columns for name in names.values()):
+        if not all(name in columns for name in BEST.values()):
             return None
-        return cls({count: columns[name] for count, name in names.items()}, columns.get(AVOIDABLE))
+        return cls({count: columns[name] for count, name in BEST.items()}, columns.get(AVOIDABLE))
 
     def regret(self, result: Result, agent: str, count: str) -> Floats:
         """Return an agent's harm minus the best known harm, [n] m2/s2."""

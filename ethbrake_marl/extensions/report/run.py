@@ -16,7 +16,7 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.results import write_results
 from ethbrake_marl.evaluation.summary import BASELINE
-from ethbrake_marl.extensions.report.best_known import HARM, MEASURE
+from ethbrake_marl.extensions.report.best_known import HARM, MEASURES
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.harm_figures import harm_against_total_gap
 from ethbrake_marl.extensions.report.learners import learners_sheets
@@ -39,7 +39,7 @@ PAGE = "report.html"
 class RunReport:
     """Report of an experiment (``training.experiment.Report``)."""
 
-    measures: tuple[str, ...] = (*Tables.measures, MEASURE)
+    measures: tuple[str, ...] = (*Tables.measures, *MEASURES)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
         """Write results in the other tests, pictures and page; return tables to print, and where the page is."""

@@ -9,7 +9,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.report.best_known import AVOIDABLE, HARM, MEASURE
+from ethbrake_marl.extensions.report.best_known import AVOIDABLE, BEST, HARM
 from ethbrake_marl.names import teams_of
 
 AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
@@ -28,10 +28,10 @@ def with_best_known(compared: Compared) -> Compared:
     least = {
         count: 0.5 * np.min([own[harm] for own in result.columns.values()], axis=0) for count, harm in HARM.items()
     }
-    more = {f"{MEASURE}_best_known_{HARM[count]}": value for count, value in least.items()}
+    more = {BEST[count]: value for count, value in least.items()}
     more[AVOIDABLE] = least["first"] == 0.0
     columns = {agent: {**own, **more} for agent, own in result.columns.items()}
-    searched = replace(result, columns=columns, measures=(*result.measures, Measure(MEASURE)))
+    searched = replace(result, columns=columns, measures=(*result.measures, Measure("best_known"), Measure(AVOIDABLE)))
     return compared._replace(result=searched, table=summarise(searched))
 
 

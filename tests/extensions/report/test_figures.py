@@ -106,7 +106,7 @@ def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Compared) ->
     means = [searched.result[agent]["total_harm"].mean() for agent in searched.teams]
     assert [bar.get_width() for bar in axes.patches] == pytest.approx(means)
     best, marks = axes.lines
-    assert best.get_xdata()[0] == pytest.approx(searched.result["ppo"]["limits_best_known_total_harm"].mean())
+    assert best.get_xdata()[0] == pytest.approx(searched.result["ppo"]["best_known_total"].mean())
     assert marks.get_xdata() == pytest.approx(means) and legend(figure) == ["best known", "other test"]
 
 
@@ -115,7 +115,7 @@ def test_harm_above__shares_are_those_of_the_worlds(compared: Compared, searched
         axes = harm_above(one.result).axes[0]
         drawn, values = axes.lines[0], one.result["full_brake"]["first_impact_harm"]
         if label == "Regret":
-            values = values - one.result["full_brake"]["limits_best_known_first_impact_harm"]
+            values = values - one.result["full_brake"]["best_known_first"]
         assert drawn.get_ydata() == pytest.approx([np.mean(values > x) for x in drawn.get_xdata()])
         assert axes.get_xlabel().startswith(label)
 
@@ -178,6 +178,9 @@ def test_trajectories__lines_and_impacts_are_those_of_the_record() -> None:
     first = record.impacts.first_impact_harm > 0.0
     assert [len(each.get_offsets()) for each in crosses] == [first.sum(), (~first).sum()]
     assert crosses[0].get_offsets()[:, 0].tolist() == record.impacts.time_s[first].tolist()
+    rows = zip(record.impacts.time_s[first], record.impacts.pair[first], strict=True)
+    front = [np.interp(t, record.time_s, record.positions_m[:, pair - 1]) for t, pair in rows]
+    assert crosses[0].get_offsets()[:, 1] == pytest.approx(front)
     words = [text.get_text() for text in above.texts]
     assert words == [f"{speed:.1f}" for speed in record.impacts.closing_speed_mps[first]]
     assert above.get_title(loc="left") == "Full braking\nharm 33.79 first-impact, 33.79 total"

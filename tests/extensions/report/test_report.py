@@ -93,10 +93,10 @@ def test_shown__begin_with_the_worst_and_say_whose_harm_it_is(compared: Compared
     assert len({each.kind for each in chosen.values()}) >= 4
     for row, each in chosen.items():
         assert each.why == f"{FOCUS}: harm {first[row]:.2f} first-impact, {total[row]:.2f} total"
-    known = searched.result[FOCUS]["limits_best_known_total_harm"]
+    known = searched.result[FOCUS]["best_known_total"]
     assert (total - known)[worst_rows(searched.result, FOCUS)].tolist() == sorted(total - known, reverse=True)[:10]
     avoidable = [row for row, each in choose_shown(searched.result, FOCUS).items() if "Avoidable" in each.kind]
-    assert avoidable and (searched.result[FOCUS]["limits_avoidable"] & (total > 0.0))[avoidable].all()
+    assert avoidable and (searched.result[FOCUS]["avoidable"] & (total > 0.0))[avoidable].all()
 
 
 def test_worst_worlds__can_be_watched(searched: Compared) -> None:
@@ -108,12 +108,12 @@ def test_worst_worlds__can_be_watched(searched: Compared) -> None:
 
 
 def test_avoidable__splits_the_worlds_only_if_somebody_has_proven_it(compared: Compared, searched: Compared) -> None:
-    avoidable = searched.result[FOCUS]["limits_avoidable"]
+    avoidable = searched.result[FOCUS]["avoidable"]
     section = avoidable_section(searched)
     text = " ".join(str(part.html) for part in section.parts)
     assert section.title == "What was avoidable" and f"{100 * avoidable.mean():.1f} %" in text
     assert f"Contact avoidable: {avoidable.sum()} worlds" in text
-    harm = searched.result[FOCUS]["first_impact_harm"] - searched.result[FOCUS]["limits_best_known_first_impact_harm"]
+    harm = searched.result[FOCUS]["first_impact_harm"] - searched.result[FOCUS]["best_known_first"]
     assert f"{harm[~avoidable].mean():.2f}" in text and f"{harm[avoidable].mean():.2f}" in text
     section = avoidable_section(compared)
     assert section.title == "World by world" and len(section.parts) == 1
@@ -163,7 +163,8 @@ def test_player__marks_the_decisions_that_a_shield_replaced() -> None:
     (record,) = record_episodes(scenario.sample(1, 7), team, game)
     replaced = record.last.memories["shield"].replaced[0]
     times = replaced_at_s(record)
-    assert len(times) == replaced > 0 and times[0] >= 0.5 and np.diff(times).min() > 0.099
+    decisions = [float(state.time_s[0]) for state in record.states[1:-1]]
+    assert len(times) == replaced > 0 and {*times} <= {*decisions} and times[0] == decisions[0] == 0.5
     assert episode_data(record)["stepped"] == times
 
 
