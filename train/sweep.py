@@ -15,14 +15,15 @@ import argparse
 from itertools import product
 from pathlib import Path
 
+from ethbrake_marl.cli.settings import read_settings
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.first_edition.evaluation import load_runnable
-from ethbrake_marl.first_edition.training import Training, load_recipe, read_settings
 from ethbrake_marl.parallel import run_each
+from ethbrake_marl.training.recipe import load_recipe
+from ethbrake_marl.training.training import Training
 
 # 1. What to train. All names and settings are checked before the first training run begins.
 
@@ -30,11 +31,11 @@ from ethbrake_marl.parallel import run_each
 def read_jobs(args: argparse.Namespace) -> list[TrainingJob]:
     """Return all training runs, ordered by seed. The name of a run's folder ends in a hash of all its settings."""
     recipes = [load_recipe(name) for name in args.recipes]
-    settings = read_settings(args.set, recipes)
-    scenarios = [load_runnable(name, settings.scenario) for name in args.scenarios]
+    settings = read_settings(args.set, {key for recipe in recipes for key in type(recipe).model_fields})
+    scenarios = [settings.change_scenario(name) for name in args.scenarios]
     jobs = []
     for seed, scenario, recipe in product(range(args.seeds), scenarios, recipes):
-        training = Training.of(settings.change(recipe), scenario, seed=seed)
+        training = Training.of(settings.change_recipe(recipe), scenario, seed=seed)
         name = f"{scenario.name}-{recipe.name}-seed{seed}-{training.identity[:12]}"
         jobs.append(TrainingJob(training, args.output.absolute() / name, settings.texts))
     if not jobs or len({job.folder for job in jobs}) < len(jobs):

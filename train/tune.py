@@ -15,14 +15,15 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
+from ethbrake_marl.cli.settings import read_settings
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.first_edition.evaluation import load_runnable
-from ethbrake_marl.first_edition.training import Training, load_recipe, read_settings
 from ethbrake_marl.parallel import run_each
+from ethbrake_marl.training.recipe import load_recipe
+from ethbrake_marl.training.training import Training
 
 
 def read_search(text: str) -> tuple[str, BaseDistribution]:
@@ -44,12 +45,12 @@ def tune(args: argparse.Namespace) -> None:
     space, loaded = dict(map(read_search, args.search)), load_recipe(args.recipe)
     if min(args.jobs, args.trials) < 1 or len(space) < len(args.search):
         raise InvalidInput("--jobs and --trials must be 1 or more, and --search must name each key only once")
-    settings = read_settings(args.set, [loaded])
-    scenario, recipe = load_runnable(args.scenario, settings.scenario), settings.change(loaded)
+    settings = read_settings(args.set, [*type(loaded).model_fields])
+    scenario, recipe = settings.change_scenario(args.scenario), settings.change_recipe(loaded)
 
     def job(values: dict[str, object], folder: str = "") -> TrainingJob:
-        own = read_settings([f"recipe.{key}={value}" for key, value in values.items()], [recipe])
-        training, path = Training.of(own.change(recipe), scenario), args.output.absolute() / folder
+        own = read_settings([f"recipe.{key}={value}" for key, value in values.items()], [*type(recipe).model_fields])
+        training, path = Training.of(own.change_recipe(recipe), scenario), args.output.absolute() / folder
         return TrainingJob(training, path, (*args.set, *own.texts))
 
     for key, each in space.items():  # raises now what a trial would raise
