@@ -70,7 +70,7 @@ def cube_of(scenario: Scenario) -> Cube:
     points[1] = points[0]
     for k in range(len(places)):
         points[1, k, :, k] = (points[0, k, :, k] + 0.5) % 1.0
-    worlds = Cube(scenario, tuple(places)).worlds(points.reshape(-1, len(places)))
+    worlds = Cube(scenario, tuple(places)).worlds(points.reshape(2 * len(places) * _TRIED, len(places)))
     half = worlds.n // 2
     differ = ((array[:half] != array[half:]).any(axis=(1, 2)) for array in (worlds.line, worlds.car))
     matters = np.logical_or(*differ).reshape(len(places), _TRIED).any(axis=1)

@@ -1,18 +1,21 @@
 """``train/sweep.py`` and ``train/tune.py``: a killed run goes on to the result of an undisturbed one."""
 
 import runpy
-import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
-from tests.extensions.studies.conftest import RECIPE, write_yaml
-from tests.extensions.studies.killing import ROOT, end_when
+from tests.training.tiny import TINY, UPDATE
 
 Run = Callable[..., int]
+
+ROOT = Path(__file__).resolve().parents[3]
 
 SWEEP = ("sweep", "--scenarios", "paper-random", "--seeds", "2", "--recipes")
 LONGER = ("sweep", "--scenarios", "paper-random", "--seeds", "3", "--recipes")
@@ -23,7 +26,10 @@ TUNE += ("n_epochs=1..3", "network.policy=[8]/[16, 8]", "--recipe")
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A recipe of eight updates, with a checkpoint after each."""
-    return str(write_yaml(tmp_path_factory.mktemp("recipe") / "tiny.yaml", {**RECIPE, "total_steps": 1024}))
+    path = tmp_path_factory.mktemp("recipe") / "tiny.yaml"
+    tiny = TINY.replace(name="tiny", total_steps=8 * UPDATE, checkpoint_every_updates=1)
+    path.write_text(yaml.safe_dump(tiny.model_dump(mode="json")))
+    return str(path)
 
 
 @pytest.fixture
@@ -57,7 +63,11 @@ def test_killed_run__goes_on_to_the_same_result(
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert run(script, *options, recipe, "--output", whole) == 0
     line = [sys.executable, f"train/{script}.py", *options, recipe, "--output", killed]
-    end_when(line, lambda process: any(killed.glob(f"{second}/checkpoints/*")), signal.SIGKILL)
+    with subprocess.Popen(line, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        while not any(killed.glob(f"{second}/checkpoints/*")):
+            assert process.poll() is None
+            time.sleep(0.01)
+        process.kill()
     assert not [*killed.glob("*.csv")] and any(killed.glob("*/checkpoints/*"))
     assert run(script, *options, recipe, "--output", killed) == 0
     assert results(killed) == results(whole) and len(results(whole)) >= 3
