@@ -17,27 +17,26 @@ from pathlib import Path
 
 from ethbrake_marl.cli.settings import read_settings
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.extensions.studies.folder import StudyFolder
-from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.parallel import run_each
+from ethbrake_marl.training.job import Job, folder_of_many
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.training import Training
 
 # 1. What to train. All names and settings are checked before the first training run begins.
 
 
-def read_jobs(args: argparse.Namespace) -> list[TrainingJob]:
+def read_jobs(args: argparse.Namespace) -> list[Job]:
     """Return all training runs, ordered by seed. The name of a run's folder ends in a hash of all its settings."""
     recipes = [load_recipe(name) for name in args.recipes]
-    settings = read_settings(args.set, {key for recipe in recipes for key in type(recipe).model_fields})
+    settings = read_settings(args.set, [key for recipe in recipes for key in type(recipe).model_fields])
     scenarios = [settings.change_scenario(name) for name in args.scenarios]
     jobs = []
-    for seed, scenario, recipe in product(range(args.seeds), scenarios, recipes):
-        training = Training.of(settings.change_recipe(recipe), scenario, seed=seed)
+    for seed, scenario, recipe in product(range(args.seeds), scenarios, map(settings.change_recipe, recipes)):
+        training = Training.of(recipe, scenario, seed=seed)
         name = f"{scenario.name}-{recipe.name}-seed{seed}-{training.identity[:12]}"
-        jobs.append(TrainingJob(training, args.output.absolute() / name, settings.texts))
+        jobs.append(Job(training, args.output.absolute() / name, settings.texts))
     if not jobs or len({job.folder for job in jobs}) < len(jobs):
         raise InvalidInput("a sweep needs at least one seed, and each scenario and each recipe only once")
     if args.jobs is not None and args.jobs < 1:
@@ -52,7 +51,7 @@ def sweep(args: argparse.Namespace) -> int:
     """Do all training runs, write ``results.csv``, and return the number of runs that failed."""
     jobs = read_jobs(args)
     rows, failed = [], 0
-    with StudyFolder(args.output, "a sweep", writes=("results.csv",)).work():
+    with folder_of_many(args.output, "results.csv"):
         reasons = run_each(((job.attempt,) for job in jobs), args.jobs, args.ray)
         for job, reason in zip(jobs, reasons, strict=True):
             failed += bool(reason)

@@ -17,11 +17,10 @@ from optuna.storages.journal import JournalFileBackend
 
 from ethbrake_marl.cli.settings import read_settings
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.extensions.studies.folder import StudyFolder
-from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.files.sheet import csv_text
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.parallel import run_each
+from ethbrake_marl.training.job import Job, folder_of_many
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.training import Training
 
@@ -45,25 +44,29 @@ def tune(args: argparse.Namespace) -> None:
     space, loaded = dict(map(read_search, args.search)), load_recipe(args.recipe)
     if min(args.jobs, args.trials) < 1 or len(space) < len(args.search):
         raise InvalidInput("--jobs and --trials must be 1 or more, and --search must name each key only once")
-    settings = read_settings(args.set, [*type(loaded).model_fields])
+    keys = [*type(loaded).model_fields]
+    settings = read_settings(args.set, keys)
     scenario, recipe = settings.change_scenario(args.scenario), settings.change_recipe(loaded)
 
-    def job(values: dict[str, object], folder: str = "") -> TrainingJob:
-        own = read_settings([f"recipe.{key}={value}" for key, value in values.items()], [*type(recipe).model_fields])
+    def job(values: dict[str, object], folder: str = "") -> Job:
+        own = read_settings([f"recipe.{key}={value}" for key, value in values.items()], keys)
         training, path = Training.of(own.change_recipe(recipe), scenario), args.output.absolute() / folder
-        return TrainingJob(training, path, (*args.set, *own.texts))
+        return Job(training, path, (*args.set, *own.texts))
 
     for key, each in space.items():  # raises now what a trial would raise
         for value in each.choices if isinstance(each, CategoricalDistribution) else (each.low, each.high):
             job({key: value})
-    question = {"training": job({}).training.content(), "search": args.search, "jobs": args.jobs}
-    with StudyFolder(args.output, "a tuning", question, writes=("trials.csv",)).work():
+    question = {"training": job({}).training.identity, "search": args.search, "jobs": args.jobs}
+    with folder_of_many(args.output, "trials.csv"):
         log = args.output / "optuna.log"
         try:
             storage = JournalStorage(JournalFileBackend(str(log)))
             study = optuna.create_study(storage=storage, study_name="tuning", load_if_exists=True)
         except (ValueError, KeyError) as error:
             raise InvalidInput(f"{log}: is damaged ({error}); delete it, and finished trials are kept") from None
+        if study.user_attrs.get("question", question) != question:
+            raise InvalidInput(f"{log}: is of a tuning with other settings; give another folder (--output)")
+        study.set_user_attr("question", question)
         while (ended := sum(each.state.is_finished() for each in study.trials)) < args.trials:
             while (number := len(study.trials)) < min(args.trials, (ended // args.jobs + 1) * args.jobs):
                 study.sampler = optuna.samplers.TPESampler(seed=number, constant_liar=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override
@@ -12,8 +12,6 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 if TYPE_CHECKING:
     from ethbrake_marl.training.recipe import TrainingRecipe
-
-Recipe = TypeVar("Recipe", bound="TrainingRecipe")
 
 NO_SETTING = {"name", "title", "description", "source"}  # words, which cannot be set
 
@@ -34,13 +32,13 @@ class Settings(NamedTuple):
         content = scenario.model_dump(mode="json", exclude_none=True) | scenario.declared()
         return scenario.replace(**Override.put(content, self.scenario))
 
-    def change_recipe(self, recipe: Recipe) -> Recipe:
+    def change_recipe(self, recipe: TrainingRecipe) -> TrainingRecipe:
         """Return the recipe with these settings."""
         return recipe.replace(**Override.put(recipe.model_dump(mode="json"), self.recipe)) if self.recipe else recipe
 
 
 def read_settings(
-    texts: Sequence[str] | None, recipe_keys: Iterable[str] = (), of_command: Sequence[str] = ()
+    texts: Sequence[str] | None, recipe_keys: Sequence[str] = (), of_command: Sequence[str] = ()
 ) -> Settings:
     """Return the settings ``KEY=VALUE`` of a command, by their owner.
 
@@ -52,7 +50,7 @@ def read_settings(
     found: dict[str, list[Override]] = {owner: [] for owner in known}
     for override in Override.parse(texts or ()):
         named = override.top in ("scenario", "recipe") and len(override.path) > 1
-        if named and override.top == "recipe" and not known["recipe"]:
+        if named and override.top == "recipe" and not recipe_keys:
             raise InvalidInput(f"--set {override.key}: this command uses no recipe; remove this setting")
         whose, inside = ([override.top], override.inside()) if named else ([*known], override)
         owners = [owner for owner in whose if inside.top in known[owner]]

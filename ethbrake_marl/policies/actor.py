@@ -24,7 +24,7 @@ class Actor:
         self.spec, self.actions = spec, spec.actions
         self.networks = [layers_of(tensors, prefix + name, len(spec.policy_hidden)) for name in spec.actors]
         self.gate = layers_of(tensors, f"{prefix}gate", len(spec.gate_hidden)) if spec.networks > 1 else []
-        self.members = [Actor(member, tensors, f"among_{m}.") for m, member in enumerate(spec.among, 1)]
+        self.members = [type(self)(member, tensors, f"among_{m}.") for m, member in enumerate(spec.among, 1)]
 
     def __call__(self, observations: Float32s) -> Float32s:
         """Return the actions [n, A] in [-1, 1] for observations [n, F] float32. Raises ``InvalidInput``."""

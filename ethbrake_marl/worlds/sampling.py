@@ -57,12 +57,17 @@ def draw(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel: Chan
     index = world_numbers(n, seed, first, channel)
     if not scenario.members:
         return _accepted(scenario, seed, channel, index)
-    u = numbers_of(seed, channel, 0, index)(OF_WORLD, MIXTURE)[:, 0]
-    chosen, parts = pick([member.weight for member in scenario.mixture or ()], u), []
+    chosen, parts = member_numbers(scenario, index, seed, channel), []
     for k in np.unique(chosen):
         part = _accepted(scenario.members[k], seed, channel, index[chosen == k])
         parts.append(part._replace(scenarios=np.full(part.worlds.n, scenario.members[k].name)))
     return merged(parts, np.argsort(chosen, kind="stable"))
+
+
+def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel = "list") -> Ints:
+    """Return from which member of a mixture the worlds ``index`` [n], ascending, are drawn: its number from 0, [n]."""
+    u = numbers_of(seed, channel, 0, index)(OF_WORLD, MIXTURE)[:, 0]
+    return pick([member.weight for member in scenario.mixture or ()], u)
 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:

@@ -1,1 +1,1 @@
-"""Learning algorithms of this project: vine (also with a mixture of experts) and rollout classification."""
+"""Learning algorithms without exploration, critic or shaping: vine, mixtures of experts, and rollout classification."""

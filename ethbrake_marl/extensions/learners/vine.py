@@ -1,65 +1,122 @@
-"""The algorithm ``vine``: try two actions in the same state, and measure the gradient of the return.
+"""Vine: try a higher and a lower action in the same state; the difference in return is the gradient of the return.
 
-The name of the algorithm is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common
-random numbers.
+The name is from Schulman et al. 2015 (TRPO), who sample branches from visited states with common random numbers.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import NamedTuple
 
-from stable_baselines3.common.base_class import BaseAlgorithm
-from torch.optim import Optimizer
+import numpy as np
+import torch
+from torch import nn
 
-from ethbrake_marl.extensions.learners.mixture_model import ExpertsModel
-from ethbrake_marl.extensions.learners.start_weights import widened
-from ethbrake_marl.extensions.learners.vine_model import VineModel
-from ethbrake_marl.extensions.learners.vine_recipe import VineRecipe
-from ethbrake_marl.first_edition.envs.sb3 import EthBrakeVecEnv
-from ethbrake_marl.first_edition.policies.bundle import load_policy
-from ethbrake_marl.first_edition.policies.network_spec import Float32s, NetworkSpec
-from ethbrake_marl.first_edition.policies.shipped import load_shipped
-from ethbrake_marl.first_edition.training.algorithm import Algorithm
-from ethbrake_marl.first_edition.training.training import Training
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.extensions.learners.branches import Offsets, moving, play_to_the_end
+from ethbrake_marl.extensions.learners.model import BranchingModel
+from ethbrake_marl.extensions.learners.networks import Averaged, drawn, linear_layers, perceptron
+from ethbrake_marl.extensions.learners.recipes import VineRecipe
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.policies.layers import Float32s
 
 
-class Vine(Algorithm):
-    """The algorithm vine, which measures gradients of the return and trains an actor with them.
+class Actor(Averaged):
+    """A deterministic policy: the network's output, clipped to [-1, 1]."""
 
-    The same actor drives all learners. If there is only one learner, a mixture of experts may drive this learner
-    instead.
+    def __init__(self, inputs: int, recipe: VineRecipe) -> None:
+        shape = recipe.network
+        average = perceptron(inputs, 1, shape.policy, shape.activation)
+        *hidden, last = linear_layers(average)
+        for layer in hidden:
+            nn.init.orthogonal_(layer.weight, math.sqrt(2.0))
+            nn.init.zeros_(layer.bias)
+        nn.init.orthogonal_(last.weight, 0.01)
+        nn.init.constant_(last.bias, shape.initial_action or 0.0)
+        learning = perceptron(inputs, 1, shape.policy, shape.activation)
+        super().__init__(average, learning, recipe.learning_rate.at(1.0))
+
+    @torch.no_grad()
+    def means(self, observations: Float32s) -> Float32s:
+        """Return the outputs of the network in training, [rows], for observations [rows, F]."""
+        means: Float32s = self.learning(torch.from_numpy(observations))[:, 0].numpy()
+        return means
+
+    def act(self, observations: Float32s) -> Float32s:
+        """Return the actions, [rows]."""
+        return np.clip(self.means(observations), -1.0, 1.0)
+
+
+class Tried(NamedTuple):
+    """B decisions at which a higher and a lower action were tried."""
+
+    seen: Float32s  # [B, F] observations
+    mean: Float32s  # [B] output of the actor, not clipped
+    gradient: Float32s  # [B] of the return with respect to the action
+
+
+class VineModel(BranchingModel):
+    """One actor drives all learners, and learns from measured gradients."""
+
+    policy: Actor
+    recipe: VineRecipe
+
+    def new_policy(self) -> nn.Module:
+        """Return the actor."""
+        return Actor(len(self.features), self.recipe)
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", "policy.optimizer"], []
+
+    def improve(self, seen: Float32s, states: State) -> None:
+        """Measure gradients, and follow them."""
+        self.train_actor(self.policy, self.try_out(seen, states, self.policy))
+
+    def try_out(self, seen: Float32s, states: State, policy: Actor) -> Tried:
+        """Draw visited decisions; play a branch with a higher and one with a lower action than the policy's."""
+        recipe, learners = self.recipe, self.learners
+        alive = np.flatnonzero(moving(states).repeat(learners))
+        rows = drawn(alive, recipe.tried)
+        least, most = recipe.offset.smallest, recipe.offset.largest
+        sizes: Floats = least * (most / least) ** torch.rand(len(rows), dtype=torch.float64).numpy()
+        steps = np.tile(self.drawn_steps(len(rows)), 2)
+        offsets = Offsets(np.tile(rows % learners, 2), np.concatenate([sizes, -sizes]), steps)
+        branches = states.take(np.tile(rows // learners, 2))
+        gained, moved = play_to_the_end(self.game, branches, policy.act, offsets, recipe.gamma)
+        (up, down), (higher, lower) = np.split(gained, 2), np.split(moved, 2)
+        measured = (up - down) / (higher - lower)
+        gradient = np.clip(measured, -recipe.gradient_limit, recipe.gradient_limit)
+        whole = float(np.abs(measured).sum())
+        self.logger.record("train/gradient_cut", 1.0 - float(np.abs(gradient).sum()) / whole if whole else 0.0)
+        return Tried(seen[rows], policy.means(seen[rows]), gradient.astype(np.float32))
+
+    def train_actor(self, actor: Actor, tried: Tried) -> None:
+        """Move an actor's outputs towards their targets."""
+        recipe = self.recipe
+        self._update_learning_rate(actor.optimizer)
+        target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)
+        seen, wanted, weights = (torch.from_numpy(array) for array in (tried.seen, target, weight))
+        losses = []
+        for _ in range(recipe.n_epochs):
+            for batch in torch.split(torch.randperm(len(wanted)), recipe.batch_size):
+                loss = (weights[batch] * (actor.learning(seen[batch])[:, 0] - wanted[batch]) ** 2).mean()
+                losses.append(actor.descend(loss, recipe.averaging))
+        self._n_updates += recipe.n_epochs
+        self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
+        self.logger.record("train/gradient", float(np.abs(tried.gradient).mean()) if len(wanted) else 0.0)
+        self.logger.record("train/tried", len(wanted))
+
+
+def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32s, Float32s]:
+    """Return targets of the actor's outputs, and the weights of the squared errors in the loss, [B] each.
+
+    Let m be the present output and g the gradient. Then ``weight = |g| / radius + anchor`` and ``target = m + g /
+    weight``: the target is less than ``radius`` away, and ``(weight / 2) (output - target)^2`` has the slope ``-g`` at
+    m. An output at or beyond 1 is not moved farther out, because actions are clipped to [-1, 1].
     """
-
-    def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        """Return a new model for a training run.
-
-        The initial weights come from the policy that the recipe's key ``start`` names; without this key they are
-        random.
-        """
-        recipe = training.recipe
-        assert isinstance(recipe, VineRecipe)
-        environment.engine.branch(environment.engine.moment())  # raises at once if the engine cannot branch
-        model = (VineModel if recipe.experts is None else ExpertsModel)(environment, recipe)
-        start = recipe.policy_to_start_from(training.scenario)
-        if start is not None:
-            name, _, path = start.partition("@")
-            policy = load_policy(path) if path else load_shipped(name)
-            first = model.policy.actors[0] if isinstance(model, ExpertsModel) else model.policy
-            first.take_over(widened(policy, training))
-        return model
-
-    def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of an actor's averaged weights, by name, for a policy bundle whose network is ``network``."""
-        tensors: dict[str, Float32s] = actor.tensors(network)
-        return tensors
-
-    def optimizers(self, model: BaseAlgorithm) -> dict[str, Optimizer]:
-        """Return the optimisers of the model, by name.
-
-        A model with one actor has one optimiser, ``policy``. A mixture of experts has the optimisers ``network_1``,
-        ``network_2``, ... of its experts, and ``gate`` of its gating network.
-        """
-        if not isinstance(model, ExpertsModel):
-            return {"policy": model.policy.optimizer}
-        members = {f"network_{k + 1}": actor.optimizer for k, actor in enumerate(model.policy.actors)}
-        return {**members, "gate": model.policy.gate.optimizer}
+    outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))
+    gradient = tried.gradient.copy()
+    gradient[outward] = 0.0
+    weight = (np.abs(gradient) / radius + anchor).astype(np.float32)
+    target: Float32s = tried.mean + gradient / weight
+    return target, weight

@@ -1,45 +1,57 @@
-"""Trainings of a second, by algorithms of this extension."""
+"""Trainings of a second by algorithms of this extension, and models that have not learned yet."""
 
-import ethbrake_marl.first_edition as eb
+from __future__ import annotations
 
-TINY_VINE = eb.load_recipe("vine").replace(
-    start=None,
-    observation=None,
-    n_envs=8,
-    n_steps=4,
-    tried=16,
-    batch_size=8,
-    network={"policy": [8]},
-    total_steps=256,
-    evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
-    checkpoint_every_updates=3,
-)
-TINY_ROLLOUTS = eb.load_recipe("rollout-classification").replace(
-    observation=None,
-    n_envs=8,
-    n_steps=4,
-    tried=16,
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.logger import Logger
+
+from ethbrake_marl.training.recipe import algorithm_of, load_recipe
+from ethbrake_marl.training.train import make_environment
+from ethbrake_marl.training.training import Training
+from ethbrake_marl.worlds.catalogue import load_scenario
+
+PAPER = load_scenario("paper-random")
+PAIR = PAPER.with_learners(["vehicle_2", "vehicle_3"])
+MIXTURE = load_scenario({"name": "two", "mixture": [{"scenario": "paper-random"}, {"scenario": "paper-delay-high"}]})
+OWN = {"harm": 1.0, "harm_count": "total", "objective": "own", "terminal": 0.5}
+
+SHORT = {
+    "observation": None, "n_envs": 8, "n_steps": 4, "tried": 16, "batch_size": 8, "total_steps": 256,
+    "averaging": 0.9, "learning_rate": {"start": 1e-2, "end": 1e-3},
+    "evaluation": {"every_updates": 4, "worlds": 10, "seed": 7}, "checkpoint_every_updates": 3,
+}  # fmt: skip
+VINE = load_recipe("vine").replace(start=None, network={"policy": [8]}, **SHORT)
+ROLLOUTS = load_recipe("rollout-classification").replace(
     memory=40,  # fills up on the way
     gradient_steps=3,
-    batch_size=8,
     network={"policy": [8], "choices": 9},
-    total_steps=256,
-    evaluation={"every_updates": 4, "worlds": 10, "seed": 7},
-    checkpoint_every_updates=3,
+    **SHORT,
 )
-EXPERTS = {
-    "networks": 2,
-    "gating": [4],
-    "worlds": 64,
-    "templates": 20,
-    "gain": 0.0,
-    "margin": 5.0,
-    "imitation_epochs": 2,
-    "gating_states": 32,
-    "gating_memory": 100,
-    "gating_steps": 4,
-    "tie_break": 0.05,
-    "joint_rate": 0.5,
+POLICIES = ROLLOUTS.replace(
+    policies=["ppo", "sac"], drawn=2, near=[], focus=0.5, relative=True, tie_break=0.5,
+    observation=["own", "front_1", "rear_1", "own_harm_weight"],
+)  # fmt: skip
+PLAN: dict[str, Any] = {
+    "networks": 2, "gating": [4], "worlds": 64, "templates": 20, "gain": 0.0, "margin": 5.0, "imitation_epochs": 2,
+    "gating_states": 32, "gating_memory": 100, "gating_steps": 4, "tie_break": 0.05, "joint_rate": 0.5,
     "shares": {"pretraining_first": 0.25, "pretraining_others": 0.25, "gating": 0.25, "joint": 0.25},
-}
-TINY_EXPERTS = TINY_VINE.replace(experts=EXPERTS)
+}  # fmt: skip
+EXPERTS = VINE.replace(experts=PLAN)
+
+
+def new_model(recipe: Any, scenario: Any = PAPER) -> Any:
+    """Return a model that has not learned yet, whose environment has been reset."""
+    training = Training.of(recipe, scenario)
+    model = algorithm_of(recipe).build(training, make_environment(training))
+    model.set_logger(Logger(None, []))
+    model._last_obs = model.rows.reset()
+    return model
+
+
+def fingerprint(policies: Any) -> list[float]:
+    """Return the sum of the absolute weights of each learned tensor of the first policy."""
+    tensors = next(iter(policies.values())).tensors
+    learned = sorted(name for name in tensors if not name.startswith("among") and "log_std" not in name)
+    return [float(np.abs(tensors[name].astype(np.float64)).sum()) for name in learned]

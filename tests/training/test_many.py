@@ -1,6 +1,9 @@
 """``train/sweep.py`` and ``train/tune.py``: a killed run goes on to the result of an undisturbed one."""
 
+from __future__ import annotations
+
 import runpy
+import signal
 import subprocess
 import sys
 import time
@@ -11,25 +14,27 @@ from pathlib import Path
 import pytest
 import yaml
 
-from tests.training.tiny import TINY, UPDATE
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.training.job import Job
+from ethbrake_marl.training.training import Training
+from tests.training.tiny import TINY
 
+pytest.importorskip("optuna")
 Run = Callable[..., int]
-
-ROOT = Path(__file__).resolve().parents[3]
-
+ROOT = Path(__file__).resolve().parents[2]
 SWEEP = ("sweep", "--scenarios", "paper-random", "--seeds", "2", "--recipes")
-LONGER = ("sweep", "--scenarios", "paper-random", "--seeds", "3", "--recipes")
 TUNE = ("tune", "--scenario", "paper-random", "--trials", "3", "--search", "gamma=0.9..1.0:log")
 TUNE += ("n_epochs=1..3", "network.policy=[8]/[16, 8]", "--recipe")
 
 
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A recipe of eight updates, with a checkpoint after each."""
-    path = tmp_path_factory.mktemp("recipe") / "tiny.yaml"
-    tiny = TINY.replace(name="tiny", total_steps=8 * UPDATE, checkpoint_every_updates=1)
-    path.write_text(yaml.safe_dump(tiny.model_dump(mode="json")))
-    return str(path)
+    """The file of a recipe with a checkpoint after each update."""
+    often = {"total_steps": 1024, "evaluation": {"every_updates": 1, "worlds": 5, "seed": 7}}
+    file = tmp_path_factory.mktemp("recipe") / "tiny.yaml"
+    tiny = TINY.replace(name="tiny", checkpoint_every_updates=1, **often)
+    file.write_text(yaml.safe_dump(tiny.model_dump(mode="json")))
+    return str(file)
 
 
 @pytest.fixture
@@ -48,27 +53,25 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
 
 
 def results(folder: Path) -> dict[str, bytes]:
-    """The table and all weights: name -> content."""
     files = [*folder.glob("*.csv"), *folder.rglob("weights.safetensors")]
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("words", "second"), [(LONGER, "*-seed1-*"), (TUNE, "trial-1")], ids=["sweep", "tune"])
+@pytest.mark.parametrize(("words", "second"), [(SWEEP, "*-seed1-*"), (TUNE, "trial-1")], ids=["sweep", "tune"])
 def test_killed_run__goes_on_to_the_same_result(
     words: tuple[str, ...], second: str, recipe: str, run: Run, tmp_path: Path
 ) -> None:
-    """It is killed in the second of three trainings, so that a slow test does not come too late."""
     script, *options = words
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert run(script, *options, recipe, "--output", whole) == 0
-    line = [sys.executable, f"train/{script}.py", *options, recipe, "--output", killed]
+    line = [sys.executable, f"train/{script}.py", *options, recipe, "--output", str(killed)]
     with subprocess.Popen(line, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
         while not any(killed.glob(f"{second}/checkpoints/*")):
             assert process.poll() is None
             time.sleep(0.01)
-        process.kill()
-    assert not [*killed.glob("*.csv")] and any(killed.glob("*/checkpoints/*"))
+        process.send_signal(signal.SIGKILL)
+    assert not [*killed.glob("*.csv")]
     assert run(script, *options, recipe, "--output", killed) == 0
     assert results(killed) == results(whole) and len(results(whole)) >= 3
     before = {file: file.stat().st_mtime_ns for file in whole.rglob("weights.safetensors")}
@@ -118,37 +121,34 @@ def test_bad_input__is_refused_in_one_line_and_nothing_is_made(
     assert key in told and told.startswith(f"{script}.py: error: ") and told.count("\n") == 1
 
 
-def test_tune__other_settings_in_its_folder_are_refused(recipe: str, run: Run, tmp_path: Path) -> None:
-    script, *options = TUNE
-    assert run(script, *options, recipe, "--trials", "1", "--output", tmp_path) == 0
-    assert run(script, *options, recipe, "--set", "gae_lambda=0.5", "--output", tmp_path) == 2
-
-
-def test_sweep__damaged_results_of_a_finished_run_are_a_row_with_its_reason(
-    recipe: str, run: Run, tmp_path: Path
-) -> None:
-    script, *options = (*SWEEP, recipe, "--output", tmp_path)
-    assert run(script, *options) == 0
-    before = (tmp_path / "results.csv").read_text().splitlines()
-    (progress,) = tmp_path.glob("*-seed0-*/progress.csv")
-    head, *rows = progress.read_bytes().splitlines(keepends=True)
-    for damaged in (head, b"\xff\xfe", head + rows[-1].replace(b".", b"x")):
-        progress.write_bytes(damaged)
-        assert run(script, *options) == 1
-        now = (tmp_path / "results.csv").read_text().splitlines()
-        assert f"{progress}: is damaged (" in now[1] and "delete the run's folder" in now[1]
-        assert (now[0], now[2]) == (before[0], before[2])
-
-
-def test_tune__damaged_file_of_trials_is_one_error_and_can_be_deleted(
+def test_tune__a_log_of_other_settings_or_a_damaged_one_is_one_error(
     recipe: str, run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     script, *options = (*TUNE, recipe, "--trials", "1", "--output", tmp_path)
     assert run(script, *options) == 0
     before, log = results(tmp_path), tmp_path / "optuna.log"
+    assert run(script, *options, "--set", "gae_lambda=0.5") == 2
+    assert "with other settings" in capsys.readouterr().err
     for damaged in (b"\x81", log.read_bytes()[:-5] + b"\n{}\n", b"{}\n{}\n"):
         log.write_bytes(damaged)
         assert run(script, *options) == 2
         assert f"{log}: is damaged (" in capsys.readouterr().err
     log.unlink()
     assert run(script, *options) == 0 and results(tmp_path) == before
+
+
+def test_job__skips_what_is_finished_and_reads_its_best_measurement(tmp_path: Path) -> None:
+    job = Job(Training.of(TINY, "paper-random"), tmp_path / "run")
+    assert not job.is_finished() and job.attempt() == "" and job.is_finished()
+    head, *rows = (tmp_path / "run" / "progress.csv").read_text().splitlines()
+    column = head.split(",").index("eval/first_impact_harm")
+    harm = [float(row.split(",")[column]) for row in rows if row.split(",")[column]]
+    assert len(harm) == 4 and job.result()["harm"] == min(harm)
+    other = Job(Training.of(TINY, "paper-random", seed=1), tmp_path / "run")
+    assert "has a training with other settings" in other.attempt()
+    (tmp_path / "file").mkdir()
+    with pytest.raises(InvalidInput, match="is not the folder of a run"):
+        job._replace(folder=tmp_path / "file").is_finished()
+    for damaged in (b"\xff\xfe", (head + "\n" + rows[-1].replace(".", "x")).encode(), head.encode()):
+        (tmp_path / "run" / "progress.csv").write_bytes(damaged)
+        assert "is damaged (" in job.attempt()

@@ -1,0 +1,65 @@
+"""How a training builds the models of this extension, and takes policies from them."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import torch
+
+from ethbrake_marl.extensions.learners.mixture import MixtureModel
+from ethbrake_marl.extensions.learners.recipes import VineRecipe
+from ethbrake_marl.extensions.learners.rollout_classification import RolloutClassificationModel
+from ethbrake_marl.extensions.learners.start import named_policy, shipped_for, start_weights
+from ethbrake_marl.extensions.learners.vine import VineModel
+from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
+from ethbrake_marl.policies.layers import Float32s
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.training.algorithm import Algorithm
+from ethbrake_marl.training.training import Training
+
+
+class RandomStart(UserWarning):
+    """Warning: a recipe names a policy to start from, but none is shipped for the scenario."""
+
+
+class Vine(Algorithm):
+    """Vine: one actor drives all learners; or a mixture of experts drives the only one."""
+
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
+        """Return a new model, with the weights of the policy that the recipe's key ``start`` names."""
+        recipe = training.recipe
+        assert isinstance(recipe, VineRecipe)
+        model = (VineModel if recipe.experts is None else MixtureModel)(training, environment)
+        start, scenario = recipe.start, training.scenario.name
+        if start is not None and "@" not in start:
+            start = shipped_for(start, scenario)
+            if start is None:
+                why = f"recipe {recipe.name!r}: start: no policy {recipe.start} is shipped for scenario {scenario!r}"
+                warnings.warn(RandomStart(f"{why}; training begins with random weights"), stacklevel=2)
+        if start is not None:
+            first = model.policy.actors[0] if isinstance(model, MixtureModel) else model.policy
+            policy, wanted = named_policy(start, recipe.name, "start"), recipe.network_spec(len(model.features))
+            for name, tensor in start_weights(policy, wanted, model.features, recipe.name).items():
+                if name in first.weights("policy"):
+                    first.weights("policy")[name].copy_(torch.from_numpy(tensor))
+            first.learning.load_state_dict(first.average.state_dict())
+        return model
+
+    def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
+        """Return the averaged weights."""
+        one = {"policy.log_std": np.full(1, -3.0, np.float32)}  # which never counts, because vine does not explore
+        return dict(actor.tensors("policy") | one if network.networks == 1 else actor.tensors(network))
+
+
+class RolloutClassification(Algorithm):
+    """Rollout classification: one network drives all learners."""
+
+    def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
+        """Return a new model. At first it acts like the first of the recipe's ``policies``, or brakes fully."""
+        return RolloutClassificationModel(training, environment)
+
+    def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
+        """Return the averaged weights, and the weights of the policies."""
+        return dict(actor.all_tensors())

@@ -1,0 +1,112 @@
+"""The loop of both algorithms: drive without exploration, try other actions at some visited decisions, learn."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, Self
+
+import numpy as np
+import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import MaybeCallback
+from torch import nn
+
+from ethbrake_marl.episode.objectives import amounts, objectives_of
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.extensions.learners.branches import Act
+from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
+from ethbrake_marl.motion.layout import Floats, Ints
+from ethbrake_marl.policies.layers import Float32s
+from ethbrake_marl.training.training import Training
+
+
+class BranchingModel(BaseAlgorithm):
+    """A model that drives all rows of ``environment`` with one deterministic policy. F: features, L: learners."""
+
+    policy: Any  # a torch module
+
+    def __init__(self, training: Training, environment: EthBrakeVecEnv) -> None:
+        recipe = training.recipe
+        super().__init__(
+            nn.Module,  # type: ignore[arg-type]  # only models that explore need a policy of Stable-Baselines3
+            environment,
+            learning_rate=recipe.learning_rate.at,
+            stats_window_size=max(100, environment.num_envs),
+            device="cpu",
+            support_multi_env=True,
+            seed=recipe.seed,
+        )
+        self.recipe: Any = recipe
+        self.rows, self.game, self.learners = environment, environment.game, len(training.learners)
+        objective = recipe.reward.objective or training.scenario.objective
+        self.objectives = objectives_of(objective, training.scenario.vehicles)
+        self.features = training.row.names
+        self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self.new_policy()
+
+    @abstractmethod
+    def new_policy(self) -> nn.Module:
+        """Return the networks, whose weights depend on torch's generator."""
+
+    @abstractmethod
+    def improve(self, seen: Float32s, states: State) -> None:
+        """Learn from visited decisions: observations [decisions L, F], and the states there."""
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train until the learners have made ``total_timesteps`` decisions, with arguments of Stable-Baselines3."""
+        total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < total:
+            callback.on_rollout_start()
+            seen, states = self.collect(callback)
+            callback.on_rollout_end()
+            self._update_current_progress_remaining(self.num_timesteps, total)
+            self.improve(seen, states)
+        callback.on_training_end()
+        return self
+
+    def collect(self, callback: BaseCallback) -> tuple[Float32s, State]:
+        """Return the decisions of this update."""
+        return self.visit(callback, self.policy.act)
+
+    def visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
+        """Drive all worlds for ``n_steps`` decisions; return observations [decisions L, F], and the states there."""
+        seen, states, every = [], [], np.arange(self.rows.n)
+        for _ in range(self.recipe.n_steps):
+            observations: Any = self._last_obs
+            seen.append(observations)
+            states.append(self.rows.episode.take(every))
+            new_obs, rewards, dones, infos = self.rows.step(act(observations)[:, np.newaxis])
+            self.num_timesteps += self.n_envs
+            ended = [infos[row] for row in np.flatnonzero(dones)]  # only these have statistics
+            self._update_info_buffer(ended, dones[dones])
+            self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
+            callback.update_locals(locals())
+            callback.on_step()
+        return np.concatenate(seen), State.join(states)
+
+    def dump_logs(self) -> None:
+        """Write a row of the logs."""
+        self.logger.dump(step=self.num_timesteps)
+
+    def harm(self, state: State, count: str) -> Floats:
+        """Return the harm so far that each learner should make small, [n, L]."""
+        return amounts(self.objectives, None, state, count)[:, self.game.rules.learners - 1]
+
+    def drawn_steps(self, count: int) -> Ints:
+        """Draw for how many steps each of ``count`` tried actions lasts, [count]."""
+        holds = np.array(self.recipe.holds, np.int64)
+        return np.asarray(holds[torch.randint(len(holds), (count,)).numpy()])

@@ -1,0 +1,310 @@
+"""Recipes of ``vine``, with its mixtures of experts, and of ``rollout-classification``."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from operator import not_
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, ValidationInfo, field_validator, model_validator
+
+from ethbrake_marl.agents.drive import MESSAGES
+from ethbrake_marl.agents.trained import make_trained
+from ethbrake_marl.errors import InvalidInput, refuse_shipped_path
+from ethbrake_marl.extensions.learners.start import Member, members_of, named_policy
+from ethbrake_marl.files.model import FileModel, refuse
+from ethbrake_marl.policies.network import Activation, NetworkSpec
+from ethbrake_marl.registry import Part
+from ethbrake_marl.training.recipe import (
+    ACTOR_LAYERS,
+    BATCH_SIZE,
+    NETWORK,
+    Fraction,
+    Layers,
+    NonNegative,
+    Positive,
+    Rate,
+    TrainingRecipe,
+)
+
+MOST_DECISIONS = 2**22  # of one update whose states fit into memory
+
+Text = Annotated[str, Field(max_length=4096)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+Action = Annotated[float, Field(ge=-1.0, le=1.0)]
+Steps = Annotated[tuple[Annotated[int, Field(ge=1, le=1000)], ...], Field(strict=False, min_length=1, max_length=16)]
+
+
+class Range(FileModel):
+    """Range of a distance between two actions. The logarithm of the distance is drawn uniformly."""
+
+    smallest: Rate
+    largest: Rate
+
+    @field_validator("largest")
+    @classmethod
+    def _in_order(cls, value: float, info: ValidationInfo) -> float:
+        if "smallest" in info.data and not value >= info.data["smallest"]:
+            raise ValueError(f"must be at least the value of the key smallest, {info.data['smallest']:g}")
+        return value
+
+
+class BranchingRecipe(TrainingRecipe):
+    """Keys of both algorithms: they try actions at visited decisions, and play each branch to the end."""
+
+    n_steps: int = Field(ge=1, description="number of decisions in each world between two updates")
+    tried: int = Field(ge=1, description="number of decisions per update at which other actions are tried")
+    holds: Steps = Field(description="numbers of time steps for which a tried action may last; one of them is drawn")
+    batch_size: int = Field(ge=2, description=BATCH_SIZE)
+    averaging: float = Field(
+        ge=0.0,
+        lt=1.0,
+        description="share of the weight average that a gradient step keeps; the trained policy uses the average",
+    )
+
+    @model_validator(mode="after")
+    def _branches_fit(self) -> Self:
+        if self.reward.shaping > 0.0:
+            right = "must be 0: this algorithm plays tried actions to the end of the episode, so shaping has no effect"
+            refuse(("reward", "shaping"), self.reward.shaping, right)
+        visited = self.n_envs * self.n_steps
+        if not visited <= MOST_DECISIONS:
+            right = f"n_envs x n_steps = {visited} decisions per update are too many (at most {MOST_DECISIONS})"
+            refuse(("n_envs",), self.n_envs, right)
+        if not self.tried <= visited:
+            refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
+        return self
+
+
+class ActorShape(FileModel):
+    """The actor's network; there is no critic."""
+
+    policy: Layers = Field(description=ACTOR_LAYERS)
+    activation: Activation = "relu"
+    initial_action: Annotated[Action | None, Field(exclude_if=lambda action: action is None)] = Field(
+        None, description="approximate action of the untrained network, -1 to 1; left out: 0, which coasts"
+    )
+
+
+class Shares(FileModel):
+    """Share of all updates, 0 to 1, that each stage of training a mixture of experts gets."""
+
+    pretraining_first: Fraction  # the first expert, in all worlds
+    pretraining_others: Fraction  # the others together, each in worlds selected for it
+    gating: Fraction  # the gating network
+    joint: Fraction  # all networks; each expert learns at decisions at which it is chosen
+
+    @model_validator(mode="after")
+    def _everything(self) -> Self:
+        total = self.pretraining_first + self.pretraining_others + self.gating + self.joint
+        if not abs(total - 1.0) <= 1e-9:
+            raise ValueError(
+                "pretraining_first, pretraining_others, gating and joint are shares of all updates: they must sum to 1,"
+                f" but sum to {total:g}"
+            )
+        return self
+
+
+class ExpertsPlan(FileModel):
+    """A mixture of experts: several networks, and a gating network that chooses one of them at every decision."""
+
+    networks: int = Field(ge=2, le=16, description="number of experts")
+    gating: Layers = Field(description="hidden layers of the gating network")
+    worlds: Count = Field(description="number of worlds in which templates are compared with experts")
+    templates: int = Field(
+        ge=1, le=100_000, description="number of templates (random braking profiles) drawn in each world"
+    )
+    gain: NonNegative = Field(
+        description="a new expert imitates a template if its return exceeds the best earlier expert's by more than this"
+    )
+    margin: Positive = Field(
+        description="a new expert is trained in the worlds in which its return is at least the best earlier expert's"
+        " return minus this number"
+    )
+    imitation_epochs: int = Field(
+        ge=1, le=1000, description="number of passes over the decisions of the imitated templates"
+    )
+    gating_states: Count = Field(
+        description="number of decisions per update at which the returns of the experts are compared"
+    )
+    gating_memory: Count = Field(description="number of stored decisions at which experts were compared")
+    gating_steps: int = Field(
+        ge=1, le=100_000, description="number of gradient steps of the gating network in each update"
+    )
+    tie_break: NonNegative = Field(
+        description="weight, when experts are compared, of the harm count (first or total) that the reward does not use"
+    )
+    joint_rate: Rate = Field(description="factor on the learning rate in the last stage, in which all networks learn")
+    shares: Shares = Field(description="share of all updates for each stage of the training; the shares sum to 1")
+
+
+class VineRecipe(BranchingRecipe):
+    """Recipe of vine: a higher and a lower action are tried, and the difference in return gives the gradient."""
+
+    algorithm: Literal["vine"]
+    start: Text | None = Field(
+        None,
+        description="policy to start from: ppo, or ppo@PATH; ppo stands for the shipped PPO policy of this scenario,"
+        " and for random weights, with a warning, if there is none; left out: random weights",
+    )
+    offset: Range = Field(description="range of the offset between a tried action and the policy's action")
+    gradient_limit: Positive = Field(
+        description="largest gradient (return per unit of action); larger ones are cut to it"
+    )
+    trust_radius: Rate = Field(description="largest distance, in one update, between an action and its target")
+    anchor: Positive = Field(description="weight that holds actions at their value where the gradient is small")
+    n_epochs: int = Field(ge=1, le=1000, description="number of passes of each update over the tried decisions")
+    network: ActorShape = Field(description=NETWORK)
+    experts: Annotated[ExpertsPlan | None, Field(exclude_if=not_)] = Field(
+        None, description="mixture of experts: several networks and a gating network; left out: one network"
+    )
+
+    @field_validator("start")
+    @classmethod
+    def _names_a_policy(cls, start: str | None) -> str | None:
+        kind, at, path = (start or "ppo").partition("@")
+        refuse_shipped_path(path, kind)
+        if not kind.replace("-", "").isalpha() or (at and (not path or kind not in ("ppo", "vine"))):
+            raise ValueError(
+                "must be the name of a shipped policy, for instance ppo, or ppo@PATH or vine@PATH of a trained policy"
+            )
+        return start
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """Return the actor, or the experts and the gating network."""
+        spec, plan = super().network_spec(observation_size), self.experts
+        return spec if plan is None else spec.model_copy(update={"networks": plan.networks, "gate_hidden": plan.gating})
+
+    def check_learners(self, learners: int) -> None:
+        """Raise ``InvalidInput`` for a mixture of experts with several learners."""
+        if self.experts is not None and learners != 1:
+            raise InvalidInput(
+                f"recipe {self.name!r}: experts: a mixture of experts can drive only one learner, but the scenario has"
+                f" {learners} learners; leave out experts"
+            )
+
+
+class ChoosingShape(FileModel):
+    """The network that scores actions, which are evenly spaced from -1 to 1."""
+
+    policy: Layers = Field(description=ACTOR_LAYERS)
+    activation: Activation = "relu"
+    choices: int = Field(ge=2, le=4096, description="number of actions that the network scores")
+
+
+class RolloutClassificationRecipe(BranchingRecipe):
+    """Recipe of rollout classification: several choices are tried at a decision, and the network learns the cheapest.
+
+    A choice is one of ``network.choices`` actions, or one of the trained ``policies``. Tried are the policy's own
+    choice, an action below and one above it for each range of ``near``, the ``fixed`` actions, and ``drawn`` others.
+    The *cost* of a choice is minus the return from the decision to the end of the episode.
+    """
+
+    algorithm: Literal["rollout-classification"]
+    policies: Annotated[tuple[Text, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
+        (), description="trained policies; at a decision the network can let one of them act; left out: none"
+    )
+    near: Annotated[tuple[Range, ...], Field(strict=False, max_length=8)] = Field(
+        description="ranges of distances; from each range one distance is drawn, and the actions this far below and"
+        " above the policy's action are tried"
+    )
+    fixed: Annotated[tuple[Action, ...], Field(strict=False, max_length=16)] = Field(
+        description="actions that are always tried; rounded to the nearest choice of the network"
+    )
+    drawn: int = Field(
+        ge=0, le=16, description="number of choices that are drawn and tried: policies if there are any, else actions"
+    )
+    largest_cost: Positive = Field(
+        description="limit of an action's extra cost (its cost minus the best tried action's cost)"
+    )
+    caution: NonNegative = Field(
+        0.0,
+        exclude_if=not_,
+        description="weight of a further cost, which is the action's cost minus the cost of full braking to the end of"
+        " the episode, if positive; the weight grows from 0 to this value during the training",
+    )
+    tie_break: NonNegative = Field(
+        0.0,
+        exclude_if=not_,
+        description="weight, in the cost, of the harm count (first or total) that the reward does not use",
+    )
+    relative: bool = Field(
+        False,
+        exclude_if=not_,
+        description="true: in a mixture of scenarios, a cost is divided by the mean cost in its scenario",
+    )
+    focus: float = Field(
+        0.0,
+        ge=0.0,
+        le=0.99,
+        exclude_if=not_,
+        description="share of the remembered decisions that are drawn in proportion to their largest extra cost",
+    )
+    guide: NonNegative = Field(
+        description="weight of the convex term of the loss; without it learning can stall at the beginning"
+    )
+    memory: int = Field(
+        ge=1, le=500_000, description="number of decisions in memory, from which the network learns: the latest ones"
+    )
+    gradient_steps: int = Field(ge=1, le=100_000, description="number of steps of the optimiser in one update")
+    network: ChoosingShape = Field(description=NETWORK)
+
+    @property
+    def others(self) -> int:
+        """Number of choices, beside the policy's own, that are tried at a decision."""
+        return 2 * len(self.near) + len(self.fixed) + self.drawn
+
+    @model_validator(mode="after")
+    def _choices_fit(self) -> Self:
+        if not self.memory >= self.tried:
+            refuse(("memory",), self.memory, f"must be at least tried, which is {self.tried}")
+        if not self.others:
+            refuse(("near",), list(self.near), "must contain a range, because the recipe has no fixed or drawn actions")
+        for name in self.policies:
+            kind, _, path = name.partition("@")
+            refuse_shipped_path(path, kind)
+        return self
+
+    @cached_property
+    def members(self) -> tuple[Member, ...]:
+        """The policies that the key ``policies`` names, and those among which one of them chooses.
+
+        Raises ``InvalidInput`` if one cannot be used, or if more choices are drawn than there are policies.
+        """
+        named = (named_policy(name, self.name, "policies") for name in self.policies)
+        members = tuple(member for policy in named for member in members_of(policy))
+        if members and not self.drawn <= len(members):
+            raise InvalidInput(
+                f"recipe {self.name!r}: drawn = {self.drawn}: drawn must be at most {len(members)}, the number of"
+                " policies"
+            )
+        return members
+
+    def network_spec(self, observation_size: int) -> NetworkSpec:
+        """Return the network, and those of the policies that it can choose."""
+        own = {"observation_size": observation_size, "value_hidden": ()}
+        among = tuple(each.network.model_copy(update=own) for each in self.members)
+        return (
+            super()
+            .network_spec(observation_size)
+            .model_copy(update={"output": "choice", "choices": self.network.choices, "among": among})
+        )
+
+
+VINE = Part(VineRecipe, "ethbrake_marl.extensions.learners.algorithms:Vine")
+ROLLOUT_CLASSIFICATION = Part(
+    RolloutClassificationRecipe, "ethbrake_marl.extensions.learners.algorithms:RolloutClassification"
+)
+
+
+def _agent(name: str, words: str) -> Part:
+    return Part(
+        make_trained,
+        form=f"{name}@PATH",
+        about=f"a policy trained by {words}; PATH is a run or a bundle",
+        knows=MESSAGES,
+    )
+
+
+VINE_AGENT = _agent("vine", "vine")
+ROLLOUT_CLASSIFICATION_AGENT = _agent("rollout-classification", "rollout classification")

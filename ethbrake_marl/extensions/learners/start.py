@@ -1,0 +1,99 @@
+"""Trained policies in a new training: to start from, or to choose among. It may observe more features than they do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.bundle import load_policy, load_shipped, shipped_policies
+from ethbrake_marl.policies.layers import Float32s
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+
+
+class Member(NamedTuple):
+    """The actor of a trained policy."""
+
+    network: NetworkSpec
+    tensors: dict[str, Float32s]
+    features: tuple[str, ...]  # that it observes
+
+
+def members_of(policy: Policy) -> list[Member]:
+    """Return the policies among which a policy chooses, or its own actor."""
+    features, network = tuple(policy.observation.names), policy.manifest.network
+    parts = {f"among_{m}.": member for m, member in enumerate(network.among, 1)} or {"": network}
+    return [
+        Member(
+            member,
+            {
+                name.removeprefix(prefix): tensor
+                for name, tensor in policy.tensors.items()
+                if name.startswith(prefix) and not name.startswith("value.")
+            },
+            features,
+        )
+        for prefix, member in parts.items()
+    ]
+
+
+def named_policy(name: str, recipe: str, key: str) -> Policy:
+    """Return a shipped policy, or that of ``ALGORITHM@PATH``. Raises ``InvalidInput`` if another algorithm trained it.
+
+    ``key`` of the recipe with the name ``recipe`` names the policy, for messages.
+    """
+    kind, _, path = name.partition("@")
+    policy = load_policy(path) if path else load_shipped(kind)
+    by = policy.manifest.algorithm
+    if path and kind not in ("policy", by):
+        raise InvalidInput(f"recipe {recipe!r}: {key}: {name}: this policy was trained by {by}; write {by}@{path}")
+    return policy
+
+
+def shipped_for(start: str, scenario: str) -> str | None:
+    """Return the shipped policy ``start`` or ``start-...`` that was trained on a scenario; None if there is none."""
+    names = [name for name in shipped_policies() if name == start or name.startswith(f"{start}-")]
+    return next((name for name in names if load_shipped(name).manifest.scenario.get("name") == scenario), None)
+
+
+def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
+    """Return the weights of ``policy`` for a training by the networks ``wanted``, which observes ``features``.
+
+    Raises ``InvalidInput`` for a mixture of experts, for other layers, and for a feature that is not observed.
+    """
+    network = policy.manifest.network
+    if network.networks > 1:
+        raise InvalidInput(
+            f"recipe {recipe!r}: start: the policy that this key names is a mixture of {network.networks} networks;"
+            " name a policy that has one network"
+        )
+    for name in ("policy_hidden", "activation", "output"):
+        if getattr(network, name) != getattr(wanted, name):
+            raise InvalidInput(
+                f"recipe {recipe!r}: network.{name} is {getattr(wanted, name)}, but must be {getattr(network, name)},"
+                " as in the policy that the key start names"
+            )
+    return widened(members_of(policy)[0], features, recipe, "start")
+
+
+def widened(member: Member, features: Sequence[str], recipe: str, key: str) -> dict[str, Float32s]:
+    """Return the weights of a policy that observes ``features``, and does not use those that it did not know.
+
+    Raises ``InvalidInput`` if the training does not observe a feature that the policy needs.
+    """
+    missing = [name for name in member.features if name not in features]
+    if missing:
+        raise InvalidInput(
+            f"recipe {recipe!r}: the observation lacks the features {', '.join(missing[:5])}, which the policy of the"
+            f" key {key} observes; add them to the observation"
+        )
+    columns = [list(features).index(name) for name in member.features]
+    tensors = {name: tensor.copy() for name, tensor in member.tensors.items()}
+    for name in [name for name in tensors if name.endswith(".0.weight")]:
+        first = np.zeros((len(tensors[name]), len(features)), np.float32)
+        first[:, columns] = tensors[name]
+        tensors[name] = first
+    return tensors

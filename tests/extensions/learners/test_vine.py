@@ -1,0 +1,75 @@
+"""Vine: targets by hand, policies to start from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.extensions.learners.algorithms import RandomStart
+from ethbrake_marl.extensions.learners.start import shipped_for
+from ethbrake_marl.extensions.learners.vine import Tried, trusted_targets
+from ethbrake_marl.training.recipe import load_recipe
+from ethbrake_marl.training.train import train
+from tests.extensions.learners.tiny import PAIR, VINE, new_model
+
+SMALL = {name: getattr(VINE, name) for name in ("n_envs", "n_steps", "tried", "batch_size", "evaluation")}
+STILL = load_recipe("vine").replace(**SMALL, learning_rate={"start": 1e-12, "end": 1e-12}, total_steps=1)
+
+
+def test_targets__keep_the_slope_and_stay_within_the_radius_and_the_bounds() -> None:
+    # r = 0.05 and k = 3: g = 0.15 moves by 0.15 / (3 + 3), g = 1e6 by almost 0.05, g = 0 not at all
+    gradient = np.array([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15, -1e6], np.float32)
+    mean = np.array([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0, -1.0], np.float32)
+    target, weight = trusted_targets(Tried(np.zeros((9, 1), np.float32), mean, gradient), 0.05, 3.0)
+    assert [round(float(each), 6) for each in target] == [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975, -1.0]
+    assert [round(float(each), 5) for each in weight[[0, 1, 2, 4]]] == [3.0, 6.0, 6.0, 3.0]
+    assert [round(float(each), 5) for each in (weight * (target - mean))[:3]] == [0.0, 0.15, -0.15]
+
+
+@pytest.mark.parametrize("limit", [0.01, 1e9])
+def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: float) -> None:
+    """Two learners with their own objectives: the difference between two whole episodes, played by hand."""
+    recipe = VINE.replace(gradient_limit=limit, holds=[2], tried=32, reward={"harm": 1.0, "objective": "own"})
+    model = new_model(recipe, PAIR)
+    states, seen = model.rows.episode.take(np.arange(8)), model._last_obs
+    tried = model.try_out(seen, states, model.policy)
+    assert len(tried.seen) == 16 and np.abs(tried.gradient).max() > (0.1 if limit > 1.0 else 0.0)
+    assert np.abs(tried.gradient).max() <= np.float32(limit)
+    row = next(k for k in range(16) if abs(tried.gradient[k]) == np.abs(tried.gradient).max())
+    (place,) = np.flatnonzero((seen == tried.seen[row]).all(axis=1))
+    game, gained = model.game, []
+    for offset in (1e-4, -1e-4):
+        now, total = states.take([place // 2]), 0.0
+        for number in range(200):
+            rows = game.observe_alike(now, game.rules.learners)[0]
+            actions = model.policy.act(rows).astype(np.float64)
+            actions[place % 2] += offset if number < 2 else 0.0
+            now, step = game.step(now, actions[np.newaxis])
+            total += step.reward[0, 1 + place % 2]
+            if now.ended[0]:
+                break
+        gained.append(total)
+    slope = (gained[0] - gained[1]) / 4e-4
+    assert tried.gradient[row] == pytest.approx(np.clip(slope, -limit, limit), rel=0.1)
+    cut = model.logger.name_to_value["train/gradient_cut"]
+    assert cut == 0.0 if limit > 1.0 else cut > 0.5
+
+
+def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> None:
+    policy = train(STILL, "paper-random", tmp_path / "run", measure=None, on_progress=None).policy
+    agents = {"old": eb.LearnedAgent(eb.load_shipped("ppo")), "new": eb.LearnedAgent(policy)}
+    found = eb.evaluate("paper-random", agents, episodes=50)
+    np.testing.assert_allclose(found["old"]["total_harm"], found["new"]["total_harm"], atol=1e-3)
+    assert (policy.manifest.algorithm, len(policy.manifest.observation.features)) == ("vine", 57)
+    assert eb.make_agent(f"vine@{tmp_path / 'run'}").name == f"vine@{tmp_path / 'run'}"
+    assert shipped_for("ppo", "paper-random-obstacle") == "ppo-obstacle"
+
+
+def test_training__starts_at_random_where_no_policy_ships_and_says_so(tmp_path: Path) -> None:
+    with pytest.warns(RandomStart, match="no policy ppo is shipped for scenario 'cooperation-2-five'"):
+        policy = train(STILL, "cooperation-2-five", tmp_path / "run", measure=None, on_progress=None).policy
+    seen = np.random.default_rng(0).uniform(0, 1, (50, 57)).astype(np.float32)
+    np.testing.assert_allclose(policy(seen), -0.9, atol=0.1)
