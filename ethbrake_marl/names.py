@@ -335,6 +335,16 @@ def open_game(
     return game_of(loaded, None, reward, observation, reward_vector, scripts_of(loaded))
 
 
+def check_learners(scenario: Scenario) -> None:
+    """Raise ``InvalidInput`` if no vehicle learns, so that agents could drive nobody."""
+    if not scenario.learners:
+        raise InvalidInput(
+            f"scenario {scenario.name!r} has no learner that the agents could drive; choose the scenario that the"
+            " agents were trained for, or make a vehicle a learner: scenario.with_learners(['vehicle_2']), on the"
+            " command line --set roles.vehicle_2=learner"
+        )
+
+
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
     """Return the scripts of a scenario that look at the state, body -> agent."""
     scripts = {}

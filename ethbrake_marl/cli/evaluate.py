@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -23,7 +24,7 @@ from ethbrake_marl.files.store import check_folder
 
 if TYPE_CHECKING:
     from ethbrake_marl.cli.settings import Settings
-    from ethbrake_marl.evaluation.evaluate import Result
+    from ethbrake_marl.evaluation.compared import Compared
 
 GROUP_EPISODES = 400  # worlds of each scenario of a group; best known harms exist for these worlds of `benchmark`
 REPORT = "report.html"
@@ -76,37 +77,39 @@ def evaluate_command(
                     f"{option}: cannot be used with {scenario}, a group of {len(names)} scenarios; name one scenario"
                 )
         count = (GROUP_EPISODES if names else 10_000) if episodes is None else episodes
-        results = {name: _result(out, name, chosen, agents, count, seed, jobs, ray) for name in names or [scenario]}
+        every = {name: _compared(out, name, chosen, agents, count, seed, jobs, ray) for name in names or [scenario]}
         if report and output is not None:
+            write = page_of("evaluation", "--report")
             output.mkdir(parents=True, exist_ok=True)
-            page_of("evaluation", "--report")(
-                output / REPORT, scenario, agents=agents, episodes=count, seed=seed, settings=chosen.texts, force=force
-            )
+            write(output / REPORT, every[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
             out.note(f"report: {output / REPORT}")
-        _show(out, results, output, per_world, REPORT if report else "")
+        _show(out, every, output, per_world, REPORT if report else "")
 
 
-def _result(
+def _compared(
     out: Out, scenario: str, chosen: Settings, agents: str, episodes: int, seed: int, jobs: int | None, ray: str | None
-) -> Result:
+) -> Compared:
     """Return what the agents do in one scenario."""
-    from ethbrake_marl.evaluation.door import evaluate
+    from ethbrake_marl.evaluation.compared import Compared
+    from ethbrake_marl.names import teams_of
 
     harm_count, measures = chosen.command.get("harm_count", "first"), chosen.command.get("measures", "")
     if not isinstance(measures, str):
         raise InvalidInput("--set measures: must be names with commas between them, for instance measures=injury")
-    return evaluate(
-        chosen.change_scenario(scenario), agents, episodes=episodes, seed=seed, harm_count=harm_count,
+    loaded = chosen.change_scenario(scenario)
+    return Compared.of(
+        loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
         measures=measures, jobs=jobs or 1, ray=ray, on_done=lambda done: out.progress("worlds", done, episodes),
     )  # fmt: skip
 
 
-def _show(out: Out, results: dict[str, Result], output: Path | None, per_world: Any, page: str) -> None:
+def _show(out: Out, every: dict[str, Compared], output: Path | None, per_world: Any, page: str) -> None:
     """Write the files of an evaluation, and show its tables: one of a single scenario, or one of a group."""
     from ethbrake_marl.evaluation.results import write_results
-    from ethbrake_marl.evaluation.summary import summarise, summarise_lists
+    from ethbrake_marl.evaluation.summary import summarise_lists
 
-    tables = {name: summarise(result) for name, result in results.items()}
+    tables = {name: each.table for name, each in every.items()}
+    results = {name: each.result for name, each in every.items()}
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
         for name in {*FILES} - {page}:

@@ -15,10 +15,11 @@ def register_page(shows: str, write: Callable[..., None]) -> None:
     An installed package registers its function with an entry point of the group ``ethbrake_marl.pages``.
 
     Args:
-        shows: subject of the page: ``"evaluation"`` (``evaluate --report``) or ``"worlds"`` (``scenario sample``).
-        write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, the
-            evaluation, the results table and the agents by name; for ``"worlds"``, the path of the file, the scenario
-            and the sample. The calls in ``cli.evaluate`` and ``cli.scenario`` show its keyword arguments.
+        shows: subject of the page: ``"evaluation"`` (``evaluate --report``), ``"worlds"`` (``scenario sample``) or
+            ``"run"`` (``ethbrake run``).
+        write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, what was
+            compared (``evaluation.compared``), and the command; for ``"worlds"``, the path of the file, the scenario,
+            the number of worlds and the seed. For ``"run"`` it returns a ``training.experiment.Report``.
 
     """
     PAGES.add(shows, write, lambda other: other is write)

@@ -10,7 +10,7 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.evaluate import Result, evaluate as evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.named_measures import measures_called
-from ethbrake_marl.names import open_game, teams_of
+from ethbrake_marl.names import check_learners, open_game, teams_of
 from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.sampling import Drawn
 
@@ -69,12 +69,7 @@ def evaluate(
             raise InvalidInput("evaluate: worlds need their scenario, for instance scenario='paper-random'")
         scenario = "paper-random"
     loaded, game = open_game(scenario)
-    if not loaded.learners:
-        raise InvalidInput(
-            f"scenario {loaded.name!r} has no learner that the agents could drive; choose the scenario that the agents"
-            " were trained for, or make a vehicle a learner: scenario.with_learners(['vehicle_2']), on the command line"
-            " --set roles.vehicle_2=learner"
-        )
+    check_learners(loaded)
     about = about_scenario(loaded, None if given is not None else seed)
     if given is None:
         check_whole_number("episodes", episodes, 1)

@@ -108,7 +108,19 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
         )
     if not (isinstance(sample_s, int | float) and 0.0 < sample_s < math.inf):
         raise InvalidInput(f"record_episode: sample_s = {sample_s!r}: must be a finite number of seconds above 0")
-    states = [world, *(state for _, state in play(game, world, team))]
+    return record_episodes(world, team, game, sample_s)[0]
+
+
+def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
+    """Let a team drive some worlds together, and record the motion of each, as ``record_episode`` does."""
+    states = [worlds, *(state for _, state in play(game, worlds, team))]
+    return [_recorded([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
+
+
+def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> EpisodeRecord:
+    """Return the record of one world from its states at the alert, at all decisions and at the end."""
+    until = 2 + sum(not state.ended[0] for state in states[1:])
+    states, world = states[:until], states[0]
     pieces = [_between(before, after, sample_s) for before, after in pairwise(states)]
     times, lines, wanted = (np.concatenate(part) for part in zip(*pieces, strict=True))
     way_m = np.cumsum(lines[:, 0, GAP, 0] - lines[:, 1, GAP, 0])  # of Vehicle 1, up to the end of each piece

@@ -58,15 +58,16 @@ def write_results(
     rows: Rows | None = None,
     *,
     more: Mapping[str, Any] | None = None,
+    name: str = RESULTS,
     force: bool = False,
 ) -> list[Path]:
     """Write ``FOLDER/results.json`` and, with ``rows``, ``FOLDER/worlds.csv`` (``.parquet``, ``.json``); return paths.
 
-    ``more``: plain data that every object gets, such as settings. Raises ``AlreadyExists`` if a file exists and
-    ``force`` is false, and ``MissingExtra`` for Parquet without pyarrow.
+    ``name``: other name of the first file. ``more``: plain data that every object gets, such as settings. Raises
+    ``AlreadyExists`` if a file exists and ``force`` is false, and ``MissingExtra`` for Parquet without pyarrow.
     """
     target, objects = Path(folder), [{**each, **(more or {})} for each in table.to_json()]
-    written = [check_target(target / RESULTS, force=force)]
+    written = [check_target(target / name, force=force)]
     if result is not None and rows is not None:
         file = check_target(target / f"{WORLDS}.{rows}", force=force)
         write_rows(file, result, force=force)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import os
-from collections.abc import Mapping
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -23,6 +23,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 Status = Literal["running", "finished", "interrupted", "failed"]
 
 FORMAT = "ethbrake-run"
+OF_STATUS = ("format", "format_version", "status", "started_utc", "ended_utc")  # keys that every ``run.json`` has
 WRITTEN = "written"  # key of run.json: names of the files that ``ethbrake run`` has written after the training
 
 
@@ -78,6 +79,28 @@ class RunFolder:
         if status != "running":
             times["ended_utc"] = now
         write_json(self.status, {"format": FORMAT, "format_version": 1, "status": status, **times, **more})
+
+    @contextmanager
+    def stage(self, name: str, status: Status) -> Iterator[None]:
+        """Record in ``run.json`` what happens after the training: the stage, how it ends, and the files it has written.
+
+        ``status``: of the training, if nothing goes wrong.
+        """
+        kept = {key: value for key, value in read_object(self.status).items() if key not in OF_STATUS}
+        with self.held():
+            self.write_status("running", **kept, stage=name)
+            before = {path.name for path in self.path.iterdir()}
+            ended: Status = status
+            reason: str | None = None
+            try:
+                yield
+            except BaseException as error:
+                ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+                reason = repr(error)
+                raise
+            finally:
+                written = sorted({path.name for path in self.path.iterdir()} - before)
+                self.write_status(ended, **{**kept, "stage": name, "reason": reason, WRITTEN: written})
 
     def training(self) -> Training:
         """Return the training that a run records.

@@ -7,6 +7,7 @@ import json
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from ethbrake_marl.episode.objectives import OBJECTIVES, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.manifest import installed_versions
@@ -68,6 +69,18 @@ class Training(NamedTuple):
         """Columns of a row that each learner observes."""
         place = {name: column for column, name in enumerate(self.row.names)}
         return [[place[name] for name in view.names] for view in self.views]
+
+    @property
+    def objective(self) -> str:
+        """What the learners minimise, such as ``own``; empty if it is the harm of the whole line."""
+        declared = self.recipe.reward.objective or self.scenario.objective
+        objectives = objectives_of(declared, self.scenario.vehicles)
+        whole = all(each.kind is OBJECTIVES["total"] for each in objectives)
+        if whole or not self.recipe.reward.harm:
+            return ""
+        if isinstance(declared, str):
+            return declared
+        return ", ".join(dict.fromkeys(declared[body - 1] for body in self.scenario.learners))
 
     def content(self) -> dict[str, dict[str, Any]]:
         """Return everything that affects the training as plain data: defaults too, words not."""

@@ -1,4 +1,4 @@
-"""Figures of harm: mean harm, distribution of regret, and harm in worlds with avoidable and unavoidable contact."""
+"""Figures of harm: its mean, its distribution, and how it depends on the gaps at the alert."""
 
 from __future__ import annotations
 
@@ -9,9 +9,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.captions import caption, ranges_of
+from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.evaluation.statistics import mean
+from ethbrake_marl.evaluation.summary import SummaryTable
+from ethbrake_marl.extensions.rendering.picture import COLOURS
+from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
 from ethbrake_marl.extensions.report.page import SLIM_IN
 from ethbrake_marl.extensions.report.style import (
     TITLES,
+    band,
     finish,
     in_our_style,
     label_text,
@@ -20,48 +28,38 @@ from ethbrake_marl.extensions.report.style import (
     plain,
     series_style,
 )
-from ethbrake_marl.extensions.search.limit_measures import best_known_words
-from ethbrake_marl.extensions.search.regret import regrets_of
-from ethbrake_marl.first_edition.envs.rendering import COLOURS
-from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
-from ethbrake_marl.first_edition.evaluation.summary_row import SummaryRow
-from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
 
-_POINTS = 250  # number of points of a curve; more points would not be visible
-
-_PARTS = (
-    ("best known harm", "#bbbbbb", ""),
-    ("regret, contact unavoidable", COLOURS[2], "//"),
-    ("regret, contact avoidable", COLOURS[1], ".."),
-)
+POINTS = 250  # of a curve; more would not be visible
 
 
 @in_our_style
 def harm_by_agent(
-    rows: Sequence[SummaryRow],
-    harm_count: HarmCount = "first",
-    elsewhere: Mapping[str, Sequence[SummaryRow]] | None = None,
+    table: SummaryTable,
+    count: str = "first",
+    known: BestKnown | None = None,
+    elsewhere: Mapping[str, SummaryTable] | None = None,
 ) -> Figure:
-    """Draw the mean harm of each agent as a bar with its 95 % interval.
+    """Draw the mean harm of each agent as a bar with its 95 % interval, narrow enough for a phone.
 
-    A vertical line marks the mean best known harm. Markers show the agent's mean harm in other tests; ``elsewhere`` has
-    the results of each test under its title. The figure is narrow enough for the screen of a phone.
+    A vertical line is the mean best known harm. Marks are the agents' means in other tests, title -> table.
     """
-    figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(rows)))
-    name = {"first": "first_impact_harm", "total": "total_harm"}[harm_count]
-    for k, row in enumerate(rows):
-        axes.barh(k, getattr(row, name).value, height=0.62, color=COLOURS[2])
-        axes.hlines(k, *getattr(row, name).ends, color=COLOURS[0], linewidth=1.6)
-    if (best := rows[0][f"best_known_{name}"]) is not None:
-        axes.axvline(best.value, color=COLOURS[3], linewidth=1.6, linestyle="--", label=best_known_words(rows[0]))
-    for number, (title, others) in enumerate((elsewhere or {}).items()):
-        harms = {row.agent: getattr(row, name).value for row in others}
-        places = [k for k, row in enumerate(rows) if row.agent in harms]
+    figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(table)))
+    for k, row in enumerate(table):
+        estimate = row.estimates[HARM[count]]
+        assert estimate is not None
+        axes.barh(k, estimate.value, height=0.62, color=COLOURS[2])
+        axes.hlines(k, *estimate.ends, color=COLOURS[0], linewidth=1.6)
+    if known is not None:
+        best = float(known.harm[count].mean())
+        axes.axvline(best, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
+    for number, (title, other) in enumerate((elsewhere or {}).items()):
+        harms = {row.agent: each.value for row in other if (each := row.estimates[HARM[count]]) is not None}
+        places = [k for k, row in enumerate(table) if row.agent in harms]
         style = series_style(number + 4) | {"linestyle": "none", "markersize": 6.0}
-        axes.plot([harms[rows[k].agent] for k in places], places, label=label_text(title.lower(), 22), **style)
-    name_axes(axes, x=TITLES[harm_count])
+        axes.plot([harms[table[k].agent] for k in places], places, label=label_text(title.lower(), 22), **style)
+    name_axes(axes, x=TITLES[count])
     axes.set_xlim(left=0.0)
-    _name_rows(axes, [row.agent for row in rows], most=22)
+    _name_rows(axes, [row.agent for row in table], most=22)
     axes.tick_params(labelsize=8)
     named = axes.get_legend_handles_labels()
     figure.legend(
@@ -71,61 +69,66 @@ def harm_by_agent(
 
 
 def _name_rows(axes: Axes, agents: Sequence[str], most: int = 40) -> None:
-    """Label the rows of a figure with the agents' names, at most ``most`` characters each, the first agent on top."""
     axes.set_yticks(range(len(agents)), [label_text(agent, most) for agent in agents])
     axes.invert_yaxis()
 
 
 @in_our_style
-def regret_distribution(evaluation: Evaluation) -> Figure:
-    """Draw, for every x, the fraction of worlds in which an agent's regret exceeds x, for each agent and harm count.
-
-    If the best known harm of the worlds was not computed, the figure shows the agents' harm instead of their regret.
-    """
-    regrets = regrets_of(evaluation)
+def harm_above(result: Result) -> Figure:
+    """Draw, for every x, the share of worlds in which an agent's regret is above x; its harm if no best is known."""
+    known = BestKnown.of(result)
     figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
-    for axes, count in zip(panels, HARM_COUNTS, strict=True):
-        for number, (agent, outcome) in enumerate(evaluation.outcomes.items()):
-            values = outcome.ledger.world_harm(count) if regrets is None else regrets.regret(outcome, count)
-            ordered = np.sort(values)  # thresholds: the values themselves, thinned to _POINTS
-            chosen = np.unique(np.linspace(0, len(ordered) - 1, min(_POINTS, len(ordered))).astype(np.int64))
-            thresholds = np.concatenate([[0.0], ordered[chosen]])
-            share = [float((ordered > threshold).mean()) for threshold in thresholds]
-            style = {**series_style(number), "markevery": 40}
-            axes.plot(thresholds, share, label=label_text(agent), **style)
+    for axes, (count, harm) in zip(panels, HARM.items(), strict=True):
+        for number, agent in enumerate(result.columns):
+            ordered = np.sort(result[agent][harm] if known is None else known.regret(result, agent, count))
+            chosen = np.unique(np.linspace(0, len(ordered) - 1, min(POINTS, len(ordered))).astype(np.int64))
+            at = np.concatenate([[0.0], ordered[chosen]])
+            share = [float((ordered > value).mean()) for value in at]
+            axes.plot(at, share, label=label_text(agent), **series_style(number), markevery=40)
         axes.set_xscale("symlog", linthresh=1.0, linscale=0.4)
         axes.xaxis.set_major_formatter(FuncFormatter(plain))
         axes.set_xlim(left=0.0)
         axes.set_ylim(0.0, 1.0)
-        what = "Harm" if regrets is None else "Regret"
-        name_axes(axes, x=f"{what}, {TITLES[count][0].lower()}{TITLES[count][1:]}")
+        name_axes(axes, x=f"{'Harm' if known is None else 'Regret'}, {TITLES[count][0].lower()}{TITLES[count][1:]}")
     name_axes(panels[0], y="Worlds above this value")
     panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    caption = f"Linear up to 1 m²/s², logarithmic beyond. {evaluation.conditions.line}."
-    return finish(figure, caption, panels[0], columns=5)
+    note = f"Linear up to 1 m²/s², logarithmic beyond. {line(result)}."
+    return finish(figure, note, panels[0], columns=5)
 
 
 @in_our_style
-def harm_in_parts(evaluation: Evaluation) -> Figure:
-    """Draw the mean harm of each agent as a bar of three parts.
+def harm_against_total_gap(result: Result, *, bins: int = 12) -> Figure:
+    """Draw each agent's mean harm, with 95 % intervals, against the sum of the gaps at the alert.
 
-    The parts are the best known harm, the regret in worlds with unavoidable contact, and the regret in worlds with
-    avoidable contact. The evaluation needs a proof, for each world, whether contact is avoidable.
+    ``bins``: intervals of equal width into which the sums are divided. Raises ``InvalidInput`` for less than 1.
     """
-    regrets = regrets_of(evaluation)
-    avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    assert regrets is not None and avoidable is not None
-    figure, panels = new_panels((10.0, 1.4 + 0.36 * len(evaluation.outcomes)), columns=2, sharey=True)
-    for axes, count in zip(panels, HARM_COUNTS, strict=True):
-        for k, outcome in enumerate(evaluation.outcomes.values()):
-            regret, left = regrets.regret(outcome, count), 0.0
-            parts = (regrets.best(count).mean(), (regret * ~avoidable).mean(), (regret * avoidable).mean())
-            for part, (label, colour, hatch) in zip(map(float, parts), _PARTS, strict=True):
-                axes.barh(
-                    k, part, left=left, height=0.62, color=colour, hatch=hatch, edgecolor="#ffffff", linewidth=0.5,
-                    label=label if k == 0 else None,
-                )  # fmt: skip
-                left += part
-        name_axes(axes, x=TITLES[count])
-    _name_rows(panels[0], list(evaluation.outcomes))
-    return finish(figure, f"Mean over the worlds. {evaluation.conditions.line}.", panels[0], columns=5)
+    if not bins >= 1:
+        raise InvalidInput(f"harm_against_total_gap: bins = {bins}: the number of bins must be at least 1")
+    by, names = result.clusters, [name for name in result.worlds if name.startswith("gap_")]
+    gap = np.sum([result.worlds[name] for name in names], axis=0)
+    part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * bins).astype(np.int64), bins - 1)
+    groups = [part == k for k in np.unique(part)]
+    at = [float(gap[group].mean()) for group in groups]
+    sums = " + ".join(f"d{p + 1}" for p in range(len(names))) if len(names) <= 3 else f"d1 + … + d{len(names)}"
+    figure, panels = new_panels((10.0, 4.6), columns=2, sharey=True)
+    for axes, (count, harm) in zip(panels, HARM.items(), strict=True):
+        for number, agent in enumerate(result.columns):
+            values, style = result[agent][harm], series_style(number)
+            estimates = [mean(values[group], None if by is None else by[group]) for group in groups]
+            axes.plot(at, [each.value for each in estimates], label=label_text(agent), **style)
+            low, high = zip(*(each.ends for each in estimates), strict=True)
+            if len(groups) > 1:
+                band(axes, at, low, high, style)
+            else:
+                axes.vlines(at, low, high, color=str(style["color"]), linewidth=1.2)
+        name_axes(axes, TITLES[count], f"Total gap at the alert, {sums} (m)")
+    panels[0].set_ylim(bottom=0.0)  # after all curves are drawn; of both panels
+    note = f"Mean over worlds with similar gaps; bands: 95 % intervals. {line(result)}."
+    return finish(figure, note, panels[0])
+
+
+def line(result: Result) -> str:
+    """Return the worlds of a result in one line."""
+    by = result.clusters
+    recordings = {} if by is None else {"recordings": len(np.unique(by))}
+    return caption({**result.about, **recordings, **ranges_of(result.worlds)})

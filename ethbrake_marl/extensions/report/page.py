@@ -15,16 +15,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.extensions.report.player import DATA, PLAYER_SCRIPTS, Played
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.first_edition.envs.rendering import BODY_M
-from ethbrake_marl.first_edition.evaluation.conditions import Conditions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -75,7 +72,8 @@ class Part:
     @classmethod
     def box(cls, title: str, meanings: Mapping[str, str]) -> Part:
         """Return a box that explains words; ``meanings`` maps each word to its meaning."""
-        return cls(Markup('<aside class="box"><strong>{}</strong>{}</aside>\n').format(title, cls.facts(meanings).html))
+        markup = Markup('<aside class="box"><strong>{}</strong>{}</aside>\n')
+        return cls(markup.format(shown(title), cls.facts(meanings).html))
 
     @classmethod
     def beside(cls, parts: Sequence[Part]) -> Part:
@@ -155,65 +153,6 @@ class Part:
                 base64.b64encode(svg).decode(), caption,
             )
         )  # fmt: skip
-
-    @classmethod
-    def player(
-        cls,
-        worlds: Sequence[Played],
-        driven: Sequence[int] | Mapping[str, Sequence[int]],
-        *,
-        focus: str = "",
-        shown_first: Sequence[int] = (),
-        folded: bool = False,
-    ) -> Part:
-        """Return the episode player, which shows the same worlds driven by different agents.
-
-        Args:
-            worlds: worlds to show, at least one, with the episode of each agent.
-            driven: indices (0 = front) of the controlled vehicles. If different agents control different vehicles, give
-                a mapping from the name of each agent to the indices of its vehicles.
-            focus: agent that is shown at the start if ``shown_first`` is empty.
-            shown_first: indices of the agents that are shown at the start. If empty, up to three agents are shown:
-                ``focus``, the first agent, and agents from the end of the list.
-            folded: True: the curves over time are hidden until the reader clicks on their title.
-
-        """
-        agents, one = list(worlds[0].motions), next(iter(worlds[0].motions.values())).world
-        by_agent = driven if isinstance(driven, Mapping) else dict.fromkeys(agents, driven)
-        middle = [agents.index(focus)] if focus in agents else []
-        order = dict.fromkeys([*middle, 0, *reversed(range(len(agents)))])
-        data: list[dict[str, Any]] = []
-        for world in worlds:
-            alert = next(iter(world.motions.values())).world
-            title = shown(world.title or f"World {world.number}")
-            episodes = [Played.episode(motion, by_agent[agent]) for agent, motion in world.motions.items()]
-            data.append({
-                "conditions": f"{title}: {Conditions.of(alert).quantities}.",
-                "episodes": episodes,
-                "number": world.number,
-                "title": title,
-                "kind": shown(world.kind),
-                "why": shown(world.why),
-            })  # fmt: skip
-        content = {
-            "vehicles": one.N,
-            "agents": [shown(agent) for agent in agents],
-            # the first agent, the focus, and the last ones, up to three
-            "shown": list(shown_first) or sorted(list(order)[:3]),
-            "worlds": data,
-        }
-        shielded = any(episode["stepped"] for world in data for episode in world["episodes"])
-        return cls.template(
-            "player.html.j2",
-            ("player.css",),
-            PLAYER_SCRIPTS,
-            vehicles=one.N,
-            shielded=shielded,
-            folded=folded,
-            name=DATA,
-            episodes=cls.data(DATA, content).html,
-            body=BODY_M,
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,14 +1,14 @@
-"""Rows of the paper's two tables of results, and a check whether an evaluation uses the same test as the paper."""
+"""The paper's two tables of results, and the scenarios whose results stand beside them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from ethbrake_marl.extensions.report.three_tests import is_as_shipped
-from ethbrake_marl.first_edition.evaluation.notes import Note
-from ethbrake_marl.first_edition.evaluation.summary import RowsBeside, SummaryTable
-from ethbrake_marl.first_edition.scenario.task import Task
+from ethbrake_marl.files.sheet import Row
+from ethbrake_marl.worlds.scenario import Scenario
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,35 +61,31 @@ PAPER_NOTE = (
     " equations, figures and tables one by one."
 )
 
-_SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant that PAPER_NOTE mentions
+SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant that PAPER_NOTE mentions
 
 
-def is_papers_test(task: Task, seed: int | None) -> bool:
-    """Return whether an evaluation can be compared with the paper's rows.
-
-    This is true if the scenario is ``paper-random`` or ``paper-random-early`` as shipped, only Vehicle 2 is controlled,
-    and the seed of the list of worlds is known (not None).
-    """
-    scenario = task.scenario
-    return scenario.name in _SHOWN_WITH and seed is not None and task.vehicles == (1,) and is_as_shipped(scenario)
+def is_papers_test(scenario: Scenario) -> bool:
+    """Return whether results in a scenario can be compared with the paper's: it is one of these, as shipped."""
+    return scenario.name in SHOWN_WITH and is_as_shipped(scenario)
 
 
-def with_paper_rows(table: SummaryTable) -> SummaryTable:
-    """Return ``table`` with the rows of the paper's tables at the end."""
-    return SummaryTable(table, _beside())
-
-
-def _beside() -> RowsBeside:
-    rows: list[str | tuple[str, dict[str, str]]] = []
+def paper_rows(names: Sequence[str]) -> list[Row]:
+    """Return the rows of the paper's tables for a table with the columns ``names``; the first has the agent."""
+    rows: list[Row] = []
     for paper in PAPER_ROWS:
-        section = f"paper, {paper.table}"
+        section = f"The paper's {paper.table}, as printed"
         rows += [] if section in rows else [section]
-        texts = {
+        cells = {
+            names[0]: paper.agent,
             "collision_rate": f"{100 * paper.collision_rate:.4g} %",
             "first_impact_harm": f"{paper.average_harm:.6g}",
         }
         if paper.harm_decrease is not None:
-            texts["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
-        rows.append((paper.agent, texts))
-    conditions: list[Note] = [("quiet", f"Paper, {name}: {text}.") for name, text in PAPER_PARAMETERS.items()]
-    return RowsBeside(rows, [*conditions, ("note", PAPER_NOTE)])
+            cells["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
+        rows.append([cells.get(name) for name in names])
+    return rows
+
+
+def paper_notes() -> list[str]:
+    """Return the conditions of the paper's tables, and what is odd about them."""
+    return [*(f"Paper, {name}: {text}." for name, text in PAPER_PARAMETERS.items()), PAPER_NOTE]

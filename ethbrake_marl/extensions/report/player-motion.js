@@ -1,15 +1,15 @@
 "use strict";
-// Exact motion of N vehicles. An episode is a list of pieces (stretches of time with constant jerk). A piece has 1 + 3 N
-// numbers: the time at which it begins, the place of Vehicle 1, the gaps, the speeds and the accelerations. If brakes
-// build up, the N jerks follow. The functions of this file do not change the page.
+// Motion of N vehicles. An episode is a list of pieces (stretches of time with constant acceleration). A piece has 1 + 3 N
+// numbers: the time at which it begins, the place of Vehicle 1, the gaps, the speeds and the accelerations. The functions
+// of this file do not change the page.
 
 const BODY_M = 4.5; // length of a drawn vehicle; in the physics, vehicles have no length
 const FLASH_S = 0.3; // how long an impact is shown
 
-function decodePieces(text, vehicles, jerks) {
+function decodePieces(text, vehicles) {
   const bytes = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
   const view = new DataView(bytes.buffer);
-  const width = 1 + (jerks ? 4 : 3) * vehicles;
+  const width = 1 + 3 * vehicles;
   const pieces = [];
   for (let at = 0; at < bytes.length; at += 8 * width) {
     const n = (k) => view.getFloat64(at + 8 * k, true);
@@ -20,7 +20,6 @@ function decodePieces(text, vehicles, jerks) {
       gaps: some(2, vehicles - 1),
       speeds: some(1 + vehicles, vehicles),
       accelerations: some(1 + 2 * vehicles, vehicles),
-      jerks: jerks ? some(1 + 3 * vehicles, vehicles) : null,
     });
   }
   return pieces;
@@ -40,13 +39,12 @@ function lastBegun(list, time, timeOf) {
 
 function moveOn(piece, time) {
   const t = time - piece.time;
-  const jerkOf = (i) => (piece.jerks === null ? 0 : piece.jerks[i]);
-  const ways = piece.speeds.map((v, i) => (v + 0.5 * (piece.accelerations[i] + (jerkOf(i) * t) / 3) * t) * t);
+  const ways = piece.speeds.map((v, i) => (v + 0.5 * piece.accelerations[i] * t) * t);
   return {
     front: piece.front + ways[0],
     gaps: piece.gaps.map((gap, p) => Math.max(gap + ways[p] - ways[p + 1], 0)),
-    speeds: piece.speeds.map((v, i) => v + (piece.accelerations[i] + 0.5 * jerkOf(i) * t) * t),
-    accelerations: piece.accelerations.map((a, i) => a + jerkOf(i) * t),
+    speeds: piece.speeds.map((v, i) => v + piece.accelerations[i] * t),
+    accelerations: piece.accelerations,
   };
 }
 
@@ -107,8 +105,7 @@ function restOf(episode) {
   return last.speeds.every((v) => v === 0) ? last.time : episode.end;
 }
 
-// Exact curves as SVG paths. In each piece a gap is quadratic in time, a speed linear and an acceleration constant. If
-// brakes build up, the degree of each curve is one higher.
+// Curves as SVG paths. In each piece a gap is quadratic in time, a speed linear and an acceleration constant.
 function curves(episode, until, x, y, vehicles) {
   const gaps = Array.from({ length: vehicles - 1 }, () => "");
   const speeds = Array.from({ length: vehicles }, () => "");
@@ -123,20 +120,13 @@ function curves(episode, until, x, y, vehicles) {
     const go = k === 0 ? "M" : "L";
     gaps.forEach((_, p) => {
       gaps[p] += `${go}${pair(piece.time, piece.gaps[p], y.gap)}`;
-      if (piece.jerks !== null) {
-        const early = piece.gaps[p] + ((piece.speeds[p] - piece.speeds[p + 1]) * t) / 3;
-        const late = after.gaps[p] - ((after.speeds[p] - after.speeds[p + 1]) * t) / 3;
-        gaps[p] += `C${pair(piece.time + t / 3, early, y.gap)} ${pair(end - t / 3, late, y.gap)} ${pair(end, after.gaps[p], y.gap)}`;
-        return;
-      }
       const middle = piece.gaps[p] + ((piece.speeds[p] - piece.speeds[p + 1]) * t) / 2;
       gaps[p] += `Q${pair(piece.time + t / 2, middle, y.gap)} ${pair(end, after.gaps[p], y.gap)}`;
     });
     speeds.forEach((_, i) => {
       const v = piece.speeds[i];
       const a = piece.accelerations[i];
-      const bend = piece.jerks === null ? "L" : `Q${pair(piece.time + t / 2, v + (a * t) / 2, y.speed)} `;
-      speeds[i] += `${go}${pair(piece.time, v, y.speed)}${bend}${pair(end, after.speeds[i], y.speed)}`;
+      speeds[i] += `${go}${pair(piece.time, v, y.speed)}L${pair(end, after.speeds[i], y.speed)}`;
       accelerations[i] += `${go}${pair(piece.time, a, y.acceleration)}L${pair(end, after.accelerations[i], y.acceleration)}`;
     });
   });

@@ -130,7 +130,7 @@ class Player {
     const world = this.data.worlds[this.world];
     return this.shown.map((k) => {
       const episode = world.episodes[k];
-      if (typeof episode.pieces === "string") episode.pieces = decodePieces(episode.pieces, this.data.vehicles, episode.jerks);
+      if (typeof episode.pieces === "string") episode.pieces = decodePieces(episode.pieces, this.data.vehicles);
       episode.agent = this.data.agents[k];
       return episode;
     });

@@ -1,85 +1,140 @@
-"""Data of the episode player: the motion of each episode, from which the player computes exact positions."""
+"""The episode player of a page: its data, pieces of motion between which the player computes places."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.first_edition.agents.protocol import Driver
-from ethbrake_marl.first_edition.evaluation.motion import EpisodeMotion, follow_episodes
-from ethbrake_marl.first_edition.physics.state import Worlds
-from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.evaluation.record import EpisodeRecord
+from ethbrake_marl.extensions.rendering.scene import BODY_M
+from ethbrake_marl.extensions.report.page import Part, shown
+from ethbrake_marl.extensions.report.style import quantities
+from ethbrake_marl.motion.layout import Floats
 
-PLAYER_SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
-
+SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
 DATA = "episode_data"  # id of the data in a page; no section has it
+SAMPLE_S = 0.005  # time between two samples of the motion
+SAME = 1e-8  # a sample is left out if the one before it, continued, is this close to it (m, m/s, m/s2)
+MOST_SHOWN = 3  # agents that are shown at the start
 
-_BIN_S = 1e-3  # s; if a pair has several impacts within this time, only the last one is drawn, but all are counted
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Played:
-    """One world of the episode player, with the motion of the vehicles under every agent."""
+    """One world of the player, with its episode under every agent."""
 
-    number: int  # number of the world in its list
+    number: int  # in its list
     kind: str  # heading of the group of worlds, which says why the world is shown
     why: str  # special property of the world, in a few words
-    motions: dict[str, EpisodeMotion] = field(default_factory=dict)  # motion of the vehicles, by name of the agent
-    title: str = ""  # title of the world; empty: "World" and its number
-
-    @staticmethod
-    def drive(played: Sequence[Played], worlds: Worlds, name: str, agent: Driver, scenario: Scenario) -> None:
-        """Let one agent drive the worlds (at the alert), and store the motion in each world as ``motions[name]``.
-
-        ``played`` has one object for each world. The agent is not changed. The scenario's learners are the controlled
-        vehicles.
-        """
-        for one, motion in zip(played, follow_episodes(worlds, agent, scenario), strict=True):
-            one.motions[name] = motion
-
-    @staticmethod
-    def episode(motion: EpisodeMotion, driven: Sequence[int]) -> dict[str, Any]:
-        """Return the data of one episode for the script of the player.
-
-        ``driven`` are the indices of the controlled vehicles.
-        """
-        obstacle = float(motion.world.obstacle_gap_m[0])
-        without = 1 + 3 * motion.world.N
-        jerks = bool(motion.pieces[:, without:].any())
-        pieces = np.ascontiguousarray(motion.pieces if jerks else motion.pieces[:, :without], np.dtype("<f8"))
-        return {
-            **({"jerks": True} if jerks else {}),
-            "pieces": base64.b64encode(pieces.tobytes()).decode("ascii"),
-            "end": motion.end_s,
-            "impacts": _impacts(motion),
-            "stepped": motion.stepped_in_s.tolist(),
-            "driven": list(driven),
-            "rest": motion.at_rest,
-            "obstacle": obstacle if np.isfinite(obstacle) else None,
-        }
+    records: dict[str, EpisodeRecord] = field(default_factory=dict)  # by agent; samples ``SAMPLE_S`` apart
+    title: str = ""  # "": "World" and its number
 
 
-def _impacts(motion: EpisodeMotion) -> list[list[float]]:
-    """Return a list of seven numbers for each impact of an episode, earlier impacts first.
+def player(worlds: Sequence[Played], *, focus: str = "", shown_first: Sequence[int] = (), folded: bool = False) -> Part:
+    """Return the player of at least one world, all with the same agents.
 
-    The numbers are the time (s), the index of the pair, the closing speed (m/s), 1 for the first impact of the pair and
-    0 for a later impact, the number of the impact in the episode (from 1), the first-impact harm so far, and the total
-    harm so far (m2/s2). If a pair has several later impacts within the same 1 ms (``_BIN_S``), only the last is
-    returned. The two harms so far at the last impact equal the recorded harms of the episode exactly.
+    ``shown_first``: indices of the agents that are shown at the start; by default the first agent, ``focus``, and those
+    at the end of the list, up to three. ``folded``: curves over time are hidden until the reader asks for them.
     """
-    rows = motion.impacts
-    order = np.argsort(rows.time_s, kind="stable")
-    harm = rows.closing_speed_mps[order] ** 2
-    first, total = np.cumsum(harm * rows.first[order]), np.cumsum(harm)
-    if len(harm):
-        first[np.flatnonzero(rows.first[order])[-1] :], total[-1] = motion.harm
-    by_key: dict[tuple[int, int, bool], list[float]] = {}
-    for number, k in enumerate(order.tolist()):
-        time, pair, is_first = float(rows.time_s[k]), int(rows.pair[k]), bool(rows.first[k])
-        entry = [time, pair, float(rows.closing_speed_mps[k]), int(is_first), number + 1]
-        by_key[pair, int(time / _BIN_S), is_first] = [*entry, float(first[number]), float(total[number])]
-    return sorted(by_key.values(), key=lambda entry: (entry[0], entry[4]))
+    agents, alert = list(worlds[0].records), next(iter(worlds[0].records.values())).initial
+    middle = [agents.index(focus)] if focus in agents else []
+    order = list(dict.fromkeys([*middle, 0, *reversed(range(len(agents)))]))
+    data = [_world_data(each) for each in worlds]
+    content = {
+        "vehicles": alert.vehicles,
+        "agents": [shown(agent) for agent in agents],
+        "shown": list(shown_first) or sorted(order[:MOST_SHOWN]),
+        "worlds": data,
+    }
+    return Part.template(
+        "player.html.j2",
+        ("player.css",),
+        SCRIPTS,
+        vehicles=alert.vehicles,
+        shielded=any(episode["stepped"] for world in data for episode in world["episodes"]),
+        folded=folded,
+        name=DATA,
+        episodes=Part.data(DATA, content).html,
+        body=BODY_M,
+    )
+
+
+def _world_data(world: Played) -> Mapping[str, Any]:
+    alert, title = next(iter(world.records.values())).initial, shown(world.title or f"World {world.number}")
+    return {
+        "conditions": f"{title}: {quantities(alert)}.",
+        "episodes": [episode_data(record) for record in world.records.values()],
+        "number": world.number,
+        "title": title,
+        "kind": shown(world.kind),
+        "why": shown(world.why),
+    }
+
+
+def episode_data(record: EpisodeRecord) -> dict[str, Any]:
+    """Return what the scripts of the player read of an episode."""
+    obstacle = float(record.initial.obstacle_gap_m[0])
+    return {
+        "pieces": base64.b64encode(np.asarray(pieces_of(record), "<f8").tobytes()).decode("ascii"),
+        "end": float(record.time_s[-1]),
+        "impacts": _impacts(record),
+        "stepped": replaced_at_s(record),
+        "driven": [body - 1 for body in record.vehicles],
+        "rest": record.at_rest,
+        "obstacle": obstacle if np.isfinite(obstacle) else None,
+    }
+
+
+def pieces_of(record: EpisodeRecord) -> Floats:
+    """Return the motion as pieces of constant acceleration, [k, 1 + 3 N].
+
+    A piece: the time at which it begins (s), place of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2). An
+    impact between two samples ends a piece; the next one leads from there to the second sample. If something else
+    happens there as well, such as another impact, places are wrong by millimetres until the second sample.
+    """
+    time_s, speeds, N = record.time_s, record.speeds_mps, record.speeds_mps.shape[1]
+    rates = np.zeros_like(speeds)
+    rates[:-1] = np.diff(speeds, axis=0) / np.diff(time_s)[:, np.newaxis]
+    struck_s = np.array(sorted({*record.impacts.time_s.tolist()}))
+    struck = np.clip(np.searchsorted(time_s, struck_s, "right") - 1, 0, len(time_s) - 2)
+    for k in np.unique(struck).tolist():
+        rates[k] = rates[k - 1] if k else 0.0
+    rows = np.column_stack([time_s, record.positions_m[:, 0], record.gaps_m, speeds, rates])
+    goes_on = (np.abs(moved(rows[:-1], np.diff(time_s), N) - rows[1:, 1:]) <= SAME).all(axis=1)
+    later = rows[struck + 1]
+    begun = np.column_stack([struck_s, moved(later, struck_s - later[:, 0], N)])
+    pieces: Floats = np.concatenate([rows[np.append(True, ~goes_on)], begun])
+    return pieces[np.argsort(pieces[:, 0], kind="stable")]
+
+
+def moved(pieces: Floats, t: Floats, N: int) -> Floats:
+    """Return what pieces have become ``t`` (s) after their beginning, without the time."""
+    speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
+    ways = (speeds + 0.5 * rates * t) * t
+    gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]
+    return np.column_stack([pieces[:, 1] + ways[:, 0], gaps, speeds + rates * t, rates])
+
+
+def replaced_at_s(record: EpisodeRecord) -> list[float]:
+    """Return the times of the decisions at which a shield replaced an action (s)."""
+    shields = [(before.time_s, after.memories.get("shield")) for before, after in pairwise(record.states[1:])]
+    return [float(time_s[0]) for time_s, memory in shields if memory is not None and memory.intervened.any()]
+
+
+def _impacts(record: EpisodeRecord) -> list[list[float]]:
+    """Return seven numbers of each impact that is drawn, earlier ones first.
+
+    The time (s), the pair (-1: the obstacle), the closing speed (m/s), whether it is the pair's first impact, the
+    number of impacts so far, and both harms so far (m2/s2), which end with those of the episode.
+    """
+    rows, last = record.impacts, record.last
+    number, first, total = np.cumsum(rows.number), np.cumsum(rows.first_impact_harm), np.cumsum(rows.total_harm)
+    if len(number):
+        first[np.flatnonzero(rows.first_impact_harm)[-1] :], total[-1] = last.harm("first")[0], last.harm("total")[0]
+    is_first = rows.first_impact_harm > 0.0
+    columns = (rows.time_s, rows.pair - 1, rows.closing_speed_mps, is_first, number, first, total)
+    return [list(map(float, row)) for row in zip(*columns, strict=True)]

@@ -1,4 +1,4 @@
-"""Figure of training runs with several seeds: mean of a quantity at each training step, and spread between seeds."""
+"""Figures of trainings: the course of one, and the mean and spread of several with other seeds."""
 
 from __future__ import annotations
 
@@ -8,11 +8,22 @@ from typing import Self
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, PercentFormatter, StrMethodFormatter
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.report.style import GREY, band, finish, in_our_style, name_axes, new_panels, series_style
-from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.evaluation.summary_row import SummaryRow
+from ethbrake_marl.extensions.report.style import (
+    GREY,
+    TITLES,
+    band,
+    finish,
+    in_our_style,
+    label_text,
+    name_axes,
+    new_panels,
+    series_style,
+)
+from ethbrake_marl.motion.layout import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,3 +90,48 @@ def seed_curves(
         name_axes(axes, label, x_label)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     return finish(figure, caption, every[0])
+
+
+PANELS = (
+    ("first_impact_harm", TITLES["first"]),
+    ("total_harm", TITLES["total"]),
+    ("collision_rate", "Worlds with a collision"),
+)
+LEARNED = 3  # number of the style of what learns; references have the others
+
+
+@in_our_style
+def learning_curve(
+    points: Sequence[Mapping[str, float]],
+    *,
+    learned: str = "policy",
+    references: Sequence[SummaryRow] = (),
+    caption: str = "",
+) -> Figure:
+    """Draw both harms and the collision rate of what learns against the number of training steps.
+
+    Args:
+        points: evaluations, earliest first, with ``steps``, ``first_impact_harm``, ``total_harm``, ``collision_rate``.
+        learned: its name in the legend.
+        references: agents whose results are horizontal lines.
+        caption: text below the figure.
+
+    """
+    figure, panels = new_panels((10.0, 3.9), columns=3)
+    steps, style = [point["steps"] for point in points], series_style(LEARNED)
+    for axes, (name, label) in zip(panels, PANELS, strict=True):
+        values = [point[name] for point in points]
+        axes.plot(steps, values, color=style["color"], marker="o", markersize=3.5, label=learned)
+        for number, row in enumerate(references):
+            look = series_style(number if number < LEARNED else number + 1)
+            value = row.estimates[name]
+            assert value is not None
+            axes.axhline(
+                value.value, color=look["color"], linestyle=look["linestyle"], linewidth=1.2,
+                label=label_text(row.agent),
+            )  # fmt: skip
+        name_axes(axes, label, "Training steps")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.set_ylim(bottom=0.0)
+    panels[2].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    return finish(figure, caption, panels[0])

@@ -1,82 +1,57 @@
-"""Choice of the worlds that a report shows as episodes: worst worlds, typical worlds, random worlds and others."""
+"""Choice of the worlds that a page shows as episodes: the worst, the avoidable, the typical and some at random."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
+from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.evaluation.summary import BASELINE
+from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
 from ethbrake_marl.extensions.report.player import Played
-from ethbrake_marl.extensions.search.regret import regrets_of
-from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
-from ethbrake_marl.first_edition.game.harm import HarmCount
-from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
 
 MOST_WORLDS = 50
-
 WORST = 10
-
-_EACH = 5  # number of worlds of every kind except the worst and the random ones
-
-_RANDOM_SEED = 0
-
-BASELINE = "full_brake"
-
-ROUNDING = 1e-6  # m2/s2
-
-NAMES: dict[HarmCount, str] = {"first": "first_impact_harm", "total": "total_harm"}
-
-WORDS = {
-    "Contact": "Two vehicles, or Vehicle 1 and an obstacle, touch: the gap between them is 0.",
-    "Impact": "A contact with a closing speed above 0. The square of that speed is its harm.",
-    "Collision": "A world with at least one impact.",
-}
+EACH = 5  # worlds of every kind except the worst and the random ones
+TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
+RANDOM_SEED = 0
 
 
-def choose_shown(evaluation: Evaluation, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
-    """Choose at most ``most`` worlds of an evaluation to show as episodes.
+def choose_shown(result: Result, focus: str, *, most: int = MOST_WORLDS) -> dict[int, Played]:
+    """Return at most ``most`` rows to show, each once, in order of their kinds: row -> world, without episodes."""
+    first, total = (result[focus][HARM[count]] for count in ("first", "total"))
+    known, chosen = BestKnown.of(result), dict[int, Played]()
 
-    Return a dictionary from the index of each chosen world to a ``Played`` object without motion (``Played.drive`` adds
-    the motion). The worlds are chosen in this order: worlds in which the agent ``focus`` did worst, worlds with an
-    avoidable collision, worlds with the largest reduction of harm compared with full braking, worlds with more harm
-    than full braking, worlds with typical harm of the agent ``focus``, and random worlds.
-    """
-    outcome = evaluation.outcome(focus)
-    chosen: dict[int, Played] = {}
-    total, first = outcome.total_harm, outcome.first_impact_harm
-
-    def add(kind: str, rows: Sequence[int] | Ints, most_of_kind: int) -> None:
-        fresh = [int(row) for row in rows if int(row) not in chosen][: min(most_of_kind, most - len(chosen))]
-        for row in fresh:
+    def add(kind: str, rows: Iterable[int] | Ints, most_of_kind: int) -> None:
+        fresh = [int(row) for row in rows if int(row) not in chosen]
+        for row in fresh[: min(most_of_kind, most - len(chosen))]:
             why = f"{focus}: harm {first[row]:.2f} first-impact, {total[row]:.2f} total"
-            chosen[row] = Played(int(evaluation.index[row]), kind, why)
+            chosen[row] = Played(int(result.worlds["world"][row]), kind, why)
 
-    add(f"Where {focus} did worst", worst_rows(evaluation, focus), WORST)
-    regrets = regrets_of(evaluation)
-    avoidable = None if regrets is None else regrets.limits.proof.avoidable
-    if avoidable is not None:
-        add(f"Avoidable, and {focus} collided", _largest(total, outcome.collided & avoidable), _EACH)
-    if BASELINE in evaluation.outcomes and focus != BASELINE:
-        saved = evaluation.outcome(BASELINE).total_harm - total
-        add(f"Where {focus} saved most against {BASELINE}", _largest(saved, saved > 0.0), _EACH)
-        add(f"Where {focus} did more harm than {BASELINE}", _largest(-saved, saved < 0.0), _EACH)
+    add(f"Where {focus} did worst", worst_rows(result, focus), WORST)
+    if known is not None and known.avoidable is not None:
+        avoidable = result[focus]["collided"] & known.avoidable
+        add(f"Avoidable, and {focus} collided", largest(total, avoidable), EACH)
+    if BASELINE in result.columns and focus != BASELINE:
+        saved = result[BASELINE][HARM["total"]] - total
+        add(f"Where {focus} saved most against {BASELINE}", largest(saved, saved > 0.0), EACH)
+        add(f"Where {focus} did more harm than {BASELINE}", largest(-saved, saved < 0.0), EACH)
     order = np.argsort(total, kind="stable")
-    add(f"Typical of {focus}", [order[int(q * (len(order) - 1))] for q in (0.5, 0.6, 0.7, 0.8, 0.9)], _EACH)
-    add("Drawn at random", np.random.default_rng(_RANDOM_SEED).permutation(len(total))[: 2 * most], most)
+    add(f"Typical of {focus}", [order[int(q * (result.n - 1))] for q in TYPICAL], EACH)
+    add("Drawn at random", np.random.default_rng(RANDOM_SEED).permutation(result.n)[: 2 * most], most)
     return chosen
 
 
-def worst_rows(evaluation: Evaluation, focus: str) -> Ints:
-    """Return the indices of at most ten worlds in which the agent ``focus`` did worst, worst first.
-
-    The worst world has the largest regret in total harm or, if the best known harm is not available, the largest total
-    harm. Worlds whose regret (or harm) is 0 are omitted.
-    """
-    outcome, regrets = evaluation.outcome(focus), regrets_of(evaluation)
-    value = outcome.total_harm if regrets is None else regrets.regret(outcome, "total")
-    return _largest(value, value > 0.0)[:WORST]
+def worst_rows(result: Result, focus: str) -> Ints:
+    """Return at most ten rows in which an agent did worst, the worst first: by total harm minus the best known."""
+    known = BestKnown.of(result)
+    value = result[focus][HARM["total"]] if known is None else known.regret(result, focus, "total")
+    return largest(value, value > 0.0)[:WORST]
 
 
-def _largest(value: Floats, among: Bools) -> Ints:
-    order = np.argsort(-value, kind="stable")
+def largest(value: Floats, among: Bools) -> Ints:
+    """Return the rows that are true in ``among``, those with the largest value first."""
+    order: Ints = np.argsort(-value, kind="stable")
     return order[among[order]]

@@ -15,10 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, plain_text
+from ethbrake_marl.evaluation.captions import caption, ranges_of
+from ethbrake_marl.extensions.rendering.picture import COLOURS
 from ethbrake_marl.files.store import write_output
-from ethbrake_marl.first_edition.envs.rendering import COLOURS
-from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.worlds.describe import quantities_of
 
 # Curves differ by marker and dashes as well as by colour.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -175,3 +178,9 @@ TITLES = {"first": "First-impact harm (m²/s²)", "total": "Total harm (m²/s²)
 def plain(value: float, _: int) -> str:
     """Return the number at a tick of an axis as text such as 1000, not as a power of ten."""
     return f"{value:g}"
+
+
+def quantities(world: State) -> str:
+    """Return the quantities of one world in words: ``d = (7, 7) m; v = (20, 18, 20) m/s; ...``."""
+    ranges = ranges_of(quantities_of(world))
+    return caption({"scenario": "", "count": 1, **ranges}).partition("; ")[2]

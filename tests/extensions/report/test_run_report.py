@@ -1,76 +1,112 @@
-"""What a report adds to the folder of a run."""
+"""What the report adds to the folder of a run, and pages of commands."""
 
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
-import ethbrake_marl.first_edition as eb
-from ethbrake_marl.extensions.report.experiment import telling_world
-from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
+import ethbrake_marl as eb
+from ethbrake_marl.errors import _EXTRA_OF
+from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.extensions.report.learners import learners_sheets
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_test, paper_rows
+from ethbrake_marl.extensions.report.run import telling_row
+from ethbrake_marl.extensions.report.three_tests import TESTS, brief, is_as_shipped, other_tests
+from ethbrake_marl.training.experiment import run_experiment
 from tests.cli.test_train import ctrl_c_when, status_of
-from tests.fixtures.commands import rows_of, told_json
+from tests.extensions.report.conftest import compared_by
+from tests.fixtures.commands import Command, check_refused, told_json
+from tests.fixtures.page import Page
+from tests.test_imports import ended
+from tests.training.tiny import TINY
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
+PICTURES = {"learning_curve.png", "harm_against_gap.png", "trajectories.png"}
 
 
-def test_run__leaves_results_figures_report_and_policy(finished_run: Path) -> None:
+# ---- the folder of a run
+
+
+def test_run__leaves_results_pictures_page_and_policy(finished_run: Path) -> None:
     names = {path.name for path in finished_run.iterdir()}
-    assert names >= {
-        "config.json", "run.json", "progress.csv", "policy", "results.csv", "results.json", "per_world.csv",
-        "report.html", "learning_curve.png", "harm_against_gap.png", "trajectories.png",
-    }  # fmt: skip
-    page = (finished_run / "report.html").read_text()
-    assert page.count("<figure>") == page.count("data:image/svg") == 6  # three of them are in the pictures, too
-    assert page.count('"pieces":') == 50 * len(AGENTS)
-    assert status_of(finished_run, "status", "stage", "steps", "reason") == ("finished", "report", 256, None)
+    others = {f"results-{name}.json" for name in TESTS if name != "paper-random"}
+    assert names >= {"config.json", "policy", "results.json", "worlds.csv", "report.html", *PICTURES, *others}
+    html = (finished_run / "report.html").read_text()
+    assert html.count("<figure>") == html.count("data:image/svg") == 5  # three of them are in the pictures, too
+    assert html.count('"pieces":') == 50 * len(AGENTS)
+    page = Page(html)
+    assert "Every measure, and the paper's rows" in page.text and "33.5878" in page.text
+    assert "ethbrake run: paper-random" in page.text and "256 steps of 256 (finished)" in page.text
+    titles = [attributes.get("id") for tag, attributes in page.tags if tag == "section"]
+    assert {"results", "episodes", "worst-ten-worlds", "figures", "brake-only-test", "obstacle-test"} <= {*titles}
+    assert status_of(finished_run, "status", "stage", "steps", "reason") == ("finished", "evaluation", 256, None)
+    assert {*status_of(finished_run, "written")[0]} >= {"report.html", *PICTURES, *others}
 
 
 def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run: Path) -> None:
-    rows = json.loads((finished_run / "other_tests.json").read_text())
-    tests = ["paper-random-brake-only", "paper-random-obstacle"]
-    expected = [(test, agent) for test in tests for agent in ("full_brake", "e_v2x_bm", "trained policy", "hybrid")]
-    assert [(row["parameters"]["scenario"], row["agent"]) for row in rows] == expected
-    flat = rows_of(finished_run / "other_tests.csv")
-    assert [(line["scenario"], line["agent"]) for line in flat] == expected
-    for test, row in zip(tests, rows[::4], strict=True):
-        scenario = eb.load_scenario(test)
-        result = eb.evaluate(scenario.sample(60, 7), make_lineup(["full_brake"], scenario), scenario=scenario, seed=7)
-        assert row["total_harm"] == eb.summarise(result)[0].total_harm.value
+    for test in ("paper-random-brake-only", "paper-random-obstacle"):
+        saved = eb.read_result(finished_run / f"results-{test}.json")
+        assert [*saved.agents] == ["full_brake", "e_v2x_bm", "trained policy", "hybrid"]
+        right = eb.evaluate(test, f"full_brake,policy@{finished_run}", episodes=60)
+        for agent, spec in (("full_brake", "full_brake"), ("trained policy", f"policy@{finished_run}")):
+            mean = right[spec]["total_harm"].mean()
+            assert saved.estimate(agent, "total_harm").value == pytest.approx(mean, rel=1e-12)
 
 
 @pytest.mark.slow
 def test_run__json_prints_the_rows_alone_and_force_replaces(ethbrake, tiny_recipe, finished_run, tmp_path) -> None:
     folder = tmp_path / "again"
     shutil.copytree(finished_run, folder)
-    (folder / "per_world.csv").write_text("stale")
+    (folder / "worlds.csv").write_text("stale")
     answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "60", "--output", folder, "--force", "--json")
-    assert told_json(answer) == json.loads((finished_run / "results.json").read_text())
-    assert (folder / "per_world.csv").read_bytes() == (finished_run / "per_world.csv").read_bytes()
+    now, then = told_json(answer), json.loads((finished_run / "results.json").read_text())
+    assert now == [
+        {key: value for key, value in row.items() if key not in ("per_world", "results_sha256")} for row in then
+    ]
+    assert (folder / "worlds.csv").read_bytes() == (finished_run / "worlds.csv").read_bytes()
     assert "training" in answer.err and str(folder / "report.html") in answer.err
     assert all(picture.read_bytes().startswith(b"\x89PNG") for picture in folder.glob("*.png"))
 
 
-@pytest.mark.slow
 def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
-    ethbrake, tiny_recipe, tmp_path, monkeypatch
+    ethbrake: Command, tiny_recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undrawn: None
 ) -> None:
     folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:
         ctrl_c_when(patch, lambda shown: shown["done"] == 128)
-        answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "40", "--output", folder, "--json")
+        answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder, "--json")
     assert (answer.status, [row["agent"] for row in json.loads(answer.out)]) == (130, AGENTS)
     assert "interrupted after 128 steps; now evaluating the policy so far" in answer.err
     last = answer.err.splitlines()[-1]
     assert last.startswith("interrupted after 128 training steps") and str(folder) in last
-    assert status_of(folder, "status", "steps", "stage") == ("interrupted", 128, "report")
-    assert "interrupted" in (folder / "report.html").read_text()
+    assert status_of(folder, "status", "steps", "stage") == ("interrupted", 128, "evaluation")
+    assert "The training was interrupted. This is the trained policy" in (folder / "report.html").read_text()
     assert ethbrake("train", "--resume", folder).status == 0
     assert status_of(folder, "status", "steps") == ("finished", 256)
-    assert not [*folder.glob("*.html"), *folder.glob("*.png"), *folder.glob("results.*")]  # of the policy before
+    assert not [*folder.glob("*.html"), *folder.glob("*.png"), *folder.glob("results*")]  # of the policy before
+
+
+def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> None:
+    recipe = TINY.replace(total_steps=256, scheme="shared")
+    scenario = eb.load_scenario("cooperation-3-pair")
+    compared = run_experiment(recipe, scenario, tmp_path / "run", episodes=12)[0].compared
+    first, total, added = learners_sheets(compared)
+    for sheet, harm in ((first, "first_impact_harm"), (total, "total_harm")):
+        for agent, *cells in sheet.rows:
+            means = [compared.result[agent][f"{harm}{ending}"].mean() for ending in ("_1", "_2", "_3", "")]
+            assert [cell.value for cell in cells] == pytest.approx(means)
+            assert sum(cell.value for cell in cells[:3]) == pytest.approx(cells[3].value)
+    assert first.headings[1:] == ["Vehicle 1", "Vehicle 2", "Vehicle 3", "Whole line"]
+    for name, less, _ in added.rows:
+        mine = [compared.result[each]["first_impact_harm"] for each in (f"all but {name}", "trained team")]
+        assert less.value == pytest.approx((mine[0] - mine[1]).mean())
+    assert [row[0] for row in added.rows] == ["vehicle_2", "vehicle_3"]
+
+
+# ---- its parts
 
 
 @pytest.mark.parametrize(
@@ -81,9 +117,78 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
         ([0.0, 0.0], [0.0, 5.0], 0),  # full braking harms nobody
     ],
 )
-def test_telling_world__is_the_median_saving_among_harmful_worlds(before, after, row):
-    harms = {"full_brake": before, "trained policy": after}
-    by_count = {name: {"first": np.ones(4), "total": np.array(harm)} for name, harm in harms.items()}
-    outcome = {name: SimpleNamespace(world_harm=found.__getitem__) for name, found in by_count.items()}
-    evaluation = SimpleNamespace(outcome=outcome.__getitem__, outcomes=harms)
-    assert telling_world(evaluation, "total") == row
+def test_telling_row__is_the_median_saving_among_harmful_worlds(before: Any, after: Any, row: int) -> None:
+    result = {"full_brake": {"total_harm": np.array(before)}, "mine": {"total_harm": np.array(after)}}
+    assert telling_row(Compared(None, {}, result, None, "total"), "mine") == row  # type: ignore[arg-type]
+
+
+def test_three_tests__are_each_others_and_of_the_shipped_scenarios_only() -> None:
+    for name in TESTS:
+        assert {name, *(each.name for each in other_tests(eb.load_scenario(name)))} == {*TESTS}
+    changed = eb.load_scenario("paper-random").replace(horizon_s=9.0)
+    assert other_tests(changed) == other_tests(eb.load_scenario("realistic-pair")) == []
+    assert is_as_shipped(eb.load_scenario("paper-random").replace(title="Mine")) and not is_as_shipped(changed)
+    assert is_papers_test(eb.load_scenario("paper-random-early")) and not is_papers_test(changed)
+
+
+def test_brief__has_both_harms_of_each_test() -> None:
+    main = compared_by("paper-random", "full_brake,coast,constant:3", 30)
+    other = compared_by("paper-random-obstacle", "full_brake,coast", 30)
+    sheet = brief(main, {"paper-random-obstacle": other})
+    assert sheet.columns[-1].heading == "Obstacle:\nfirst, total"
+    for row, agent in zip(sheet.rows, main.teams, strict=True):
+        own = other.result.columns.get(agent)
+        harms = own and f"{own['first_impact_harm'].mean():.2f}, {own['total_harm'].mean():.2f}"
+        assert row[-1] == harms and len(row) == 5
+    assert "1.7 m beyond the place where Vehicle 1 stops by itself" in sheet.note and "30 worlds." in sheet.note
+
+
+def test_paper_rows__are_those_of_the_paper_in_their_columns() -> None:
+    rows = paper_rows(["Agent", "Knows", "collision_rate", "first_impact_harm", "harm_decrease_first"])
+    assert len(rows) == len(PAPER_ROWS) + 2
+    assert rows[1] == ["Non-E", None, "93.91 %", "33.5878", "0 %"]
+    assert rows[-1] == ["Hybrid", None, "59.9 %", "7.3641", None]
+    for paper in PAPER_ROWS:
+        assert paper.collision_rate == pytest.approx(paper.collisions / paper.episodes, abs=5e-5)
+        worst = next(each for each in PAPER_ROWS if each.table == "random test" and each.agent == "Non-E")
+        if paper.harm_decrease is not None:
+            assert paper.harm_decrease == pytest.approx(1 - paper.average_harm / worst.average_harm, abs=2e-4)
+
+
+# ---- pages and pictures of commands
+
+
+@pytest.mark.parametrize("name", ["realistic-mixed", "paper-scenario-1"])
+def test_sample__draws_a_picture(ethbrake: Command, tmp_path: Path, name: str) -> None:
+    for picture in (tmp_path / "a.png", tmp_path / "b.png"):
+        told = ethbrake("scenario", "sample", name, "--episodes", "40", "--output", picture)
+        assert (told.status, told.out, told.err) == (0, "", f"picture: {picture}\n")
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_evaluate__writes_the_page_of_its_own_numbers(ethbrake: Command, empty_folder: Path, undrawn: None) -> None:
+    def rear(game: Any, alert: Any, last: Any) -> Any:
+        """Speed at which the rear vehicle ends."""
+        return last.speeds_mps[:, -1]
+
+    eb.register_measure("rear_end_mps", rear, unit="m/s")
+    words = ("evaluate", "--agents", "full_brake,coast", "--episodes", "40", "--set", "measures=rear_end_mps")
+    rows = told_json(ethbrake(*words, "--output", "out", "--report", "--json"))
+    text = Page(Path("out/report.html").read_text()).text
+    assert "rear_end_mps (m/s)" in text and f"{rows[1]['rear_end_mps']:.2f}" in text
+    assert "coast does " in text and f"{rows[1]['first_impact_harm']:.2f}" in text and "vehicle_1 by full_brake" in text
+
+
+def test_evaluate__by_force_leaves_no_file_of_earlier_results(ethbrake: Command, tmp_path: Path, undrawn: None) -> None:
+    folder, line = tmp_path / "new", ("evaluate", "--agents", "coast", "--episodes", "3", "--output")
+    assert ethbrake(*line, folder, "--per-world", "csv", "--report").status == 0
+    (folder / "mine.txt").write_text("mine")
+    assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "report.html", "results.json", "worlds.csv"]
+    check_refused(ethbrake(*line, folder), "results.json: already exists")
+    assert ethbrake(*line, folder, "--force", "--per-world", "parquet").status == 0
+    assert sorted(each.name for each in folder.iterdir()) == ["mine.txt", "results.json", "worlds.parquet"]
+
+
+def test_report__is_imported_where_no_package_of_an_extra_can_be() -> None:
+    absent = "".join(f"sys.modules[{name!r}] = None\n" for name in sorted(_EXTRA_OF))
+    assert ended(f"import sys\n{absent}from ethbrake_marl.extensions import report") == (0, "", "")

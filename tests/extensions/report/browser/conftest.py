@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
 
 import ethbrake_marl.first_edition as eb
 from ethbrake_marl.extensions.report.page import Part
 from ethbrake_marl.extensions.report.report import Report
-from ethbrake_marl.extensions.report.run_figures import harm_against_total_gap
 from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")

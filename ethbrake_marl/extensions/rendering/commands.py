@@ -16,7 +16,6 @@ from ethbrake_marl.cli.command import (
     SettingsOption,
     example,
 )
-from ethbrake_marl.first_edition.training.commands import make_drivers, read_task
 from ethbrake_marl.registry import Part
 
 
@@ -36,17 +35,21 @@ def watch_command(
     The film shows the road to scale, the commands, the impacts and the harm. A PNG file shows three moments: the alert,
     the hardest impact, and the end.
     """
-    from ethbrake_marl.extensions.report.film import check_film, film
+    from ethbrake_marl.cli.settings import read_settings
+    from ethbrake_marl.extensions.rendering.film import check_film, film
+    from ethbrake_marl.names import check_learners, open_game, teams_of
 
     with Out(force=force) as out:
         out.check(output)
         check_film(output.suffix.lower())
         what = "pictures" if output.suffix.lower() == ".png" else "film"
-        task = read_task(scenario, settings)
-        worlds = task.scenario.sample(1, seed, first=world).worlds
-        named = make_drivers(agents, task).items()
-        titled = {f"{name}: world {world} of {task.scenario.name}": agent for name, agent in named}
-        out.write(output, film(worlds, titled, output.suffix.lower(), scenario=task.scenario), what=what)
+        chosen = read_settings(settings, of_command=("harm_count",))
+        loaded, game = open_game(chosen.change_scenario(scenario))
+        check_learners(loaded)
+        teams = teams_of(agents, loaded, harm_count=chosen.command.get("harm_count", "first"))
+        titled = {f"{name}: world {world} of {loaded.name}": team for name, team in teams.items()}
+        alert = loaded.sample(1, seed, first=world)
+        out.write(output, film(alert, titled, output.suffix.lower(), game), what=what)
 
 
 WATCH = Part(watch_command, epilog=example("watch --agents full_brake,e_v2x_bm --world 3 --output both.gif"))

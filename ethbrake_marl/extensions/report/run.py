@@ -1,0 +1,168 @@
+"""The report of ``ethbrake run``: a page, three pictures, and the results of the policy in the other two tests."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Sequence
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.errors import Unfamiliar
+from ethbrake_marl.evaluation.captions import caption
+from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.record import record_episode
+from ethbrake_marl.evaluation.results import write_results
+from ethbrake_marl.evaluation.summary import BASELINE
+from ethbrake_marl.extensions.report.best_known import HARM, MEASURE
+from ethbrake_marl.extensions.report.episode_figure import trajectories
+from ethbrake_marl.extensions.report.harm_figures import harm_against_total_gap
+from ethbrake_marl.extensions.report.learners import learners_sheets
+from ethbrake_marl.extensions.report.page import Part, Section
+from ethbrake_marl.extensions.report.paper_rows import is_papers_test, paper_notes, paper_rows
+from ethbrake_marl.extensions.report.report import Report, Test
+from ethbrake_marl.extensions.report.seed_curves import learning_curve
+from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests, title_of
+from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.names import open_game
+from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables
+from ethbrake_marl.training.run import RunFolder
+
+MOST_WORLDS = 2_000  # of each of the other two tests
+PAGE = "report.html"
+
+
+class RunReport:
+    """Report of an experiment (``training.experiment.Report``)."""
+
+    measures: tuple[str, ...] = (*Tables.measures, MEASURE)
+
+    def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
+        """Write results in the other tests, pictures and page; return tables to print, and where the page is."""
+        compared, folder = experiment.compared, experiment.trained.directory
+        single = experiment.learned != TEAM
+        tests, done = other_tests(compared.scenario) if single else [], count()
+
+        def begin(stage: str) -> None:
+            tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(tests)))
+
+        others: dict[str, Compared] = {}
+        for test in tests:
+            begin(f"the same policy in {test.name}")
+            with warnings.catch_warnings():  # the page says that the policy was not trained for this test
+                warnings.simplefilter("ignore", Unfamiliar)
+                few = min(compared.result.n, MOST_WORLDS)
+                others[test.name] = experiment.in_another(test, few, TEAM_BASELINES, Tables.measures)
+            write_results(folder, others[test.name].table, name=f"results-{test.name}.json", force=True)
+        learners = [] if single else learners_sheets(compared)
+        begin("figures")
+        figures = write_figures(experiment)
+        begin("page and episodes")
+        is_papers = is_papers_test(compared.scenario)
+        page = page_of(experiment, others, figures, [Section("Several learners", list(map(Part.table, learners)))])
+        page.write(folder / PAGE, force=True)
+        begin("")
+        more = " and the paper's rows" if is_papers else ""
+        tables = [brief(compared, others), *compared.table.tables()[1:], *learners]
+        return tables, f"report with all measures{more}: {folder / PAGE}"
+
+
+def write_figures(experiment: Experiment) -> list[Part]:
+    """Write three pictures into the run's folder, and return them as parts of a page."""
+    compared, learned = experiment.compared, experiment.learned
+    recipe, (_, game) = experiment.trained.training.recipe, open_game(compared.scenario)
+    shown = telling_row(compared, learned)
+    world, number = compared.worlds([shown]), int(compared.result.worlds["world"][shown])
+    plan, line = recipe.evaluation, caption(compared.table.parameters)
+    course = (
+        f"{compared.scenario.name}: worlds 0 to {plan.worlds - 1} of the list of seed {plan.seed} at every point;"
+        f" training seed {recipe.seed}. Horizontal lines: {line}."
+    )
+    references = [row for row in compared.table if row.agent in TEAM_BASELINES]
+    drawn = {
+        "learning_curve.png": (
+            "Learning curve",
+            "Harm and collisions on a fixed list of worlds during the training. The horizontal lines are baselines.",
+            learning_curve(experiment.trained.evaluations, learned=learned, references=references, caption=course),
+        ),
+        "harm_against_gap.png": (
+            "Harm against the total initial gap",
+            "Mean harm of each agent in worlds grouped by the sum of their gaps at the alert.",
+            harm_against_total_gap(compared.result),
+        ),
+        "trajectories.png": (
+            "One episode",
+            f"World {number} of the list, driven by these agents. It is a typical world: among the worlds in which full"
+            f" braking collides, the harm that the {learned} avoids is the median here.",
+            trajectories({
+                name: record_episode(world, team, game)
+                for name, team in compared.teams.items()
+                if name in (*TEAM_BASELINES, learned)
+            }),
+        ),
+    }  # fmt: skip
+    for name, (_, _, figure) in drawn.items():
+        write_picture(experiment.trained.directory / name, figure, force=True)
+    return [Part.drawing(figure, title, description) for title, description, figure in drawn.values()]
+
+
+def telling_row(compared: Compared, learned: str) -> int:
+    """Return the row of a typical world: the median of the harm that is saved, where full braking does harm."""
+    harm = HARM[compared.harm_count]
+    before = compared.result[BASELINE][harm]
+    rows = np.flatnonzero(before > 0.0)
+    if not len(rows):
+        return 0
+    saved = before[rows] - compared.result[learned][harm][rows]
+    return int(rows[np.argsort(saved, kind="stable")[(len(rows) - 1) // 2]])
+
+
+def page_of(
+    experiment: Experiment, others: dict[str, Compared], figures: Sequence[Part], sections: Sequence[Section]
+) -> Report:
+    """Return the page of a run; ``others``: name of another test -> results."""
+    trained, compared, learned = experiment.trained, experiment.compared, experiment.learned
+    training, recipe, name = trained.training, trained.training.recipe, compared.scenario.name
+    steps = next(iter(trained.policies.values())).manifest.steps
+    reward = recipe.reward.model_dump(exclude_defaults=True)
+    facts = {
+        "Training": f"{recipe.title or recipe.name}: {trained.steps:,} steps of {recipe.total_steps:,}"
+        f" ({trained.status}), {trained.wall_s:.0f} s",
+        "Seeds": f"training {recipe.seed}, evaluation list {compared.result.about['seed']}",
+        "Reward": ", ".join(f"{key} {value}" for key, value in reward.items()) or "minus the first-impact harm",
+        "Objective": training.objective,
+        "Harm that agents minimise": "first impacts only" if compared.harm_count == "first" else "every impact",
+        "Whole run": f"{time.monotonic() - experiment.started:.0f} s",
+        "Settings": ", ".join(read_object(RunFolder(trained.directory).config).get("settings", ())),
+    }
+    summary = (
+        f"The {learned} was trained with {recipe.algorithm}, scheme {training.scheme}. It was saved after {steps:,}"
+        " steps, when it did the least harm in the worlds that the recipe names."
+    )
+    if learned == TEAM:
+        summary += f" The agent “{SHIELDED}” is the trained team with the step shield."
+        summary += " In the agent “all but” a vehicle, this vehicle brakes fully instead."
+    else:
+        summary += f" The agent “{HYBRID}” is the trained policy with the paper's shield."
+    if others:
+        summary += f" {TESTS[name]} The results of the other two tests are further below."
+    stopped = f"The training was interrupted. This is the {learned} after {steps:,} steps."
+    papers = is_papers_test(compared.scenario)
+    sheet = compared.table.sheet()
+    return Report(
+        f"ethbrake run: {name}",
+        compared,
+        focus=learned,
+        summary=summary,
+        sections=sections,
+        figures=figures,
+        tests={title_of(test): Test(TESTS[test], other) for test, other in others.items()},
+        beside=paper_rows(sheet.only(sheet.filled()).names) if papers else (),
+        notes=paper_notes() if papers else (),
+        remarks=[stopped] if trained.status == "interrupted" else (),
+        settings={key: value for key, value in facts.items() if value},
+    )

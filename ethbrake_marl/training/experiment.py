@@ -1,0 +1,169 @@
+"""The main experiment: train the learners, and let what they learned, its shield and the baselines drive the same list.
+
+A *report* is what an extension adds: it says which measures it wants, and is given the finished experiment.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from ethbrake_marl.agents.drive import Agent, Team
+from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.door import EPISODES, SEED, evaluate
+from ethbrake_marl.evaluation.named_measures import MEASURES
+from ethbrake_marl.evaluation.results import RESULTS, write_results
+from ethbrake_marl.names import make_teams
+from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield
+from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.training.fixed_list import Policies
+from ethbrake_marl.training.recipe import TrainingRecipe
+from ethbrake_marl.training.run import RunFolder
+from ethbrake_marl.training.train import TrainResult, train
+from ethbrake_marl.worlds.scenario import Scenario
+
+BASELINES = ("full_brake", "e_v2x_bm", "e_v2x_bm:pairwise")
+TEAM_BASELINES = BASELINES[:2]  # the closed form is for one learner
+POLICY, HYBRID = "trained policy", "hybrid"  # names of what one learner learned, alone and in the paper's hybrid
+TEAM, SHIELDED = "trained team", "shielded team"  # names of what several learned, alone and with the step shield
+
+
+class Experiment(NamedTuple):
+    """A trained policy or team, and its comparison with the baselines."""
+
+    trained: TrainResult
+    compared: Compared
+    measures: tuple[str, ...]  # names of the measures beside the usual ones
+    started: float  # ``time.monotonic`` at the start (s)
+
+    @property
+    def learned(self) -> str:
+        """Name of what was learned."""
+        return POLICY if POLICY in self.compared.teams else TEAM
+
+    def in_another(
+        self, scenario: Scenario, episodes: int, baselines: Sequence[str], measures: Sequence[str]
+    ) -> Compared:
+        """Let what was learned, its shield and baselines drive the same list of another scenario."""
+        count = self.compared.harm_count
+        teams = compared_teams(self.trained.policies, scenario, count, baselines)
+        seed = self.compared.result.about["seed"]
+        return Compared.of(scenario, teams, episodes=episodes, seed=seed, harm_count=count, measures=measures)
+
+
+class Report(Protocol):
+    """Writes something about an experiment into the run's folder."""
+
+    measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
+
+    def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
+        """Write it; return the tables to print, and a text that says where it is."""
+
+
+class Tables:
+    """The report where no extension has one: the tables of the evaluation."""
+
+    measures: tuple[str, ...] = ("sampled_harm", "vehicle_1_shoved_m")
+
+    def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
+        """Write nothing more."""
+        return experiment.compared.table.tables(), f"results: {experiment.trained.directory / RESULTS}"
+
+
+def run_experiment(
+    recipe: TrainingRecipe,
+    scenario: Scenario,
+    directory: Path,
+    *,
+    steps: int | None = None,
+    seed: int | None = None,
+    episodes: int = EPISODES,
+    list_seed: int = SEED,
+    force: bool = False,
+    settings: Sequence[str] = (),
+    report: Report | None = None,
+    on_progress: OnProgress | None = None,
+) -> tuple[Experiment, Sequence[Any], str]:
+    """Train, compare, and write ``results.json``, ``worlds.csv`` and a report into the run's folder.
+
+    All compared agents minimise the count of harm that is trained for (``reward.harm_count``). Ctrl-C stops the
+    training after the current update; what was learned so far is compared. A second Ctrl-C raises
+    ``KeyboardInterrupt``; the folder keeps the policy. ``run.json`` records how the run ended. The other arguments are
+    those of ``train`` and ``evaluate``, and so are the errors.
+
+    Returns the experiment, and the tables and the text of the report.
+    """
+    started, tell = time.monotonic(), on_progress or (lambda progress: None)
+    shown: Report = report or Tables()
+    count, measures = recipe.reward.harm_count, tuple(name for name in shown.measures if name in MEASURES)
+    baselines = usable_baselines(scenario, count, list_seed, tell)
+    evaluate(scenario, baselines, episodes=1, seed=list_seed, harm_count=count, measures=measures)  # or refuse it now
+    trained = train(
+        recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
+    )
+    with RunFolder(trained.directory).stage("evaluation", trained.status):
+        note = ""
+        if trained.status == "interrupted":
+            note = (
+                f"training interrupted after {trained.steps:,} steps; now evaluating the policy so far (press Ctrl-C"
+                " again to stop immediately)"
+            )
+        tell(Progress("evaluation", 0, episodes, note=note))
+        compared = Compared.of(
+            scenario, compared_teams(trained.policies, scenario, count, baselines), episodes=episodes, seed=list_seed,
+            harm_count=count, measures=measures, on_done=lambda done: tell(Progress("evaluation", done, episodes)),
+        )  # fmt: skip
+        write_results(trained.directory, compared.table, compared.result, "csv", force=True)
+        experiment = Experiment(trained, compared, measures, started)
+        tables, where = shown.write(experiment, tell)
+    return experiment, tables, where
+
+
+def usable_baselines(scenario: Scenario, harm_count: str, seed: int, tell: OnProgress) -> list[str]:
+    """Return the baselines that can drive in a scenario; why the others cannot is reported as progress.
+
+    Raises the errors of full braking.
+    """
+    baselines = TEAM_BASELINES if len(scenario.learners) > 1 else BASELINES
+    usable = []
+    for number, name in enumerate(baselines):
+        try:
+            evaluate(scenario, name, episodes=1, seed=seed, harm_count=harm_count)
+            usable.append(name)
+        except InvalidInput as error:
+            if name == FULL_BRAKE.name:
+                raise
+            tell(Progress("baselines", number, len(baselines), note=f"this baseline is left out: {error}"))
+    return usable
+
+
+def compared_teams(
+    policies: Policies, scenario: Scenario, harm_count: str, baselines: Sequence[str]
+) -> Mapping[str, Team]:
+    """Return the teams to compare, by name: baselines, then what was learned, without and with a shield.
+
+    With several learners there is also the team ``all but vehicle_i`` for each learner, which then brakes fully.
+    """
+    drivers: dict[int, Agent] = {
+        1 + scenario.vehicle_names.index(name): LearnedAgent(policy) for name, policy in policies.items()
+    }
+    teams = make_teams(baselines, scenario, harm_count=harm_count)
+    if len(drivers) == 1:
+        shield: Any = EpisodeShield(drivers, harm_count=harm_count)
+        return {**teams, POLICY: Team(POLICY, drivers), HYBRID: Team(HYBRID, drivers, shield)}
+    teams[TEAM] = Team(TEAM, drivers)
+    for body in drivers:
+        name = without(scenario.vehicle_names[body - 1])
+        teams[name] = Team(name, {**drivers, body: FULL_BRAKE})
+    return {**teams, SHIELDED: Team(SHIELDED, drivers, StepShield(drivers, harm_count=harm_count))}
+
+
+def without(vehicle: str) -> str:
+    """Return the name of the trained team in which ``vehicle`` brakes fully."""
+    return f"all but {vehicle}"

@@ -1,0 +1,47 @@
+"""What most tests of the report look at."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.measures import Measure
+from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.extensions.report.best_known import AVOIDABLE, HARM, MEASURE
+from ethbrake_marl.names import teams_of
+
+AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
+
+
+def compared_by(scenario: str, agents: object, episodes: int = 60, count: str = "first") -> Compared:
+    """Agents in the first worlds of the list of seed 7."""
+    loaded = eb.load_scenario(scenario)
+    teams = teams_of(agents, loaded, harm_count=count)
+    return Compared.of(loaded, teams, episodes=episodes, seed=7, harm_count=count)
+
+
+def with_best_known(compared: Compared) -> Compared:
+    """The same, as if somebody had searched: half of the least harm of these agents, avoidable where that is 0."""
+    result = compared.result
+    least = {
+        count: 0.5 * np.min([own[harm] for own in result.columns.values()], axis=0) for count, harm in HARM.items()
+    }
+    more = {f"{MEASURE}_best_known_{HARM[count]}": value for count, value in least.items()}
+    more[AVOIDABLE] = least["first"] == 0.0
+    columns = {agent: {**own, **more} for agent, own in result.columns.items()}
+    searched = replace(result, columns=columns, measures=(*result.measures, Measure(MEASURE)))
+    return compared._replace(result=searched, table=summarise(searched))
+
+
+@pytest.fixture(scope="session")
+def compared() -> Compared:
+    """Four agents in 120 worlds of paper-random, one of them behind a shield."""
+    return compared_by("paper-random", AGENTS, 120)
+
+
+@pytest.fixture(scope="session")
+def searched(compared: Compared) -> Compared:
+    """The same with best known harm."""
+    return with_best_known(compared)
