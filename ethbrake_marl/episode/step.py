@@ -105,6 +105,15 @@ def command(car, wanted, learners, actions):
 
 
 @kernel
+def stands(line, wanted):
+    """Return whether every vehicle is at rest and no command or force would move it."""
+    at_rest = True
+    for i in range(1, line.shape[1]):
+        at_rest = at_rest and line[SPEED, i] == 0.0 and wanted[i] <= 0.0 and line[FORCE, i] <= 0.0
+    return at_rest
+
+
+@kernel
 def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     """Advance one running world to its next decision, in place; return what ``drive`` met, and whether all is at rest.
 
@@ -116,9 +125,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     until = horizon_s if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
     met = drive(line, car, wanted, scratch, clock[TIME], until)
     clock[TIME] = until
-    at_rest = met != FAILED
-    for i in range(1, line.shape[1]):
-        at_rest = at_rest and line[SPEED, i] == 0.0 and wanted[i] <= 0.0 and line[FORCE, i] <= 0.0
+    at_rest = met != FAILED and stands(line, wanted)
     clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
     return met, at_rest
 

@@ -1,0 +1,186 @@
+"""Agents that decide everything at the alert: ``best_harm``, and ``AGENT+search`` around another agent's commands."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import MODEL, Agent, Team
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.objectives import Declared
+from ethbrake_marl.episode.state import FIRST_DECISION, State
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.extensions.search.best_harm import alone, commands_of, e_v2x_bm_profiles
+from ethbrake_marl.extensions.search.pricing import Problem, problem_of
+from ethbrake_marl.extensions.search.search import refine, search_profiles
+from ethbrake_marl.extensions.search.tables import best_known
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.names import AgentSettings, make_agent
+from ethbrake_marl.registry import Part
+from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.worlds.roles import HELD, LEARNER
+from ethbrake_marl.worlds.scenario import Scenario
+
+BUDGET = 20_000  # profiles that best_harm simulates in a world that is in no table
+CANDIDATES = 500  # plans that +search simulates
+MOST_CANDIDATES = 1_000_000
+START = "universal"  # policy whose episode a search also starts from
+ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
+
+
+class Memory(NamedTuple):
+    """What the agent decided at the alert."""
+
+    commands_mps2: Floats  # [n, T] at every decision
+    start_s: Floats  # [n] time of the first decision
+    predicted_harm: Floats  # [n] m2/s2
+
+
+class Role(NamedTuple):
+    """A vehicle that an agent drives, whose commands nobody knows at the alert."""
+
+    name: str
+
+
+class Planner:
+    """Drives commands that it chose at the alert; it assumes that other learners brake fully.
+
+    If they do, its ``predicted_harm`` is to the last bit the harm that happens.
+    """
+
+    knows = MODEL
+
+    def __init__(self, name: str, scenario: Scenario, count: str) -> None:
+        roles = dict(enumerate(scenario.roles.values(), 1))
+        agents = {i: Role(role) for i, role in roles.items() if role.partition(":")[0] not in (LEARNER, *HELD)}
+        self.name, self.count = name, count
+        self.objective: Declared = scenario.objective
+        self.game: Game = game_of(scenario, scripts=agents)[1]  # type: ignore[arg-type]  # nobody asks them
+
+    def begin(self, alert: State, body: int) -> Memory:
+        """Choose. Raises ``InvalidInput`` where another vehicle's commands are not known at the alert."""
+        game = self.game._replace(scripts={i: role for i, role in self.game.scripts.items() if i != body})
+        game, alert = alone(game, alert, body)
+        problem = problem_of(game, alert, count=self.count, objective=self.objective)
+        commands, harm = self.choose(game, alert, problem, body)
+        return Memory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
+
+    def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
+        """Return commands at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
+        raise NotImplementedError
+
+    def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
+        """Return the command of the latest decision of the plan, [n] m/s2, and the memory as it was."""
+        step = np.floor((state.time_s - memory.start_s) / self.game.rules.time_step_s + ROUNDING).astype(np.int64)
+        at = np.clip(step, 0, memory.commands_mps2.shape[1] - 1)
+        return memory.commands_mps2[np.arange(state.n), at], memory
+
+    @property
+    def decisions(self) -> int:
+        """Largest number of decisions of an episode."""
+        return int(np.ceil(self.game.rules.horizon_s / self.game.rules.time_step_s)) + 1
+
+
+class BestHarm(Planner):
+    """Drives the best profile that is known: of a shipped table, or of a search.
+
+    A search begins with E-V2X-BM. If this vehicle is the only learner, the result is improved once more, or the
+    episode of the policy ``universal`` where that is better; so it does never more harm than either.
+    """
+
+    def __init__(self, scenario: Scenario, count: str = "first", budget: int = BUDGET, name: str = "best_harm") -> None:
+        super().__init__(name, scenario, count)
+        self.scenario, self.budget = scenario, budget
+
+    def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
+        """Look the worlds up; search those that are in no table, or all for another objective than the line's harm."""
+        known, profiles = best_known(problem, self.count)
+        missing = np.isnan(known) | (self.objective != "total")
+        commands = profiles.stepwise(self.decisions)[:, :, 0]
+        harm = problem.value(problem.follow(profiles))
+        if missing.any():
+            some = np.flatnonzero(missing)
+            commands[some], harm[some] = self.search(game, alert.take(some), problem.take(some), body)
+        return commands, harm
+
+    def search(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
+        """Search these worlds."""
+        profiles, values = search_profiles(problem, e_v2x_bm_profiles(problem, alert), budget=self.budget)
+        best = profiles.stepwise(self.decisions)[:, :, 0]
+        if self.scenario.learners != (body,):
+            return best, values[self.count]
+        steps = int(problem.last_step.max())
+        policy = make_agent(START, scenario=self.scenario)
+        assert not isinstance(policy, Team)
+        theirs = planned(game, alert, policy, body, steps)
+        better = refine(problem, theirs, budget=1)[1] < values[self.count]
+        start = np.where(better[:, np.newaxis], theirs, best[:, :steps])
+        best[:, :steps], harm = refine(problem, start, budget=self.budget)
+        return best, harm
+
+
+class Searched(Planner):
+    """Improves another agent's commands by a search at the alert. It is never worse than that agent, if others keep
+    their commands.
+    """
+
+    def __init__(self, inner: Agent, scenario: Scenario, count: str = "first", candidates: int = CANDIDATES) -> None:
+        check_whole_number("search: candidates", candidates, 1, MOST_CANDIDATES)
+        super().__init__(f"{inner.name}+search", scenario, count)
+        self.inner, self.candidates = inner, candidates
+
+    def check(self, game: Game, body: int) -> None:
+        """Ask the inner agent whether it should drive here."""
+        if hasattr(self.inner, "check"):
+            self.inner.check(game, body)
+
+    def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
+        """Let the inner agent drive, and search around its commands."""
+        start = planned(game, alert, self.inner, body, int(problem.last_step.max()))
+        commands, harm = refine(problem, start, budget=self.candidates)
+        return np.pad(commands, ((0, 0), (0, self.decisions - commands.shape[1])), mode="edge"), harm
+
+
+def planned(game: Game, alert: State, agent: Agent, body: int, steps: int) -> Floats:
+    """Return what an agent commands at each of the first decisions, [n, steps] m/s2."""
+    commands = commands_of(game, alert, Team(agent.name, {body: agent}))[:, :, 0]
+    return np.pad(commands, ((0, 0), (0, steps - commands.shape[1])), mode="edge")
+
+
+def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:
+    """Return the agent ``best_harm[:CANDIDATES]``. Raises ``InvalidInput`` for an argument that is no number."""
+    budget = BUDGET if argument is None else int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
+    if not 1 <= budget <= MOST_CANDIDATES:
+        raise InvalidInput(
+            f"agent {settings.spec!r}: after the colon, give the number of profiles to try in each world, from 1 to"
+            f" {MOST_CANDIDATES:,}, for instance best_harm:{BUDGET}"
+        )
+    return BestHarm(settings.needed_scenario(), settings.harm_count, budget, settings.spec)
+
+
+def make_searched(team: Team, argument: str | None, settings: Any) -> Team:
+    """Return the team whose agents search around their commands. Raises ``InvalidInput`` if it has a shield."""
+    if team.shield is not None:
+        raise InvalidInput(
+            f"agent {settings.spec!r}: a search around a shield; write +search first: AGENT+search+SHIELD"
+        )
+    scenario = settings.needed_scenario()
+    drivers = {i: Searched(agent, scenario, settings.harm_count) for i, agent in team.drivers.items()}
+    return Team(settings.spec, drivers)
+
+
+BEST_HARM = Part(
+    make_best_harm,
+    form="best_harm[:CANDIDATES]",
+    about="drives the best known profile; searches at the alert if no profile is stored",
+    knows=MODEL,
+)
+SEARCH = Part(
+    make_searched,
+    form="search",
+    about="drives the best commands that a search around the agent's own commands finds at the alert",
+    knows=MODEL,
+)
+LADDER = ("best_harm",)  # what `--agents ladder` adds to the core's

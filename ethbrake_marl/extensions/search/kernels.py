@@ -1,0 +1,343 @@
+"""Compiled random search for the best commands in one world: follow a profile, gather good ones, improve one.
+
+A profile has ``ends`` [K], the decisions at which its phases end, and ``commands`` [K, B] (m/s2). Every world has a
+random stream of its own, so its result does not depend on other worlds. The same functions search profiles of a few
+phases, and plans with one phase for each decision.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.state import FIRST_DECISION, LAST, harm_so_far
+from ethbrake_marl.episode.step import stands
+from ethbrake_marl.extensions.search.pricing import LARGEST, WHOLE, UInt64s
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.drive import FAILED, drive
+from ethbrake_marl.motion.elementary import exp
+from ethbrake_marl.motion.layout import FIRST, LINE_ROWS, TOTAL, Floats, Ints
+
+OTHER_WEIGHT = 1e-8  # weight of the other count of harm in what is minimised: it decides ties
+RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store and exactly repeatable
+
+# numbers of a world
+TIME_STEP, HORIZON, IS_TOTAL, AIM, STEPWISE, NUMBERS = range(6)
+
+# how random profiles and changes are drawn: a whole profile, or three phases of a plan and changes of a few steps
+KIND, ATTENTION, LONGEST_CHANGE, LONGEST_WHILE, DRAWING = range(5)
+PROFILE, PLAN = 0, 1
+
+# a change, and its kinds
+WHAT, VEHICLE, PHASE, LENGTH, AMOUNT, CHANGE = range(6)
+ADD = 0  # adds an amount to the command of some phases
+TRADE = 1  # also changes the command of the next phase, so that the speed after both stays
+SET = 2  # replaces the command of some phases
+MOVE_END = 3  # moves the border between two phases by whole steps
+
+
+class World(NamedTuple):
+    """One world, ready to be simulated again and again."""
+
+    car: Floats  # [CAR_ROWS, N + 1]
+    clock: Floats  # [CLOCK_COLUMNS] at the first decision
+    wanted: Floats  # [N + 1] commands of all bodies (m/s2); overwritten
+    bodies: Ints  # [B] vehicles that are controlled
+    bounds: Floats  # [B, 2] their smallest and largest command (m/s2)
+    shares: Floats  # [2, N + 1], as in `Problem`
+    numbers: Floats  # [NUMBERS] time step (s), horizon (s), whether the total harm counts, aim, whether step by step
+    random: UInt64s  # [1] state of the random stream
+    scratch: Floats  # of the physics
+
+
+class Room(NamedTuple):
+    """Working memory: a profile that is tried, and the states at the beginning of the phases."""
+
+    lines: Floats  # [K + 1, LINE_ROWS, N + 1] of the best profile; lines[0] is the state at the first decision
+    tried: Floats  # [K + 1, LINE_ROWS, N + 1] of the profile that is tried
+    ends: Ints  # [K]
+    commands: Floats  # [K, B]
+    change: Floats  # [CHANGE]
+
+
+class Field(NamedTuple):
+    """M profiles that are improved at the same time."""
+
+    ends: Ints  # [M, K]
+    commands: Floats  # [M, K, B]
+    phases: Ints  # [M] number of phases in use; 0: an empty place
+    values: Floats  # [M] what is minimised (m2/s2)
+
+
+def room_for(line: Floats, phases: int, controlled: int) -> Room:
+    """Return working memory for a world whose line at the first decision is ``line``."""
+    lines = np.zeros((phases + 1, LINE_ROWS, line.shape[1]))
+    lines[0] = line
+    return Room(lines, lines.copy(), np.zeros(phases, np.int64), np.zeros((phases, controlled)), np.zeros(CHANGE))
+
+
+@kernel
+def value_of(line, shares, numbers):
+    """Return what is minimised (m2/s2); it never falls in an episode."""
+    total, aim = numbers[IS_TOTAL] == 1.0, numbers[AIM]
+    other = OTHER_WEIGHT * harm_so_far(line, not total)
+    if aim == WHOLE:
+        return harm_so_far(line, total) + other
+    row, value, from_ahead = TOTAL if total else FIRST, 0.0, 0.0
+    for i in range(line.shape[1]):
+        borne = from_ahead
+        if i < line.shape[1] - 1:
+            borne += shares[0, i] * line[row, i]
+            from_ahead = shares[1, i] * line[row, i]
+        value = max(value, borne) if aim == LARGEST else value + borne
+    return value + other
+
+
+@kernel
+def move_line(line, into):
+    """Copy all rows of a line."""
+    for row in range(line.shape[0]):
+        for i in range(line.shape[1]):
+            into[row, i] = line[row, i]
+
+
+@large
+def follow(world, lines, ends, commands, phase, most):
+    """Simulate a profile from ``phase`` on; return its value (m2/s2), and the number of phases until the end.
+
+    It begins with ``lines[phase]`` and writes the state after phase p to ``lines[p + 1]``. It ends when all vehicles
+    are at rest, or the value reaches ``most`` (m2/s2). The number of phases is -1 if a check of the physics fails. Step
+    by step it has the bits of the episode; phase by phase it is several times faster and rounds differently.
+    """
+    numbers, clock = world.numbers, world.clock
+    value = value_of(lines[phase], world.shares, numbers)
+    for p in range(phase, ends.shape[0]):
+        step, at_rest, line = ends[p - 1] if p > 0 else 0, False, lines[p + 1]
+        move_line(lines[p], line)
+        if ends[p] > step:
+            for b in range(world.bodies.shape[0]):
+                world.wanted[world.bodies[b]] = commands[p, b]
+            while step < ends[p] and not at_rest:
+                start = clock[FIRST_DECISION] + step * numbers[TIME_STEP]
+                step = step + 1 if numbers[STEPWISE] == 1.0 else ends[p]
+                until = clock[FIRST_DECISION] + step * numbers[TIME_STEP]
+                until = numbers[HORIZON] if step >= clock[LAST] else until
+                if drive(line, world.car, world.wanted, world.scratch, start, until) == FAILED:
+                    return value, -1
+                at_rest = stands(line, world.wanted)
+            value = value_of(line, world.shares, numbers)
+        if value >= most or at_rest:
+            return value, p + 1
+    return value, ends.shape[0]
+
+
+@large
+def draw(random):
+    """Return the next random number, uniform in [0, 1), of a splitmix64 generator."""
+    random[0] += np.uint64(0x9E3779B97F4A7C15)
+    z = random[0]
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    return float(z >> np.uint64(11)) * 2.0**-53
+
+
+@large
+def draw_below(random, n):
+    """Return a random whole number from 0 to n - 1."""
+    return min(int(draw(random) * n), n - 1)
+
+
+@large
+def draw_sign(random):
+    """Return 1 or -1."""
+    return 1.0 if draw(random) < 0.5 else -1.0
+
+
+@kernel
+def allowed(command, low, high):
+    """Return a command within the bounds, rounded toward 0 to a multiple of 1 / RESOLUTION (m/s2)."""
+    return int(min(max(command, low), high) * RESOLUTION) / RESOLUTION
+
+
+@large
+def draw_command(random, low, high):
+    """Return a random command (m/s2), often full braking, full driving or coasting."""
+    u = draw(random)
+    if u < 0.35:
+        return low
+    if u < 0.5:
+        return high
+    if u < 0.6:
+        return 0.0
+    return allowed(low + (high - low) * draw(random), low, high)
+
+
+@large
+def draw_profile(random, bounds, last, drawing, ends, commands):
+    """Draw a profile; return its number of phases.
+
+    Six phases of random commands, of which short ones are likelier; or, for a plan, three: often full braking, another
+    command for a while, and full braking.
+    """
+    if drawing[KIND] == PLAN:
+        low, high = bounds[0, 0], bounds[0, 1]
+        first = draw_below(random, drawing[ATTENTION])
+        ends[0], ends[1], ends[2] = first, first + 1 + draw_below(random, drawing[LONGEST_WHILE]), last
+        commands[1, 0], commands[2, 0] = draw_command(random, low, high), low
+        commands[0, 0] = low if draw(random) < 0.8 else draw_command(random, low, high)
+        for p in range(3):
+            ends[p] = min(ends[p], last)
+        return 3
+    step = 0
+    for p in range(6):
+        u = draw(random)
+        step = min(step + 1 + int(u * u * 25.0), last)
+        ends[p] = step
+        for b in range(bounds.shape[0]):
+            commands[p, b] = draw_command(random, bounds[b, 0], bounds[b, 1])
+    ends[5] = last
+    return 6
+
+
+@large
+def draw_change(random, bounds, active, drawing, change):
+    """Draw a change of a profile whose first ``active`` phases matter. The sizes of amounts are log-uniform."""
+    if drawing[KIND] == PLAN:
+        low, high = bounds[0, 0], bounds[0, 1]
+        change[WHAT], change[VEHICLE] = ADD if draw(random) >= 0.1 else SET, 0
+        change[PHASE] = draw_below(random, min(active, drawing[ATTENTION]))
+        u = draw(random)
+        change[LENGTH] = 1 + int(u * u * drawing[LONGEST_CHANGE])
+        if change[WHAT] == ADD:  # down to a thousandth of all commands
+            sign = draw_sign(random)
+            change[AMOUNT] = sign * (high - low) * exp(-6.907755278982138 * draw(random))
+        else:
+            change[AMOUNT] = draw_command(random, low, high)
+        return
+    u = draw(random)
+    change[PHASE], b, change[LENGTH] = draw_below(random, active), draw_below(random, bounds.shape[0]), 1
+    sign, size, low, high = draw_sign(random), draw(random), bounds[b, 0], bounds[b, 1]
+    change[VEHICLE] = b
+    if u < 0.70:  # down to a millionth of all commands
+        change[WHAT] = ADD if u < 0.45 else TRADE
+        change[AMOUNT] = sign * (high - low) * exp(-13.815510557964275 * size)
+    elif u < 0.78:
+        change[WHAT], change[AMOUNT] = SET, draw_command(random, low, high)
+    else:
+        change[WHAT], change[AMOUNT] = MOVE_END, sign * (1 + int(8.0 * size * size * size))
+
+
+@large
+def apply_change(change, bounds, ends, commands):
+    """Change a profile in place; return whether it has become another."""
+    what, b, p, amount = int(change[WHAT]), int(change[VEHICLE]), int(change[PHASE]), change[AMOUNT]
+    low, high, phases = bounds[b, 0], bounds[b, 1], ends.shape[0]
+    begin, changed = ends[p - 1] if p > 0 else 0, False
+    if what in (MOVE_END, TRADE):
+        if p == phases - 1:
+            return False
+        here, there = ends[p] - begin, ends[p + 1] - ends[p]
+        if what == MOVE_END:
+            end = min(max(ends[p] + int(amount), begin), ends[p + 1])
+            changed = end != ends[p]
+            ends[p] = end
+            return changed
+        if here == 0 or there == 0:
+            return False
+        before = commands[p, b]
+        commands[p, b] = allowed(before + amount, low, high)
+        commands[p + 1, b] = allowed(commands[p + 1, b] - (commands[p, b] - before) * here / there, low, high)
+        return commands[p, b] != before
+    for q in range(p, min(p + int(change[LENGTH]), phases)):
+        before = commands[q, b]
+        commands[q, b] = amount if what == SET else allowed(before + amount, low, high)
+        changed = changed or commands[q, b] != before
+    return changed
+
+
+@large
+def copy_profile(ends, commands, to_ends, to_commands):
+    """Copy the phases of a profile over the first phases of another."""
+    for p in range(ends.shape[0]):
+        to_ends[p] = ends[p]
+        for b in range(commands.shape[1]):
+            to_commands[p, b] = commands[p, b]
+
+
+@large
+def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
+    """Fill ``field`` with the best of the given profiles [Q, K] and of ``drawn`` random ones, in any order.
+
+    Of profiles whose values differ by less than ``same`` (m2/s2) it keeps the first.
+    """
+    worst, number = 0, ends.shape[0]
+    begin = min(worst, number)  # 0, but no literal: numba would compile the physics again for it
+    for s in range(number + drawn):
+        used = phases[s] if s < number else 0
+        if s < number:
+            copy_profile(ends[s], commands[s], room.ends, room.commands)
+        else:
+            used = draw_profile(world.random, world.bounds, int(world.clock[LAST]), drawing, room.ends, room.commands)
+        if used == 0:
+            continue
+        tried_ends, tried = room.ends[:used], room.commands[:used]
+        value, reached = follow(world, room.lines, tried_ends, tried, begin, field.values[worst])
+        taken = reached > 0 and value < field.values[worst]
+        for m in range(field.values.shape[0]):
+            taken = taken and not abs(field.values[m] - value) < same
+        if not taken:
+            continue
+        copy_profile(tried_ends, tried, field.ends[worst], field.commands[worst])
+        field.phases[worst], field.values[worst] = used, value
+        if value <= 0.0:
+            break
+        worst = int(np.argmax(field.values))
+
+
+@large
+def improve(world, room, ends, commands, budget, drawing, least):
+    """Improve a profile in place by random changes, at most ``budget`` of them, until its value is at most ``least``.
+
+    Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its episode ends. An
+    amount that helps is doubled and tried again. A change of a profile that leaves it as it was costs nothing.
+    """
+    change, lines, tried = room.change, room.lines, room.tried
+    value, active, spent, phase, again = math.inf, 0, -1, 0, False
+    new_ends, new_commands = room.ends[: ends.shape[0]], room.commands[: ends.shape[0]]
+    for _ in range(4 * budget + 1):
+        if spent >= budget or value <= least:
+            break
+        copy_profile(ends, commands, new_ends, new_commands)
+        if spent >= 0:  # the first profile that is tried is the given one
+            if not again:
+                draw_change(world.random, world.bounds, active, drawing, change)
+            phase, again = int(change[PHASE]), False
+            if not apply_change(change, world.bounds, new_ends, new_commands):
+                spent += 1 if drawing[KIND] == PLAN else 0
+                continue
+        move_line(lines[phase], tried[phase])
+        spent += 1
+        new, reached = follow(world, tried, new_ends, new_commands, phase, value)
+        if reached < 0 or not new < value:
+            if active == 0:
+                return math.inf, 0
+            continue
+        value, active = new, reached
+        copy_profile(new_ends, new_commands, ends, commands)
+        for p in range(phase + 1, reached + 1):
+            move_line(tried[p], lines[p])
+        change[AMOUNT] *= 2.0
+        again = spent > 0 and change[WHAT] != SET
+    return value, active
+
+
+@large
+def try_all(world, room, ends, commands, values):
+    """Write the value of every profile [Q, K] to ``values`` [Q]; infinite if it cannot be simulated."""
+    begin = min(0, ends.shape[0])  # no literal, as in `gather`
+    for q in range(ends.shape[0]):
+        value, reached = follow(world, room.lines, ends[q], commands[q], begin, math.inf)
+        values[q] = value if reached > 0 else math.inf

@@ -1,0 +1,340 @@
+"""What would happen if some vehicles braked like this? Problems, profiles of commands, and what they cost.
+
+A *profile* holds the commands of the controlled vehicles from the first decision to the horizon: K phases, each with
+constant commands. Phases begin and end at decisions, so agents can follow a profile, and to the last bit its harm is
+the harm that happens. B is the number of controlled vehicles.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.objectives import Declared, objectives_of
+from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State
+from ethbrake_marl.episode.step import advance, begin
+from ethbrake_marl.errors import InvalidInput, PhysicsError
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.drive import FAILED
+from ethbrake_marl.motion.layout import (
+    BRAKE_RATE,
+    BRAKING,
+    DRIVING,
+    FAR_M,
+    FIRST,
+    FORCE,
+    GAP,
+    HIT,
+    LATENCY,
+    LIMIT,
+    MASS,
+    RELEASE_RATE,
+    RESTITUTION,
+    SPEED,
+    TOTAL,
+    Floats,
+    Ints,
+    scratch_for,
+)
+
+UInt64s = NDArray[np.uint64]
+
+MOST_PHASES = 12  # of a profile that a search returns
+COUNTS = ("first", "total")
+
+# what a search minimises
+WHOLE = 0.0  # harm of the line
+WEIGHTED = 1.0  # weighted sum of the vehicles' harm
+LARGEST = 2.0  # largest weighted harm of a vehicle
+
+
+class Profiles(NamedTuple):
+    """One profile in each of n worlds. In phase j the commands ``commands_mps2[k, j]`` hold in world k.
+
+    A phase lasts until decision ``ends[k, j]``. Phases that a profile does not need are empty: they begin and end at
+    the last step.
+    """
+
+    ends: Ints  # [n, K] number of the decision at which each phase ends
+    commands_mps2: Floats  # [n, K, B] commands in each phase; negative brakes
+
+    def take(self, rows: Any) -> Profiles:
+        """Return the profiles of the worlds ``rows``."""
+        return Profiles(self.ends[rows], self.commands_mps2[rows])
+
+    def stepwise(self, decisions: int) -> Floats:
+        """Return the commands after each of the first decisions, [n, decisions, B] m/s2."""
+        phase = (self.ends[:, np.newaxis] <= np.arange(decisions)[:, np.newaxis]).sum(axis=2)
+        phase = np.minimum(phase, self.ends.shape[1] - 1)
+        return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
+
+    @staticmethod
+    def of_steps(commands_mps2: Floats, last_step: Ints) -> Profiles:
+        """Return profiles with one phase for each decision. ``commands_mps2`` is [n, T, B], ``last_step`` [n]."""
+        ends = np.minimum(np.arange(1, commands_mps2.shape[1] + 1), last_step[:, np.newaxis])
+        return Profiles(ends, np.ascontiguousarray(commands_mps2))
+
+    @staticmethod
+    def padded(parts: Sequence[Profiles], least: int = 1) -> list[Profiles]:
+        """Return the profiles of all parts with the same number of phases, at least ``least``, by empty phases."""
+        width = max([least, *(part.ends.shape[1] for part in parts)])
+        return [
+            Profiles(
+                np.pad(part.ends, ((0, 0), (0, width - part.ends.shape[1])), mode="edge"),
+                np.pad(part.commands_mps2, ((0, 0), (0, width - part.ends.shape[1]), (0, 0)), mode="edge"),
+            )
+            for part in parts
+        ]
+
+    @staticmethod
+    def join(parts: Sequence[Profiles]) -> Profiles:
+        """Return the profiles of all parts, one part after the other."""
+        return Profiles(*(np.concatenate(arrays) for arrays in zip(*Profiles.padded(parts), strict=True)))
+
+
+class Problem(NamedTuple):
+    """Which commands of some vehicles are best in each of n worlds? Made by ``problem_of``.
+
+    >>> import ethbrake_marl as eb
+    >>> from ethbrake_marl.extensions.search.pricing import problem_of
+    >>> scenario, game = eb.open_game("paper-random")
+    >>> problem = problem_of(game, scenario.sample(2, seed=7))
+    >>> problem.follow(problem.constant(problem.even_grid(3)[:, 1:2])).harm()
+    array([ 66.70178872, 170.53289437])
+
+    """
+
+    bodies: Ints  # [B] vehicles that are controlled (1: Vehicle 1)
+    state: State  # at the first decision; all other vehicles hold ``wanted``
+    time_step_s: float
+    horizon_s: float
+    total: bool  # every impact counts, not only the first of each pair
+    aim: float  # WHOLE, WEIGHTED or LARGEST
+    shares: Floats  # [n, 2, N + 1] of each pair: weight of its harm in that of its front vehicle; of its rear vehicle
+    identity: UInt64s  # [n] hash of everything that decides the harm of a profile (``identities``)
+
+    @property
+    def n(self) -> int:
+        """Number of worlds."""
+        return self.state.n
+
+    @property
+    def last_step(self) -> Ints:
+        """Number of decisions before the horizon, [n]."""
+        return self.state.clock[:, LAST].astype(np.int64)
+
+    @property
+    def bounds(self) -> Floats:
+        """Smallest and largest command of each controlled vehicle, [n, B, 2] m/s2."""
+        car = self.state.car[:, :, self.bodies]
+        return np.ascontiguousarray(np.stack([-car[:, BRAKING], car[:, DRIVING]], axis=2))
+
+    def take(self, rows: Any) -> Problem:
+        """Return the problem in the worlds ``rows``."""
+        return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
+
+    def counting(self, count: str) -> Problem:
+        """Return the problem that minimises the harm of the ``first`` impact of each pair, or ``total``."""
+        return self._replace(total=count == "total")
+
+    def even_grid(self, number: int) -> Floats:
+        """Return evenly spaced commands from full braking to full driving, [n, number, B] m/s2."""
+        low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
+        share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
+        return np.minimum(low + share * (high - low), high)
+
+    def constant(self, commands_mps2: Floats) -> Profiles:
+        """Return profiles with constant commands [n, Q, B], [n * Q]: first the Q profiles of world 0, and so on.
+
+        The phases with the same command end at different decisions, so that a search can change them one by one.
+        """
+        n, Q, B = commands_mps2.shape
+        borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
+        ends = np.minimum(borders, self.last_step[:, np.newaxis])
+        commands = np.repeat(commands_mps2.reshape(n * Q, 1, B), MOST_PHASES, axis=1)
+        return Profiles(np.repeat(ends, Q, axis=0), commands)
+
+    def follow(self, profiles: Profiles) -> State:
+        """Return the last states of the episodes in which the controlled vehicles follow their profiles.
+
+        To the last bit these are the episodes in which agents do. Raises ``InvalidInput`` for profiles that do not fit
+        or exceed a capacity, and ``PhysicsError`` if a check of the physics fails.
+        """
+        self.check(profiles)
+        line, car, clock, know, wanted, memories = self.state
+        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
+        failed = np.zeros(self.n, np.bool_)
+        ends, commands = np.ascontiguousarray(profiles.ends, np.int64), np.ascontiguousarray(profiles.commands_mps2)
+        follow_worlds(
+            line, car, clock, wanted, ends, commands, self.bodies, self.time_step_s, self.horizon_s,
+            scratch_for(wanted.shape[1]), failed,
+        )  # fmt: skip
+        if failed.any():
+            raise PhysicsError({k: "its profile could not be simulated" for k in np.flatnonzero(failed).tolist()})
+        return State(line, car, clock, know, wanted, memories)
+
+    def value(self, last: State, count: str | None = None) -> Floats:
+        """Return what the search minimises, [n] m2/s2, of episodes with these last states. ``count`` None: its own."""
+        total = self.total if count is None else count == "total"
+        if self.aim == WHOLE:
+            return last.harm("total" if total else "first")
+        pairs = last.line[:, TOTAL if total else FIRST]
+        borne = self.shares[:, 0] * pairs
+        borne[:, 1:] += (self.shares[:, 1] * pairs)[:, :-1]
+        if self.aim == LARGEST:
+            return borne.max(axis=1)
+        value = np.zeros(self.n)
+        for i in range(borne.shape[1]):
+            value = value + borne[:, i]
+        return value
+
+    def values(self, profiles: Profiles) -> dict[str, Floats]:
+        """Return what the search minimises if the vehicles follow ``profiles``: count of harm -> [n] m2/s2."""
+        last = self.follow(profiles)
+        return {count: self.value(last, count) for count in COUNTS}
+
+    def minimising(self, weights: Floats, *, largest: bool = False) -> Problem:
+        """Return the problem that minimises the sum of the vehicles' harm times ``weights`` [n, N], or the largest."""
+        mass = self.state.car[:, MASS]
+        weights = np.pad(np.broadcast_to(weights, (self.n, mass.shape[1] - 1)), ((0, 0), (1, 0)))
+        front = mass[:, 1:] / (mass[:, :-1] + mass[:, 1:])  # 0 of the obstacle, whose mass is infinite
+        shares = np.zeros((self.n, 2, mass.shape[1]))
+        shares[:, 0, :-1], shares[:, 1, :-1] = weights[:, :-1] * front, weights[:, 1:] * (1.0 - front)
+        return self._replace(shares=shares, aim=LARGEST if largest else WEIGHTED)
+
+    def check(self, profiles: Profiles) -> None:
+        """Raise ``InvalidInput`` for profiles that do not fit the worlds, or exceed a capacity of a vehicle."""
+        K, B = profiles.ends.shape[-1], len(self.bodies)
+        if profiles.ends.shape != (self.n, K) or profiles.commands_mps2.shape != (self.n, K, B):
+            raise InvalidInput(
+                f"profiles: ends has the shape {profiles.ends.shape} and commands_mps2 {profiles.commands_mps2.shape};"
+                f" must be ({self.n}, K) and ({self.n}, K, {B})"
+            )
+        low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
+        good = (profiles.commands_mps2 >= low) & (profiles.commands_mps2 <= high)
+        if not good.all():
+            k, j, b = np.argwhere(~good)[0]
+            raise InvalidInput(
+                f"profiles: command {profiles.commands_mps2[k, j, b]:g} m/s2 of vehicle_{self.bodies[b]} in row {k};"
+                f" must be in [{low[k, 0, b]:g}, {high[k, 0, b]:g}] m/s2"
+            )
+        rising = (np.diff(profiles.ends, axis=1, prepend=0) >= 0).all()
+        if not rising or not (profiles.ends[:, -1] == self.last_step).all():
+            raise InvalidInput("profiles: ends must not decrease, and the last phase must end at the last step")
+
+
+def problem_of(
+    game: Game,
+    alert: State,
+    bodies: Sequence[int] | None = None,
+    *,
+    count: str = "first",
+    objective: Declared = "total",
+    deciders: Sequence[int] | None = None,
+) -> Problem:
+    """Return the problem of choosing commands of some vehicles in worlds at the alert, or of the learners.
+
+    Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles.
+
+    Args:
+        game: rules of the episodes.
+        alert: worlds at the alert.
+        bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
+        count: harm of the ``first`` impact of each pair, or ``total``.
+        objective: what the controlled vehicles minimise, as under a scenario's key ``objective``.
+        deciders: the first decision is at their shortest latency; None: ``bodies``.
+
+    Raises ``InvalidInput`` for vehicles that do not exist, an objective that is no weighted harm, a script that looks
+    at the state, whose commands are not known at the alert, and a horizon before the first decision.
+
+    """
+    chosen = np.array(game.rules.learners if bodies is None else bodies, np.int64)
+    if (
+        not len(chosen)
+        or len(set(chosen.tolist())) < len(chosen)
+        or not set(chosen.tolist()) <= {*range(1, alert.vehicles + 1)}
+    ):
+        raise InvalidInput(f"vehicles {chosen.tolist()}: must be one or more of 1 to {alert.vehicles}, each once")
+    for body, script in game.scripts.items():
+        if body not in chosen:
+            raise InvalidInput(
+                f"scenario {game.name!r}: vehicle_{body} is driven by {getattr(script, 'name', script)!r}, whose"
+                " commands are not known at the alert; a search needs scripts that hold one command"
+            )
+    wanted = alert.wanted.copy()
+    wanted[:, game.rules.learners] = -alert.car[:, BRAKING][:, game.rules.learners]
+    wanted[:, chosen] = 0.0
+    dt, horizon = game.rules.time_step_s, game.rules.horizon_s
+    decide = chosen if deciders is None else np.array(deciders, np.int64)
+    state = begin(alert._replace(wanted=wanted, memories={}), decide, dt, horizon)
+    if not (state.time_s < horizon).all():
+        raise InvalidInput(f"horizon_s = {horizon:g}: must be after the first decision at {state.time_s.max():g} s")
+    shares = np.zeros((alert.n, 2, wanted.shape[1]))
+    times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST]]]
+    identity = identities(alert._replace(wanted=wanted), chosen, np.hstack([*times, np.full((alert.n, 1), horizon)]))
+    return aimed(Problem(chosen, state, dt, horizon, count == "total", WHOLE, shares, identity), objective)
+
+
+def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
+    """Return a hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
+
+    These are the world, the commands of all other vehicles, who is controlled, and ``times`` [n, 4]: first decision,
+    time step, number of steps, horizon. Tables of best known harm look worlds up by it.
+    """
+    line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)
+    controlled = np.zeros(alert.wanted.shape)
+    controlled[:, bodies] = 1.0
+    for ahead in (0, 1):  # an obstacle counts as a vehicle; a world's hash does not depend on the other worlds
+        rows = np.flatnonzero((line[:, GAP, 0] >= FAR_M) == bool(ahead))
+        of_line, of_car = line[rows][:, :, ahead:], car[rows][:, :, ahead:]
+        parts = [alert.time_s[rows, np.newaxis], of_line[:, SPEED], of_line[:, GAP, :-1], of_line[:, HIT, :-1]]
+        parts += [of_car[:, RESTITUTION, :1], *(of_car[:, row] for row in (BRAKING, DRIVING, LATENCY, MASS, LIMIT))]
+        parts += [alert.wanted[rows, ahead:], times[rows], controlled[rows, ahead:]]
+        forces = [of_line[:, FORCE], of_car[:, BRAKE_RATE], of_car[:, RELEASE_RATE]]
+        builds = np.isfinite(of_car[:, [BRAKE_RATE, RELEASE_RATE]]).sum(axis=(1, 2))
+        whole, more = (np.ascontiguousarray(np.hstack(each) + 0.0, "<f8") for each in (parts, forces))  # -0.0 is 0.0
+        for k, row in enumerate(rows):
+            content = whole[k].tobytes() + (more[k].tobytes() if builds[k] else b"")
+            digests[row] = int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "little")
+    return digests
+
+
+def aimed(problem: Problem, objective: Declared) -> Problem:
+    """Return the problem that minimises the objective of the controlled vehicles.
+
+    Raises ``InvalidInput`` if it is neither a weighted sum of the vehicles' harm nor ``maximin``, or if the controlled
+    vehicles have different ones.
+    """
+    car, chosen = problem.state.car, [body - 1 for body in problem.bodies.tolist()]
+    objectives = objectives_of(objective, problem.state.vehicles)
+    forms = [objectives[i].kind.form for i in chosen]
+    if set(forms) == {"total"}:
+        return problem
+    if set(forms) == {"maximin"}:
+        return problem.minimising(np.ones(problem.state.vehicles), largest=True)
+    weights = [] if "maximin" in forms else [objectives[i].weights(car, i) for i in chosen]
+    if not weights or any(not np.array_equal(weights[0], other) for other in weights[1:]):
+        raise InvalidInput(
+            f"objective {objective!r}: the {len(chosen)} controlled vehicles have different objectives, but a search"
+            " minimises one; give all of them the same, for instance weighted:1,4,1"
+        )
+    return problem.minimising(weights[0])
+
+
+@large
+def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, horizon_s, scratch, failed):
+    """Follow every profile, decision by decision, in place; set ``failed`` [n] where a check of the physics fails."""
+    for k in range(len(failed)):
+        phase = 0
+        while clock[k, ENDED] == 0.0:
+            while phase < ends.shape[1] - 1 and ends[k, phase] <= clock[k, STEPS]:
+                phase += 1
+            for b in range(len(bodies)):
+                wanted[k, bodies[b]] = commands[k, phase, b]
+            met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s, horizon_s)
+            failed[k] = met == FAILED
