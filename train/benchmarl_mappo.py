@@ -19,54 +19,37 @@ from numpy.typing import NDArray
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
-from ethbrake_marl.first_edition.game.observed import observation_for
-from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec
-from ethbrake_marl.first_edition.policies.policy import Policy
-from ethbrake_marl.first_edition.training.recipe import load_recipe
-from ethbrake_marl.first_edition.training.recipes import PpoRecipe
-from ethbrake_marl.first_edition.training.run_folder import RunDirectory
-from ethbrake_marl.first_edition.training.training import Training
+from ethbrake_marl.files.store import new_folder
+from ethbrake_marl.policies.network import NetworkSpec
+from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.recipe import PpoRecipe
+from ethbrake_marl.training.training import Training
 
 
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
-    """Train MAPPO with the hyperparameters of a PPO recipe, and save the run in the new folder `output`.
+    """Train MAPPO with the hyperparameters of a PPO recipe, and save the shared actor as `output`/policy.
 
-    Raises `InvalidInput` if the recipe is not for PPO, and `MissingExtra` without BenchMARL.
+    The learning rate keeps its initial value, because BenchMARL has no schedule. There are no checkpoints and no
+    evaluations during the training. Raises `InvalidInput` if the recipe is not for PPO or nobody learns, `MissingExtra`
+    without BenchMARL, and `AlreadyExists` if `output` exists.
     """
-    line, plan = eb.load_scenario(scenario), load_recipe(recipe).replace(total_steps=steps, seed=seed)
+    plan = eb.load_recipe(recipe)
     if not isinstance(plan, PpoRecipe):
         raise InvalidInput(f"recipe {plan.name!r}: is for {plan.algorithm.upper()}; MAPPO needs one for PPO")
+    training = Training.of(plan, scenario, total_steps=steps, seed=seed, scheme="centralised")
     with naming_extras():
         import benchmarl  # noqa: F401  # only here: an extra
-    train_mappo(plan, line, output)
-
-
-def train_mappo(recipe: PpoRecipe, scenario: eb.Scenario, directory: Path, algorithm: str = "mappo") -> Policy:
-    """Train BenchMARL's MAPPO with the hyperparameters of `recipe`, and save the shared actor in the new `directory`.
-
-    `algorithm` may also be "ippo", whose critic has the observation of the actor. `load_team` and `ppo@DIRECTORY` load
-    the result. The learning rate keeps its initial value, because BenchMARL has no schedule. There are no checkpoints
-    and no evaluations during the training.
-    """
-    from ethbrake_marl.first_edition.training.random_state import own_random_state
-
-    recipe = recipe.replace(scheme="centralised")
-    if recipe.observation is not None:
-        scenario = scenario.replace(observation=list(recipe.observation))
-    team = Training.of(recipe, scenario).team()
-    content = {"recipe": recipe.model_dump(mode="json"), "scenario": scenario.model_dump(mode="json")}
-    run = RunDirectory(directory).create({**content, "library": "benchmarl"}, team=team)
-    with own_random_state(), tempfile.TemporaryDirectory() as scratch:
-        experiment = make_experiment(recipe, scenario, scratch, algorithm)
+    with new_folder(output) as folder, tempfile.TemporaryDirectory() as scratch:
+        experiment = make_experiment(training, scratch)
         experiment.run()
-        policy = policy_of(experiment, recipe, scenario)
-    policy.save(run.policy)
-    run.write_status("finished", steps=policy.steps)
-    return policy
+        policy_of(experiment, training).save(folder / "policy")
 
 
-def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str, algorithm: str = "mappo") -> Any:
-    """Return a BenchMARL experiment with the hyperparameters of `recipe`. BenchMARL writes its files to `scratch`."""
+def make_experiment(training: Training, scratch: str, algorithm: str = "mappo") -> Any:
+    """Return a BenchMARL experiment with a recipe's hyperparameters. BenchMARL writes its files to `scratch`.
+
+    `algorithm` may also be "ippo", whose critic has the observation of the actor.
+    """
     import torch
     from benchmarl.algorithms import algorithm_config_registry
     from benchmarl.experiment import Experiment, ExperimentConfig
@@ -74,7 +57,8 @@ def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str, algo
 
     from ethbrake_marl.extensions.benchmarl.task import LineTask
 
-    learners = len(scenario.learners)
+    recipe, learners = training.recipe, len(training.learners)
+    assert isinstance(recipe, PpoRecipe)
     config = ExperimentConfig.get_from_yaml()
     config.gamma, config.lr = recipe.gamma, recipe.learning_rate.start
     config.clip_grad_val = recipe.max_grad_norm
@@ -92,20 +76,22 @@ def make_experiment(recipe: PpoRecipe, scenario: eb.Scenario, scratch: str, algo
     activation = torch.nn.ReLU if recipe.network.activation == "relu" else torch.nn.Tanh
     for model, cells in zip(models, (recipe.network.policy, recipe.network.value), strict=True):
         model.num_cells, model.activation_class = list(cells), activation
+    scenario = training.scenario.replace(observation=list(training.row.names))
     task = LineTask(
         scenario.name, {"scenario": scenario, "reward": recipe.reward, "horizon_is_end": recipe.horizon_is_end}
     )
     return Experiment(task, learns, models[0], recipe.seed, config, critic_model_config=models[1])
 
 
-def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Policy:
+def policy_of(experiment: Any, training: Training) -> Policy:
     """Return the shared actor of an experiment as a policy; the hyperbolic tangent limits its mean to [-1, 1]."""
     from torchrl.modules import MultiAgentMLP
 
+    recipe = training.recipe
+    assert isinstance(recipe, PpoRecipe)
     (actor,) = (m for m in experiment.group_policies["learners"].modules() if isinstance(m, MultiAgentMLP))
-    observation = observation_for(scenario)
     network = NetworkSpec(
-        observation_size=observation.size,
+        observation_size=len(training.row.names),
         action_size=1,
         policy_hidden=recipe.network.policy,
         value_hidden=(),
@@ -116,12 +102,12 @@ def policy_of(experiment: Any, recipe: PpoRecipe, scenario: eb.Scenario) -> Poli
         tensors_of(actor, len(recipe.network.policy)),
         algorithm="ppo",
         network=network,
-        observation=observation,
-        learners=tuple(scenario.vehicle_names[vehicle] for vehicle in scenario.learners),
-        scenario=scenario.model_dump(mode="json"),
+        observation=training.row,
+        learners=training.learners,
+        scenario=training.scenario.content(),
         reward=recipe.reward.model_dump(mode="json"),
         seeds={"training": recipe.seed},
-        steps=int(experiment.total_frames) * len(scenario.learners),
+        steps=int(experiment.total_frames) * len(training.learners),
     )
 
 

@@ -42,8 +42,9 @@ def read_dataset(path: Path) -> tuple[Tensor, Tensor, dict[str, Any]]:
         raise InvalidInput(f"{path}: must be a Parquet file from `to_parquet`") from None
     if len(metadata["learners"]) != 1:
         raise InvalidInput(f"{path}: has {len(metadata['learners'])} learners; it must have one")
-    number = metadata["learners"][0].removeprefix("vehicle_")
-    seen = [f"observation_{number}.{feature}" for feature in metadata["observation"]]
+    (learner,) = metadata["learners"]
+    number = learner.removeprefix("vehicle_")
+    seen = [f"observation_{number}.{feature}" for feature in metadata["observation"][learner]]
     table = pyarrow.parquet.read_table(path, columns=[*seen, f"action_{number}"])
     columns = np.stack([table[name].to_numpy() for name in table.column_names], axis=1).astype(np.float32)
     return torch.from_numpy(columns[:, :-1].copy()), torch.from_numpy(columns[:, -1:].copy()), metadata
@@ -78,7 +79,8 @@ def clone(seen: Tensor, actions: Tensor, seed: int) -> nn.Sequential:
 
 def as_policy(network: nn.Sequential, metadata: dict[str, Any], seed: int) -> Policy:
     """Return the network as a policy, with the scenario and the seeds of its dataset."""
-    scenario, view = eb.Scenario(**metadata["scenario"]), eb.View(metadata["observation"])
+    (learner,) = metadata["learners"]
+    scenario, view = eb.Scenario(**metadata["scenario"]), eb.View(metadata["observation"][learner])
     linear = [layer for layer in network if isinstance(layer, nn.Linear)]
     names = [*(f"policy.{k}" for k in range(len(HIDDEN))), "policy.output"]
     tensors: dict[str, NDArray[np.float32]] = {"policy.log_std": np.zeros(1, np.float32)}
@@ -97,7 +99,7 @@ def as_policy(network: nn.Sequential, metadata: dict[str, Any], seed: int) -> Po
             output="clip",
         ),
         observation=view,
-        learners=tuple(metadata["learners"]),
+        learners=(learner,),
         scenario=scenario.content(),
         reward=metadata["reward"],
         seeds={"training": seed, "list": metadata["seed"]},

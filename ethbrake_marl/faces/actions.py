@@ -44,7 +44,7 @@ def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, coun
         good = (given >= 0) & (given < count) & (given.dtype.kind in "iu")
         if not good.all():
             raise InvalidInput(
-                f"action of {whose} = {given[~good].flat[0]!r}: with actions={count}, an action must be an index, a"
+                f"action of {whose} = {given[~good][0].item()!r}: with actions={count}, an action must be an index, a"
                 f" whole number from 0 to {count - 1}"
             )
         given = (2 * given.astype(np.int64) - (count - 1)) / (count - 1)

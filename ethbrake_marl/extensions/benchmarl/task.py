@@ -1,8 +1,8 @@
 """A scenario as a TorchRL environment and as a BenchMARL task; needs ``pip install ethbrake-marl[marl]``.
 
-The environment runs ``n`` worlds in one engine. All learners of a world form one group in TorchRL, and the episode of a
+The environment simulates ``n`` worlds together. All learners of a world form one group in TorchRL, and the episode of a
 world ends for all its learners at the same time. ``state``, the input of a central critic, is the full state of the
-line (``game.full_state.full_state``).
+line (``episode.full_state``).
 
 Letters in shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
 """
@@ -10,6 +10,7 @@ Letters in shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observatio
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,16 +20,17 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from ethbrake_marl.episode.full_state import full_state, state_features
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.first_edition.envs.making import feature_box, learner_action_space, make_engine
-from ethbrake_marl.first_edition.game.discrete_actions import index_to_action
-from ethbrake_marl.first_edition.game.full_state import full_state, state_features
-from ethbrake_marl.first_edition.game.observed import observation_for
-from ethbrake_marl.first_edition.game.rewards import Reward
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.scenario.schema import Scenario
-from ethbrake_marl.first_edition.shields.attach import guard_of
-from ethbrake_marl.first_edition.shields.options import ShieldOptions
+from ethbrake_marl.faces.actions import action_space, checked_actions
+from ethbrake_marl.faces.shield import MODES
+from ethbrake_marl.faces.spaces import FeatureBox
+from ethbrake_marl.faces.stream import Stream, chosen_seed
+from ethbrake_marl.names import open_game
+from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.scenario import Scenario
 
 GROUP = "learners"
 
@@ -40,81 +42,88 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
     [n, 1].
 
     Args:
-        scenario: the scenario, which must have at least one learner.
+        scenario: the scenario, which must have a learner; all learners observe the same features.
         n: number of worlds.
         seed: seed from which the worlds are drawn.
         reward: reward of the learners: a name such as ``harm``, or the weights of the reward's terms.
         horizon_is_end: True: an episode that reaches the horizon is terminated; False: it is truncated.
-        shield: mode of the learners' shield, which must be ``step`` if there are several learners. None: no shield.
+        shield: mode of the learners' shield, such as ``step``. None: no shield.
         actions: number of discrete actions, for algorithms such as QMIX; None: actions are numbers in [-1, 1].
 
     """
 
+    episode: State
+
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: AnyScenario,
         n: int,
         seed: int,
-        reward: Reward,
+        reward: Any = "harm",
         horizon_is_end: bool = True,
         shield: str | None = None,
         actions: int | None = None,
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))
-        self.engine = make_engine(scenario, n, reward=reward, observation=observation_for(scenario), seed=seed)
-        if shield is not None:
-            self.engine.protect(guard_of(self.engine, None, ShieldOptions(shield)))
-        self.horizon_is_end = horizon_is_end
-        self._learners = np.array(self.engine.learners, np.int64)
-        rows = (n, len(self._learners))
-        seen = _bound(feature_box(self.engine.observation.features), rows)
-        state = _bound(feature_box(state_features(scenario)), (n,))
+        loaded, game = open_game(scenario, reward=reward)
+        self.learners, self.horizon_is_end, self.actions = game.rules.learners, horizon_is_end, actions
+        self.of_state = loaded.horizon_s, loaded.has_obstacle
+        views = {game.views[i] for i in self.learners}
+        if len(views) != 1:
+            raise InvalidInput(
+                f"scenario {loaded.name!r}: its {len(self.learners)} learners have {len(views)} different observations;"
+                " must have one or more learners, which all observe the same features"
+            )
+        self.game = game if shield is None else game._replace(shield=MODES[shield](None))
+        self.stream = Stream(loaded, self.game)
+        self.stream.seed = chosen_seed(seed)
+        rows = n, len(self.learners)
+        seen = _bound(FeatureBox(views.pop().features), rows)
+        whole = _bound(FeatureBox(state_features(loaded.vehicles, *self.of_state)), (n,))
         self.observation_spec = Composite(
-            {GROUP: Composite({"observation": seen}, shape=rows), "state": state}, shape=(n,)
+            {GROUP: Composite({"observation": seen}, shape=rows), "state": whole}, shape=(n,)
         )
-        self.actions, space = actions, learner_action_space(actions)
+        space = action_space(actions)
         action = Bounded(-1.0, 1.0, shape=(*rows, 1)) if actions is None else Categorical(space.n, shape=rows)
         self.action_spec = Composite({GROUP: Composite({"action": action}, shape=rows)}, shape=(n,))
-        reward_of_each = Composite({"reward": Unbounded(shape=(*rows, 1))}, shape=rows)
-        self.reward_spec = Composite({GROUP: reward_of_each}, shape=(n,))
+        rewards = Composite({"reward": Unbounded(shape=(*rows, 1))}, shape=rows)
+        self.reward_spec = Composite({GROUP: rewards}, shape=(n,))
         flags = ("done", "terminated", "truncated")
         flag = {name: Categorical(2, dtype=torch.bool, shape=(n, 1)) for name in flags}
         self.done_spec = Composite(flag, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Start a new episode in all worlds, or in the worlds where the mask ``_reset`` in ``tensordict`` is True."""
-        asked = None if tensordict is None else tensordict.get("_reset", None)
-        if asked is None:
-            self.engine.reset()
+        """Start the next episode in all worlds, or in those where the mask ``_reset`` in ``tensordict`` is True."""
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is None:
+            self.episode = self.stream.draw(self.batch_size[0])
         else:
-            self.engine.renew(np.flatnonzero(asked.numpy().reshape(-1)))
-        return TensorDict(self._observe_all(), batch_size=self.batch_size)
+            rows = np.flatnonzero(mask.numpy().reshape(-1))
+            self.episode = self.episode.put(rows, self.stream.draw(len(rows)), donate=True)
+        return TensorDict(self._observe(), batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
-        given = tensordict[GROUP, "action"].numpy()
-        step = self.engine.step(
-            given[:, :, 0].clip(-1.0, 1.0) if self.actions is None else index_to_action(given, self.actions)
-        )
-        reward = torch.from_numpy(step.reward[:, self._learners, np.newaxis].astype(np.float32))
-        terminated, truncated = step.terminated.copy(), step.truncated.copy()
+        shape = self.batch_size[0], len(self.learners)
+        actions = checked_actions(tensordict[GROUP, "action"].numpy(), shape, "the learners", self.actions)
+        self.episode, step = self.game.step(self.episode, actions, donate=True)
+        terminated, truncated = step.terminated, step.truncated
         if self.horizon_is_end:
             terminated, truncated = terminated | truncated, np.zeros_like(truncated)
-        content = self._observe_all()
-        content[GROUP]["reward"] = reward
-        for name, flag in (("done", step.ended), ("terminated", terminated), ("truncated", truncated)):
-            content[name] = torch.from_numpy(np.array(flag, np.bool_)[:, np.newaxis])
+        content = self._observe()
+        content[GROUP]["reward"] = torch.from_numpy(step.reward[:, self.learners - 1, np.newaxis].astype(np.float32))
+        for name, flag in (("done", self.episode.ended), ("terminated", terminated), ("truncated", truncated)):
+            content[name] = torch.from_numpy(flag[:, np.newaxis])
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Start new episodes in worlds that are drawn from ``seed``; do nothing if ``seed`` is None."""
+        """Let the next reset begin with world 0 of ``seed``; do nothing if it is None."""
         if seed is not None:
-            self.engine.reset(seed=seed)
+            self.stream.seed, self.stream.next = chosen_seed(seed), 0
 
-    def _observe_all(self) -> dict[str, Any]:
-        every = torch.from_numpy(self.engine.observe_all(self._learners).copy())
-        state = torch.from_numpy(full_state(self.engine.worlds, self.engine.scenario))
-        own = TensorDict({"observation": every}, batch_size=every.shape[:2])
-        return {GROUP: own, "state": state}
+    def _observe(self) -> dict[str, Any]:
+        seen = torch.from_numpy(self.game.observe_alike(self.episode, self.learners))
+        own = TensorDict({"observation": seen}, batch_size=seen.shape[:2])
+        return {GROUP: own, "state": torch.from_numpy(full_state(self.episode, *self.of_state))}
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
@@ -122,9 +131,8 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     Args:
         name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
-        config: mapping with the keys ``scenario``, ``reward`` and ``horizon_is_end``, and optionally ``shield`` and
-            ``actions``. ``scenario`` is the name of a shipped scenario, the path of a scenario file, a mapping with the
-            content of such a file, or a ``Scenario``. The other values are passed to ``LineEnv``.
+        config: mapping with the key ``scenario``, and optionally ``reward``, ``horizon_is_end``, ``shield`` and
+            ``actions``: the arguments of ``LineEnv``.
 
     """
 
@@ -139,15 +147,14 @@ class LineTask(TaskClass):  # type: ignore[misc]
         Raises ``InvalidInput`` if the task has continuous actions and BenchMARL wants discrete actions, or the other
         way round.
         """
-        config, actions = self.config, self.config.get("actions")
+        actions = self.config.get("actions")
         if continuous_actions != (actions is None):
             raise InvalidInput(
                 f"task {self.name}: continuous_actions = {continuous_actions} contradicts actions = {actions}; for"
                 " continuous actions, set actions to None; for discrete actions, set actions to the number of actions"
                 " (at least 2)"
             )
-        settings = config["reward"], config["horizon_is_end"], config.get("shield"), actions
-        return lambda: LineEnv(config["scenario"], num_envs, seed or 0, *settings)
+        return partial(LineEnv, n=num_envs, seed=seed or 0, **self.config)
 
     def supports_continuous_actions(self) -> bool:
         """Return True if the key ``actions`` in ``config`` is None or missing."""
@@ -158,7 +165,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
-        """Return the largest number of decisions in an episode; ``env`` is unused."""
+        """Return the largest number of decisions in an episode."""
         scenario: Scenario = self.config["scenario"]
         return round(scenario.horizon_s / scenario.time_step_s) + 1
 
@@ -167,9 +174,9 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return False
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
-        """Return ``{"learners": names}``: one group with the names of all learners. ``env`` is unused."""
-        scenario = self.config["scenario"]
-        return {GROUP: [scenario.vehicle_names[vehicle] for vehicle in scenario.learners]}
+        """Return ``{"learners": names}``: one group with the names of all learners."""
+        scenario: Scenario = self.config["scenario"]
+        return {GROUP: [scenario.vehicle_names[body - 1] for body in scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:
         """Return the TorchRL spec of the learners' observations in ``env``, for a single world."""

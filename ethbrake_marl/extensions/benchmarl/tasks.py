@@ -14,11 +14,11 @@ from benchmarl.environments.common import Task
 from hydra.core.config_store import ConfigStore
 
 from ethbrake_marl.extensions.benchmarl.task import LineTask
-from ethbrake_marl.first_edition.scenario.catalogue import list_scenarios, load_scenario
+from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
 
 
 class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra is not installed
-    """Enumeration of the tasks for BenchMARL: one task for each shipped scenario with a learner."""
+    """The tasks for BenchMARL: one for each shipped scenario with a learner."""
 
     @staticmethod
     def associated_class() -> type[LineTask]:

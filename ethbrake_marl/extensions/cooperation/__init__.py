@@ -1,4 +1,4 @@
-"""Comparison of levels of cooperation (``ethbrake study ablate``), and equilibria of several learners."""
+"""What a level of cooperation is worth (``ethbrake study ablate``), and equilibria of several learners."""
 
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,10 @@ if TYPE_CHECKING:
         compare_starts as compare_starts,
         find_equilibria as find_equilibria,
         price_of_anarchy as price_of_anarchy,
+    )
+    from ethbrake_marl.extensions.cooperation.seeds import (
+        mean_over_seeds as mean_over_seeds,
+        share_over_seeds as share_over_seeds,
     )
 
 else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,12 +10,13 @@ from rich.text import Text
 
 from ethbrake_marl.cli.command import JobsOption, JsonOption, Out, SettingsOption, example
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.studies.commands import REMAINS, FolderOption
 from ethbrake_marl.registry import Part
+
+REMAINS = "the same command continues the work in this folder"
 
 
 def ablate_command(
-    output: FolderOption,
+    output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")],
     levels: Annotated[
         str | None,
         typer.Option(
@@ -57,50 +59,65 @@ def ablate_command(
     ] = None,
     settings: SettingsOption = None,
     quick: Annotated[bool, typer.Option("--quick", help="For a quick try: few seeds, worlds and decisions.")] = False,
-    cost: Annotated[
-        bool,
-        typer.Option(
-            "--cost",
-            help="Estimate the time of the command by short trials, print it and the output folders, and exit.",
-        ),
-    ] = False,
     jobs: JobsOption = 1,
     as_json: JsonOption = False,
 ) -> None:
     """Compare several levels of cooperation in the same worlds.
 
-    The command first prints an estimate of its running time. The command then trains policies at all levels, compares
-    the levels, and writes ablation.json, ablation.csv and the figure ablation.png. After an interruption, repeat the
-    command to continue.
+    The command trains policies at all levels, compares the levels, and writes ablation.json, ablation.csv and the
+    figure ablation.png. After an interruption, repeat the command to continue.
 
     With --sweep, the levels are copies of one scenario in which one key has different values.
     """
     with Out(as_json=as_json, remains=REMAINS) as out:
-        from ethbrake_marl.extensions.cooperation.ablation import HOW_MEASURED, ablation_cost, run_ablation
-        from ethbrake_marl.extensions.cooperation.levels import plan_ablation
-        from ethbrake_marl.extensions.cooperation.results import tables
+        from ethbrake_marl.cli.settings import read_settings
+        from ethbrake_marl.cli.train import changed
+        from ethbrake_marl.evaluation.door import SEED
+        from ethbrake_marl.extensions.cooperation.levels import (
+            FULL,
+            LADDER,
+            QUICK,
+            STANDARD,
+            SWEPT,
+            Plan,
+            read_levels,
+            sweep_levels,
+        )
+        from ethbrake_marl.extensions.cooperation.measured import measure
+        from ethbrake_marl.extensions.cooperation.results import tables, write_ablation
+        from ethbrake_marl.extensions.cooperation.trainings import train_all
         from ethbrake_marl.extensions.studies.machine import this_machine
+        from ethbrake_marl.training.recipe import load_recipe
 
         if sweep is not None and len(sweep) > 1:
             raise InvalidInput("--sweep is given twice; give it once, because the figures can show only one swept key")
-        plan = plan_ablation(
-            levels, recipes, settings, sweep=sweep[0] if sweep else None, quick=quick, tell=out.note,
-            seeds=seeds, steps_per_learner=steps, episodes=episodes, search_episodes=search_episodes, shield=shield,
-            folder=output,
-        )  # fmt: skip
-        plan.study_folder().check()
-        estimate = ablation_cost(plan)
-        if cost:
-            trainings, optimum = output / "trainings", output / "optimum"
-            folders = f"folders: {estimate.training_folders} in {trainings}, {estimate.search_folders} in {optimum}"
-            measured = f"measured: {HOW_MEASURED}"
-            out.result({**estimate.to_json(), "measured": HOW_MEASURED}, str(estimate), folders, measured)
-            return
-        out.note(str(estimate))
-        written = run_ablation(plan, jobs or 1, str(this_machine()), out.show_progress)
-        if written is None:
-            out.interrupted(f"interrupted; {REMAINS}")
-        results, paths = written
+        loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
+        changes = read_settings(settings, [key for recipe in loaded for key in type(recipe).model_fields])
+        plans = [changed(recipe, changes.recipe, out) for recipe in loaded]
+        plans = [recipe if recipe.scheme else recipe.replace(scheme="shared") for recipe in plans]
+        usual = ",".join(LADDER if quick else STANDARD) if sweep is None else SWEPT
+        names = [each.strip() for each in (levels or usual).split(",")]
+        if sweep is not None and len(names) != 1:
+            raise InvalidInput(f"levels: {len(names)} levels given; a sweep needs exactly one level")
+        given = {
+            "seeds": seeds, "steps_per_learner": steps, "episodes": episodes, "search_episodes": search_episodes,
+        }  # fmt: skip
+        chosen = {key: value for key, value in given.items() if value is not None}
+        plan = Plan(
+            output,
+            tuple(read_levels(names, changes) if sweep is None else sweep_levels(names[0], sweep[0], changes, plans)),
+            tuple(plans),
+            list_seed=SEED,
+            shield=shield,
+            sweep=sweep[0] if sweep else None,
+            noted=changes.texts,
+            **{**(QUICK if quick else FULL), **chosen},
+        )
+        with plan.study_folder().work():
+            if not train_all(plan, jobs or 1, out.show_progress):
+                out.interrupted(f"interrupted; {REMAINS}")
+            measured = measure(plan, jobs or 1, out.show_progress)
+            results, paths = write_ablation(plan, measured, str(this_machine()))
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
         out.result(results, *tables(results), results["conditions"], *alarms)
         out.note(f"results: {', '.join(map(str, paths))}")
@@ -110,6 +127,6 @@ ABLATE = Part(
     ablate_command,
     epilog=example(
         "study ablate --quick --output runs/ablation-quick",
-        "study ablate --sweep objective=social:0..90:15 --output runs/angle --cost",
+        "study ablate --sweep objective=social:0..90:15 --output runs/angle",
     ),
 )

@@ -4,64 +4,22 @@ from __future__ import annotations
 
 import re
 from decimal import Decimal
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.files.overrides import Override
 
-MOST = 100  # largest number of values of a sweep
-
-_NUMBER = r"-?\d+(?:\.\d+)?"
-
-_ITEM = re.compile(rf"(?P<low>{_NUMBER})(?:\.\.(?P<high>{_NUMBER}):(?P<step>{_NUMBER}))?", re.ASCII)
-
-_WORD = re.compile(r"\s*([A-Za-z][\w-]*:)?", re.ASCII)
+MOST = 100  # values of a sweep
+NUMBER = r"-?\d+(?:\.\d+)?"
+ITEM = re.compile(rf"(?P<low>{NUMBER})(?:\.\.(?P<high>{NUMBER}):(?P<step>{NUMBER}))?", re.ASCII)
+WORD = re.compile(r"\s*([A-Za-z][\w-]*:)?", re.ASCII)
 
 
 class Swept(NamedTuple):
     """The key of a scenario that a sweep varies, with one of its values."""
 
-    key: str  # key of a scenario, such as v2x.lost
+    key: str  # such as v2x.lost
     word: str  # text before the number in the value, such as ``social:``; usually empty
-    text: str  # the number, as text
-
-    @classmethod
-    def parse(cls, text: str) -> list[Swept]:
-        """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
-
-        A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. After ``KEY=``, single
-        numbers and ranges may stand together, separated by commas.
-
-        Raises ``InvalidInput`` for a value that is not a number, for a range whose length HIGH - LOW is not a multiple
-        of its step, for a repeated number, and for fewer than 2 or more than ``MOST`` numbers.
-        """
-        key, equals, values = (part.strip() for part in text.partition("="))
-        word = match.group(1) or "" if (match := _WORD.match(values)) else ""
-        numbers: list[Decimal] = []
-        for item in values.split(","):
-            parsed = _ITEM.fullmatch(item.strip().removeprefix(word).strip())
-            if not (key and equals and parsed):
-                raise InvalidInput(
-                    f"--sweep {text!r:.200}: must be KEY=LOW..HIGH:STEP or KEY=A,B,... with numbers, for instance"
-                    " objective=social:0..90:15 or v2x.lost=0,0.1,0.3; for other values, give scenarios with --levels"
-                )
-            low, high, step = (Decimal(part or parsed["low"]) for part in parsed.group("low", "high", "step"))
-            if parsed["step"] is None:
-                numbers.append(low)
-                continue
-            steps = (high - low) / step if step > 0 else Decimal(0)
-            if not 0 < steps < MOST or steps % 1:
-                raise InvalidInput(
-                    f"--sweep {key}: range {item.strip()}: a range LOW..HIGH:STEP must go up from LOW to HIGH in 1 to"
-                    f" {MOST - 1} equal steps, for instance 0..90:15"
-                )
-            numbers += [low + k * step for k in range(int(steps) + 1)]
-        if not 2 <= len(numbers) <= MOST:
-            raise InvalidInput(f"--sweep {key}: has {count_of(len(numbers), 'number')}; give 2 to {MOST} numbers")
-        for number in numbers:
-            if numbers.count(number) > 1:
-                raise InvalidInput(f"--sweep {key}: {number} is given twice; give each number once")
-        return [cls(key, word, f"{number.normalize():f}") for number in sorted(numbers)]
+    text: str  # the number
 
     @property
     def number(self) -> float:
@@ -74,20 +32,38 @@ class Swept(NamedTuple):
         return f"{self.key}={self.word}{self.text}"
 
     @property
-    def override(self) -> Override:
-        return Override.parse([self.setting])[0]
-
-    @property
-    def same_lines(self) -> bool:
-        """Whether world k has the same vehicles and the same physics for every value of the swept key."""
-        return self.key.partition(".")[0] in ("objective", "obstacle_gap_m", "roles", "v2x")
-
-    @property
     def label(self) -> str:
         """End of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
-    @property
-    def columns(self) -> dict[str, Any]:
-        """Columns of result tables: the key, its value as text, and the number in the value."""
-        return {"swept_key": self.key, "swept_value": f"{self.word}{self.text}", "swept_number": self.number}
+
+def parse_sweep(text: str) -> list[Swept]:
+    """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
+
+    A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. After ``KEY=``, single numbers
+    and ranges may stand together. Raises ``InvalidInput`` for a value that is not a number, for a range whose length
+    HIGH - LOW is not a multiple of its step, for a repeated number, and for fewer than 2 or more than ``MOST`` numbers.
+    """
+    key, equals, values = (part.strip() for part in text.partition("="))
+    match = WORD.match(values)
+    word, numbers = (match[1] or "" if match else ""), list[Decimal]()
+    for item in values.split(","):
+        parsed = ITEM.fullmatch(item.strip().removeprefix(word).strip())
+        if not (key and equals and parsed):
+            raise InvalidInput(
+                f"--sweep {text!r:.200}: must be KEY=LOW..HIGH:STEP or KEY=A,B,... with numbers, for instance"
+                " objective=social:0..90:15 or v2x.lost=0,0.1,0.3; for other values, give scenarios with --levels"
+            )
+        low, high, step = (Decimal(part or 0) for part in parsed.group("low", "high", "step"))
+        steps = (high - low) / step if step > 0 else Decimal(0)
+        if parsed["step"] is not None and (not 0 < steps < MOST or steps % 1):
+            raise InvalidInput(
+                f"--sweep {key}: range {item.strip()}: a range LOW..HIGH:STEP must go up from LOW to HIGH in 1 to"
+                f" {MOST - 1} equal steps, for instance 0..90:15"
+            )
+        numbers += [low + k * step for k in range(int(steps) + 1)]
+    if not 2 <= len(numbers) <= MOST:
+        raise InvalidInput(f"--sweep {key}: has {count_of(len(numbers), 'number')}; give 2 to {MOST} numbers")
+    if twice := [number for number in numbers if numbers.count(number) > 1]:
+        raise InvalidInput(f"--sweep {key}: {twice[0]} is given twice; give each number once")
+    return [Swept(key, word, f"{number.normalize():f}") for number in sorted(numbers)]

@@ -15,7 +15,7 @@ import pandas as pd
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.recorded.states import FARTHEST_M, Recording
-from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.motion.layout import Floats
 
 # Allowed ratio: recorded change of gaps or positions / change that follows from the speeds. It is 3.28 if a file mixes
 # feet and metres. Gaps are checked only if the two changes have at least the correlation CORRELATED.

@@ -50,8 +50,8 @@ def from_data_command(
     ] = "realistic-motorway",
     every: Annotated[float, typer.Option(help="Take rows from the recordings every so many seconds.")] = 1.0,
     draw: Annotated[
-        Literal["rows", "normal", "lognormal", "quantiles"],
-        typer.Option(help="Draw worlds as whole recorded rows, or from distributions that are fitted to the rows."),
+        Literal["rows", "quantiles"],
+        typer.Option(help="Draw worlds as whole recorded rows, or each quantity from 40 quantiles of the rows."),
     ] = "rows",
     strict: Annotated[bool, typer.Option("--strict", help="Write no scenario if any file has errors.")] = False,
     force: ForceOption = False,

@@ -38,6 +38,7 @@ class Format(NamedTuple):
     alone: float = 0.0  # value in the column of the vehicle ahead if no vehicle is ahead
     headless: tuple[str, ...] = ()  # names of the columns of a text file without a header, separated by blanks
     texts: tuple[str, ...] = ()  # quantities whose columns have names instead of numbers
+    optional: tuple[str, ...] = ()  # quantities whose columns may be missing
 
     @property
     def gaps(self) -> bool:
@@ -73,12 +74,12 @@ FORMATS: dict[DataFormat, Format] = {
     "ngsim": Format(
         "NGSIM", ("*.csv", "*.txt"),
         {"time": "Global_Time", "vehicle": "Vehicle_ID", "lane": "Lane_ID", "ahead": "Preceding", "front": "Local_Y",
-         "length": "v_Length", "speed": "v_Vel"},
+         "length": "v_Length", "speed": "v_Vel", "location": "Location"},
         "feet and feet/s",
         "NGSIM is of the US Department of Transportation, CC BY-SA: name the source, and share what you make of it"
         " under the same licence. Streets with crossings (lankershim, peachtree) are left out.",
         metres=FOOT_M, mps=FOOT_M, ticks=0.01, impossible=0.05, streets=("lankershim", "peachtree"),
-        headless=_NGSIM_TEXT, texts=("location",),
+        headless=_NGSIM_TEXT, texts=("location",), optional=("location",),
     ),
     "openacc": Format(
         "OpenACC", ("*.csv",), {"time": "Time", "speed": f"Speed{NUMBER}", "gap": f"IVS{NUMBER}"}, "m and m/s",

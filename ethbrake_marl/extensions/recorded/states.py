@@ -6,7 +6,6 @@ A *tick* is the interval between two recorded moments.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,11 +15,11 @@ import pandas as pd
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.extensions.recorded.formats import HIGHD_META, Format
 from ethbrake_marl.extensions.recorded.reading import Source, open_source, read_columns
-from ethbrake_marl.first_edition.scenario.fields import QUANTITY
+from ethbrake_marl.worlds.rules import RULES
 
 FASTEST_MPS, LONGEST_M = 75.0, 40.0  # largest speed (270 km/h) and length of a road vehicle
 
-FARTHEST_M = QUANTITY.usual["gaps_m"].high  # longest gap that a scenario may have
+FARTHEST_M = RULES["gaps_m"].high  # longest gap that a scenario may have
 
 # Range of the lengths of cars and vans (m), and the least share of such vehicles. Lengths in feet violate it.
 CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3
@@ -55,52 +54,41 @@ class Recording(NamedTuple):
         return self.names.get(number) or f"{number:.0f}"
 
 
-def check_every(every_s: float, entry: Format, what: str) -> int:
+def check_every(every_s: float, entry: Format) -> int:
     """Return the number of ticks in the time ``every_s``.
 
-    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick. ``what`` is the name of the data in the message.
+    Raises ``InvalidInput`` if ``every_s`` is not a multiple of a tick.
     """
     stride = every_s * entry.hertz
     off = 0.01 * stride if entry.title == "the table" else 1e-6  # video has 29.97 pictures in a second
     if not (1.0 - 1e-6 <= stride < 1e9 and abs(stride - round(stride)) <= off):
         raise InvalidInput(
             f"every = {every_s:g} s: the time between the moments that are read must be a multiple of"
-            f" {1 / entry.hertz:g} s, the time step of {what}"
+            f" {1 / entry.hertz:g} s, the time step of {entry.title}"
         )
     return round(stride)
 
 
-def read_recording(file: Path, entry: Format, every_s: float, progress: Callable[[int, int], None]) -> Recording:
+def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
     """Read the states of the vehicles in a file at regular times, ``every_s`` apart, from the file's first moment.
 
-    The file is read twice: first the times, then the rows at the moments that are used. Raises ``InvalidInput``, which
-    names file, line and column, for an impossible value, for instance a length of 0 m.
+    Raises ``InvalidInput``, which names file, line and column, for an impossible value, for instance a length of 0 m.
     """
     source = open_source(file, entry)
-    first = [quantity for quantity in ("time", "location") if quantity in source.at]
-    moments = [np.empty(0)]
-    for piece in read_columns(source, entry, first, progress):
-        source.refuse(abs(piece["time"]) > LATEST, "time", piece["time"], "must be between -2^53 and 2^53")
-        moments.append(piece["time"].unique())
-    times = np.unique(np.concatenate(moments))
-    if not len(times):
+    raw, names = read_columns(source, entry), dict[float, str]()
+    if raw.empty:
         right = f" except those from {' and '.join(entry.streets)}, which have crossings" * bool(entry.streets)
         raise InvalidInput(f"{file}: contains no rows of data{right}")
+    source.refuse(abs(raw["time"]) > LATEST, "time", raw["time"], "must be between -2^53 and 2^53")
     if not entry.hertz:
-        entry = _with_rate(entry, times, every_s)
-    stride = check_every(every_s, entry, entry.title)
+        entry = _with_rate(entry, raw["time"].unique(), every_s)
+    stride = check_every(every_s, entry)
     near = max(1, min(stride, int(CHECK_S * entry.hertz)))
-    pieces = []
-    for piece in read_columns(source, entry, list(source.at), progress):
-        ticks = (piece["time"] - times[0]) * entry.ticks
-        whole = ticks.round()
-        right = f"is more than 2^53 steps of {1 / entry.hertz:g} s after the first time"
-        source.refuse(whole > LATEST, "time", piece["time"], right)
-        right = f"must be a multiple of {1 / entry.hertz:g} s after the first time"
-        source.refuse(abs(ticks - whole) > OFF, "time", piece["time"], right)
-        pieces.append(piece.assign(tick=whole.astype("int64"))[np.isin(whole % stride, (0, near % stride))])
-    raw = pd.concat(pieces)
-    names = dict[float, str]()
+    ticks = (raw["time"] - raw["time"].min()) * entry.ticks
+    right = f"must be a multiple of {1 / entry.hertz:g} s after the first time, and less than 2^53 of them"
+    source.refuse((ticks > LATEST) | (abs(ticks - ticks.round()) > OFF), "time", raw["time"], right)
+    raw["tick"] = ticks.round().astype("int64")
+    raw = raw[np.isin(raw["tick"] % stride, (0, near % stride))]
     if entry.gaps:
         states = _openacc(raw, source, entry)
     else:
@@ -165,7 +153,7 @@ def _along_road(raw: Any, source: Source, entry: Format) -> Any:
 def _turn_highd(states: Any, source: Source) -> None:
     """Let positions increase in the direction of travel; x is the left edge of a vehicle and grows to the right."""
     meta = open_source(Path(f"{str(source.file)[:-4]}Meta.csv"), HIGHD_META)
-    rows = pd.concat(read_columns(meta, HIGHD_META, list(meta.at), lambda *_: None))
+    rows = read_columns(meta, HIGHD_META)
     direction = states["vehicle"].map(rows.drop_duplicates("vehicle").set_index("vehicle")["direction"])
     right = "must have the drivingDirection 1 or 2 in its tracksMeta.csv"
     source.refuse(~direction.isin([1.0, 2.0]), "vehicle", states["vehicle"], right)
@@ -210,23 +198,20 @@ def _openacc(raw: Any, source: Source, entry: Format) -> Any:
             f"{source.file}: no column is the gap between two cars; the file must have the speeds of two cars and the"
             " gap between them, such as Speed1, Speed2 and IVS1"
         )
-    for k in cars:
-        speed = raw[f"speed{k}"]
-        right = f"m/s: the speed must be at most {FASTEST_MPS:g} m/s; {entry.title} is in {entry.units}"
-        source.refuse(speed > FASTEST_MPS, f"speed{k}", speed, right)
-    for name in gap_of.values():
-        source.refuse(abs(raw[name]) > FARTHEST_M, name, raw[name], f"m: the gap must be at most {FARTHEST_M:g} m")
+    limits = {f"speed{k}": (f"m/s: the speed must be at most {FASTEST_MPS:g} m/s", FASTEST_MPS) for k in cars}
+    limits |= {gap: (f"m: the gap must be at most {FARTHEST_M:g} m", FARTHEST_M) for gap in gap_of.values()}
+    for name, (right, most) in limits.items():
+        source.refuse(abs(raw[name]) > most, name, raw[name], f"{right}; {entry.title} is in {entry.units}")
     speeds = raw[[f"speed{k}" for k in cars]].to_numpy()
     gaps = np.column_stack([raw[gap_of[k]] if k in gap_of else np.full(len(raw), np.nan) for k in cars])
     linked = np.isfinite(gaps) & np.isfinite(speeds)
     linked[:, 1:] &= np.isfinite(speeds[:, :-1])
     numbers = np.tile(np.array(cars, float), (len(raw), 1))
-    states = pd.DataFrame(
+    return pd.DataFrame(
         {
             "tick": raw["tick"].repeat(len(cars)), "vehicle": numbers.ravel(), "lane": 0.0,
             "ahead": np.where(linked, numbers - 1.0, -1.0).ravel(),
             "front": -np.cumsum(np.where(linked, gaps, 0.0), axis=1).ravel(), "side": 0.0, "dx": 1.0, "dy": 0.0,
             "length": 0.0, "speed": speeds.ravel(),
         }
-    )  # fmt: skip
-    return states.dropna()
+    ).dropna()  # fmt: skip

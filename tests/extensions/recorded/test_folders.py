@@ -102,7 +102,7 @@ def test_hostile_folder__yields_the_good_files_and_one_line_for_each_other(tmp_p
     (folder / "sub").mkdir()
     made = scenario_from_data("mine", folder, "openacc")
     assert len(rows_of(made)) == 2 and r'"it\'s ""a"",\nnew\tone.csv: 1-2-3"'.replace(r"\'", "'") in made.csv
-    assert made.skipped == ["zeros.csv", "other name.csv"]
+    assert made.skipped == ["other name.csv", "zeros.csv"]
     said = dict.fromkeys(made.refused)
     rights = (
         "binary.csv: cannot be read ('utf-8'",
@@ -136,7 +136,7 @@ def test_copy_of_a_recording__counts_once(tmp_path: Path) -> None:
 def test_thinning__keeps_rows_of_every_trio(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Two pairs at each of 100 moments, in the same order: every second row would be the same pair.
     openacc(tmp_path, "Speed1,Speed2,Speed3,Speed4,IVS1,IVS3", *["20,20,20,20,15,16"] * 100)
-    monkeypatch.setattr("ethbrake_marl.extensions.recorded.folder.MOST_NUMBERS", 400)
+    monkeypatch.setattr("ethbrake_marl.extensions.recorded.scenario.MOST_NUMBERS", 400)
     made = scenario_from_data("mine", tmp_path, "openacc", based_on="realistic-pair")
     rows = [line.rpartition(": ")[2] for line in made.csv.splitlines()[1:]]
     assert rows.count("1-2") == rows.count("3-4") == 50

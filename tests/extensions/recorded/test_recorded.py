@@ -1,18 +1,14 @@
-"""Scenarios of recorded traffic: rows by hand, formats, hostile files, memory, order of rows, table of the page."""
+"""Scenarios of recorded traffic: rows by hand, formats, hostile files, order of rows, table of the page."""
 
 import re
-import tracemalloc
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 
-import ethbrake_marl.first_edition as eb
+import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.recorded import folder as of_folder, reading
-from ethbrake_marl.extensions.recorded.fits import DataDraw
 from ethbrake_marl.extensions.recorded.formats import DataFormat
 from ethbrake_marl.extensions.recorded.scenario import scenario_from_data
 from tests.docs.site import DOCS
@@ -135,20 +131,6 @@ def test_overlaps__are_refused_but_few_of_noisy_data_are_left_out(tmp_path: Path
         scenario_from_data("mine", file.parent, "ngsim")
 
 
-def test_memory__is_that_of_the_moments_that_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading, "BATCH_BYTES", 1 << 17)
-    monkeypatch.setattr(of_folder, "MOST_NUMBERS", 500)
-    folder = write_highd(tmp_path, 600)
-    size = (folder / "01_tracks.csv").stat().st_size
-    scenario_from_data("mine", folder, "highd")  # imports what is needed
-    tracemalloc.start()
-    told = scenario_from_data("mine", folder, "highd").found
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert told[2] == "left out: 1,108 chains: a table has at most 500 numbers, so one in 13 is used"
-    assert most < 1.5 * size
-
-
 FILES = {
     "highd": (write_highd, "01_tracks.csv"),
     "ngsim": (write_ngsim, "trajectories.csv"),
@@ -183,16 +165,16 @@ def test_command__writes_both_files_or_none_and_evaluates(tmp_path: Path, monkey
     with pytest.raises(ZeroDivisionError):
         run_command([*command, "new.yaml"])
     assert sorted((path.name, path.read_bytes()) for path in tmp_path.glob("*.*")) == before
-    fits = [*command, "mine.yaml", "--draw", "normal", "--every", "0.1", "--force"]
+    fits = [*command, "mine.yaml", "--draw", "quantiles", "--every", "0.1", "--force"]
     assert run_command(fits) == 0 and not Path("mine.csv").exists()
 
 
 def test_page__shows_the_harm_of_rows_and_of_fits(tmp_path: Path) -> None:
     folder, shown = write_highd(tmp_path / "highd"), []
-    for draw in get_args(DataDraw):
+    for draw in ("rows", "quantiles"):
         made = scenario_from_data(draw, folder, "highd", draw=draw)
         write_files(tmp_path, {f"{draw}.yaml": made.text.splitlines(), f"{draw}.csv": made.csv.splitlines()})
         result = eb.evaluate(scenario=tmp_path / f"{draw}.yaml", agents="full_brake,e_v2x_bm", episodes=10_000, seed=7)
-        harms = (f"{each.first_impact_harm.mean():.2f} |" for each in result.outcomes.values())
+        harms = (f"{each['first_impact_harm'].mean():.2f} |" for each in result.columns.values())
         shown.append(" ".join([f"| `{draw}` |", *harms]))
     assert "\n".join(shown) in (DOCS / "extensions" / "recorded.md").read_text("utf-8")

@@ -1,0 +1,102 @@
+"""Joint optimum of a level: in each world, the least harm known that its learners can do together.
+
+It depends on worlds, learners and scripts, but not on what the learners know or minimise, so levels that differ only in
+that share one search. The best commands of one level count for every other level whose learners can give the same ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import FIRST_DECISION, State
+from ethbrake_marl.extensions.cooperation.levels import Level, Plan
+from ethbrake_marl.extensions.search.best_harm import search_list
+from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.motion.layout import FAR_M, GAP, OWN_LATENCY, WEIGHT, Bools, Floats
+from ethbrake_marl.names import open_game
+from ethbrake_marl.progress import OnProgress, Progress
+from ethbrake_marl.worlds.sampling import Drawn
+
+ON_GRID = 1e-9  # part of a step by which decisions of two levels may differ
+
+
+class Answer(NamedTuple):
+    """What is known of a level with learners."""
+
+    level: Level
+    game: Game
+    worlds: State  # at the alert, in which the joint optimum was searched, [m]
+    searched: BestHarmTable
+    driven: dict[str, list[Floats]]  # count -> harm of what was driven, [m] each: trained teams
+
+
+def search_all(plan: Plan, worlds: Sequence[Drawn], jobs: int, tell: OnProgress) -> dict[str, Answer]:
+    """Search the joint optimum of every level with learners; return name of the level -> answer.
+
+    ``jobs`` is the number of threads. Finished chunks are read from the folder of the ablation.
+    """
+    tables: dict[bytes, BestHarmTable] = {}
+    answers: dict[str, Answer] = {}
+    for level, drawn in zip(plan.levels, worlds, strict=True):
+        if level.scenario.learners:
+            game, some = open_game(level.scenario)[1], drawn.worlds.take(slice(plan.search_episodes))
+            identity = problem_of(game, some).identity.tobytes()
+            if identity not in tables:
+                say = partial(_tell, tell, f"joint optimum of {level.name}")
+                folder = plan.folder / "optimum" / level.name
+                tables[identity] = search_list(
+                    game, some, chunks=folder, on_progress=say, budget=plan.budget, threads=jobs
+                )
+            answers[level.name] = Answer(level, game, some, tables[identity], {"first": [], "total": []})
+    return answers
+
+
+def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
+    tell(Progress(name, done, total))
+
+
+def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
+    """Return the least known harm in each world of ``own``, [m] m2/s2. ``answers`` are those of all levels."""
+    best = np.full(own.worlds.n, np.inf)
+    for other in answers:
+        can = can_imitate(own, other)
+        rows = np.flatnonzero(can)
+        if rows.size:
+            line = other.worlds.line.copy()
+            line[:, :, 0] = own.worlds.line[:, :, 0]  # the obstacle
+            problem = problem_of(other.game, other.worlds._replace(line=line).take(rows))
+            for profiles in other.searched.profiles.values():
+                harm = problem.follow(profiles.take(rows)).harm(count)
+                best[rows] = np.minimum(best[rows], harm)
+            same = rows[other.worlds.line[rows, GAP, 0] == own.worlds.line[rows, GAP, 0]]
+            for driven in other.driven[count]:
+                best[same] = np.minimum(best[same], driven[same])
+    return best
+
+
+def can_imitate(own: Answer, other: Answer) -> Bools:
+    """Return for each world, [m], whether learners of ``own`` can give the commands of the learners of ``other``.
+
+    They can if each learner of ``other`` learns in ``own``, the other vehicles of ``own`` have the same roles, lines
+    and latencies are the same, and each decision of ``other`` is also one of ``own``. ``own`` may have an obstacle where
+    ``other`` has none, because commands are simulated with it.
+    """
+    mine, theirs = own.level.scenario, other.level.scenario
+    scripted = [name for name, role in mine.roles.items() if role != "learner"]
+    if not set(theirs.learners) <= set(mine.learners) or any(mine.roles[n] != theirs.roles[n] for n in scripted):
+        return np.zeros(own.worlds.n, np.bool_)
+    rows = [row for row in range(own.worlds.car.shape[1]) if row not in (OWN_LATENCY, WEIGHT)]
+    same = (own.worlds.line[:, :, 1:] == other.worlds.line[:, :, 1:]).all(axis=(1, 2))
+    same &= (own.worlds.car[:, rows, 1:] == other.worlds.car[:, rows, 1:]).all(axis=(1, 2))
+    first, later = (problem_of(each.game, each.worlds).state.clock[:, FIRST_DECISION] for each in (own, other))
+    steps = (later - first) / mine.time_step_s
+    ahead = other.worlds.line[:, GAP, 0]
+    return np.asarray(
+        same & (np.abs(steps - np.rint(steps)) < ON_GRID) & ((ahead == own.worlds.line[:, GAP, 0]) | (ahead >= FAR_M))
+    )
