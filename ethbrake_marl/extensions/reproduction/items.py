@@ -1,117 +1,199 @@
-"""Items of a reproduction: the paper's figures and tables in order, and last a table of what the paper leaves open."""
+"""The paper's figures and tables in its order, and what it leaves open: reproduce them, and write them to a folder."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from ethbrake_marl.extensions.reproduction.delay_curves import ALL_CURVES, HIGH, LOW, reproduce_curves
-from ethbrake_marl.extensions.reproduction.folder import RESULT, Item, Result, checked_result
-from ethbrake_marl.extensions.reproduction.groups import reproduce_delays, reproduce_distance
-from ethbrake_marl.extensions.reproduction.hybrid import (
-    reproduce_hybrid_table,
-    reproduce_illustration,
-    reproduce_random_table,
-)
-from ethbrake_marl.extensions.reproduction.open_quantities import reproduce_gaps
-from ethbrake_marl.extensions.reproduction.trainings import OPEN, STOPPED
-from ethbrake_marl.extensions.reproduction.trajectories import play, reproduce_accelerations, reproduce_trajectories
-from ethbrake_marl.files.plain import read_object
+from ethbrake_marl import __version__
+from ethbrake_marl.errors import InvalidInput, count_of, unknown_name
+from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.reproduction.curves import reproduce_delays, reproduce_distance, reproduce_illustration
+from ethbrake_marl.extensions.reproduction.learning import reproduce_curves
+from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Item, Made, Settings
+from ethbrake_marl.extensions.reproduction.register import reproduce_gaps
+from ethbrake_marl.extensions.reproduction.tables import reproduce_hybrid_table, reproduce_random_table
+from ethbrake_marl.extensions.reproduction.trainings import HIGH, LOW, STOPPED, seconds_left, train
+from ethbrake_marl.extensions.reproduction.trajectories import reproduce_accelerations, reproduce_trajectories
+from ethbrake_marl.extensions.studies.folder import StudyFolder
+from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.files.store import write_output
+from ethbrake_marl.motion.digest import physics_digest
+from ethbrake_marl.progress import Progress
 
-ITEMS = (  # in the order of the paper
+ITEMS = (
     Item(
-        "learning-high",
-        ("fig:ppo_sac_high_latency",),
-        "Learning curves at high delay",
+        "learning-high", ("fig:ppo_sac_high_latency",), "Learning curves at high delay",
         "Returns of PPO and SAC in training under large communication delays.",
-        partial(reproduce_curves, HIGH),
-        10,
-        ALL_CURVES,
+        partial(reproduce_curves, HIGH), 1, (HIGH, LOW),
     ),
     Item(
-        "learning-low",
-        ("fig:ppo_sac_low_latency",),
-        "Learning curves at low delay",
+        "learning-low", ("fig:ppo_sac_low_latency",), "Learning curves at low delay",
         "Returns of PPO and SAC in training under small communication delays.",
-        partial(reproduce_curves, LOW),
-        10,
-        ALL_CURVES,
+        partial(reproduce_curves, LOW), 1, (HIGH, LOW),
     ),
     Item(
-        "harm-distance",
-        ("Fig:Harm-ivds",),
-        "Harm over total distance",
-        "Harm of the non-ethical strategy, E-V2X-BM, SAC and PPO against the sum of both gaps.",
-        reproduce_distance,
-        15,
+        "harm-distance", ("Fig:Harm-ivds",), "Harm over total distance",
+        "Harm of the non-ethical strategy, E-V2X-BM, SAC and PPO against the sum of both gaps.", reproduce_distance, 15,
     ),
     Item(
-        "harm-delays",
-        ("Fig:harm-delay",),
-        "Harm at three delays",
-        "Harm of the four strategies at three communication delays, gaps of 7 m.",
-        reproduce_delays,
-        15,
+        "harm-delays", ("Fig:harm-delay",), "Harm at three delays",
+        "Harm of the four strategies at three communication delays, gaps of 7 m.", reproduce_delays, 15,
     ),
     Item(
-        "trajectories",
-        ("Fig:pic5sim",),
-        "Trajectories of Scenarios 1 and 2",
-        "Positions of the three vehicles under PPO and SAC, against the vehicle and against time.",
-        reproduce_trajectories,
-        5,
-        play=play,
+        "trajectories", ("Fig:pic5sim",), "Trajectories of Scenarios 1 and 2",
+        "Positions of the three vehicles under PPO and SAC.", reproduce_trajectories, 5,
     ),
     Item(
-        "accelerations",
-        ("Fig:pic5act",),
-        "Acceleration profiles of Scenarios 1 and 2",
-        "Commands of Vehicle 2 under PPO and SAC.",
-        reproduce_accelerations,
-        5,
+        "accelerations", ("Fig:pic5act",), "Acceleration profiles of Scenarios 1 and 2",
+        "Commands of Vehicle 2 under PPO and SAC.", reproduce_accelerations, 5,
     ),
     Item(
-        "hybrid-illustration",
-        ("Fig:hybrid illu",),
-        "Illustration of the hybrid",
+        "hybrid-illustration", ("Fig:hybrid illu",), "Illustration of the hybrid",
         "Harm of E-V2X-BM, of a policy that has not converged, and of the hybrid of both, against total distance.",
-        reproduce_illustration,
-        20,
-        (STOPPED,),
+        reproduce_illustration, 15, (STOPPED,),
     ),
     Item(
-        "hybrid-table",
-        ("Table:hybrid",),
-        "E-V2X-BM, DRL and hybrid in 5,000 episodes",
+        "hybrid-table", ("Table:hybrid",), "E-V2X-BM, DRL and hybrid in 5,000 episodes",
         "Collisions and harm of E-V2X-BM, of a policy that has not converged, and of the hybrid.",
-        reproduce_hybrid_table,
-        20,
-        (STOPPED,),
+        reproduce_hybrid_table, 15, (STOPPED,),
     ),
     Item(
-        "random-table",
-        ("Table:Random",),
-        "Four strategies in 10,000 random episodes",
+        "random-table", ("Table:Random",), "Four strategies in 10,000 random episodes",
         "Collisions, harm and its decrease of the non-ethical strategy, E-V2X-BM and the hybrids of SAC and PPO.",
-        reproduce_random_table,
-        60,
+        reproduce_random_table, 40,
     ),
     Item(
-        "gaps",
-        (),
-        "What the paper leaves open",
-        "Every quantity that the paper leaves open, our default, and how far the headline moves when it changes.",
-        reproduce_gaps,
-        40,
-        (OPEN,),
+        "gaps", (), "What the paper leaves open",
+        "Every quantity that the paper leaves open, our default, and the random test with another value.",
+        reproduce_gaps, 30,
     ),
-)
+)  # fmt: skip
+
+RECORD, PAGE = "reproduction.json", "README.md"
+
+PAPER = "*How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning*"
 
 
-def read_results(folder: Path) -> list[Result]:
-    """Return the results that are stored in ``folder``, in the order of the paper.
+def choose_items(names: Sequence[str]) -> list[Item]:
+    """Return the items of these names in the order of the paper; all, if there are none.
 
-    Raises ``InvalidInput`` if a result file is damaged, or lies in the folder of a different item.
+    Raises ``UnknownName``, and ``InvalidInput`` for a name that is given twice.
     """
-    files = {item.name: folder / item.name / RESULT for item in ITEMS}
-    return [checked_result(read_object(file), file, name) for name, file in files.items() if file.is_file()]
+    known = {item.name: item for item in ITEMS}
+    for k, name in enumerate(names):
+        if name not in known:
+            raise unknown_name("item", name, known)
+        if name in names[:k]:
+            raise InvalidInput(f"item {name!r} is given twice; give each item only once")
+    return [item for item in ITEMS if not names or item.name in names]
+
+
+def groups_of(settings: Settings, items: Sequence[Item]) -> list[str]:
+    """Return the groups of trainings that the items need."""
+    every = [name for item in items for name in item.trained if settings.full or name == STOPPED]
+    return list(dict.fromkeys(every))
+
+
+def cost(settings: Settings, items: Sequence[Item]) -> str:
+    """Return what is to do, and how long it takes."""
+    training_s = seconds_left(settings.folder, groups_of(settings, items))
+    seconds = sum(item.most_s for item in items)
+    text = f"to do: {count_of(len(items), 'item')}, at most about {seconds:.0f} s of one core"
+    return f"{text}; trainings before them about {training_s / 60.0:.1f} min of one core" if training_s else text
+
+
+def reproduce(
+    settings: Settings, items: Sequence[Item], machine: str, *, force: bool = False
+) -> dict[Item, Made] | None:
+    """Train what is missing, make the items, and write page, figures and tables. None: Ctrl-C stopped a training.
+
+    The folder may have results of the same settings, which are replaced; with ``force``, of others. Trainings stay.
+    Raises ``InvalidInput`` for a folder with other settings, and ``AlreadyExists`` for one with other files.
+    """
+    folder = settings.folder
+    if force and (folder / RECORD).is_file():
+        (folder / RECORD).unlink()
+    study = StudyFolder(
+        folder,
+        "a reproduction",
+        {"format": "ethbrake-reproduction", "episodes": settings.episodes, "version": __version__},
+        record=RECORD,
+        advice="give another folder (--output), or replace its results (--force)",
+        beside=("trainings", PAGE, *(item.name for item in ITEMS)),
+        writes=(PAGE,),
+    )
+    with study.work():
+        if not train(settings, groups_of(settings, items)):
+            return None
+        results = {}
+        for number, item in enumerate(items):
+            settings.tell(Progress(f"items: {item.name}", number, len(items)))
+            results[item] = made = item.make(settings)
+            write_item(folder / item.name, made)
+        today = datetime.now(UTC).date().isoformat()
+        made_by = f"`{command(settings, items)}` on {today} ({machine}; physics {physics_digest()})"
+        write_output(folder / PAGE, page(made_by, results).encode(), force=True)
+        return results
+
+
+def command(settings: Settings, items: Sequence[Item]) -> str:
+    """Return the command line that makes the same."""
+    names = [item.name for item in items] if len(items) < len(ITEMS) else []
+    fewer = ["--episodes", str(settings.episodes)] if settings.episodes < PAPER_EPISODES else []
+    return " ".join(["ethbrake reproduce", *names, "--full" if settings.full else "--quick", *fewer])
+
+
+def write_item(place: Path, made: Made) -> None:
+    """Write figures as SVG and PDF, tables as CSV and LaTeX."""
+    place.mkdir(exist_ok=True)
+    for drawn in made.figures:
+        for ending in (".svg", ".pdf"):
+            write_picture(place / f"{drawn.stem}{ending}", drawn.figure, force=True)
+    for sheet in made.sheets:
+        stem = re.sub(r"[^a-z0-9]+", "-", sheet.title.lower()).strip("-")
+        write_output(place / f"{stem}.csv", sheet.csv().encode(), force=True)
+        write_output(place / f"{stem}.tex", f"{sheet.latex()}\n".encode(), force=True)
+
+
+def plain(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
+    """Return results as plain data."""
+    return [
+        {
+            "name": item.name,
+            "labels": list(item.labels),
+            "title": item.title,
+            "verdict": made.verdict._asdict(),
+            "comparisons": [each._asdict() for each in made.verdicts],
+            "tables": {sheet.title: sheet.json() for sheet in made.sheets},
+            "notes": list(made.notes),
+            "version": __version__,
+            "physics_digest": physics_digest(),
+        }
+        for item, made in results.items()
+    ]
+
+
+def overview(results: Mapping[Item, Made]) -> Sheet:
+    """Return the verdict on each item."""
+    rows = [(item.name, made.verdict.outcome, made.verdict.because) for item, made in results.items()]
+    return Sheet("", ("Item", "Verdict", "Because"), rows)
+
+
+def page(made_by: str, results: Mapping[Item, Made]) -> str:
+    """Return the page with all results as Markdown. ``made_by``: the command, the day, the machine."""
+    lead = f"Figures and tables of {PAPER}, and our results beside its numbers and statements. Made by {made_by}."
+    parts = ["# The paper, reproduced", lead, overview(results).markdown()]
+    for item, made in results.items():
+        labels = f" In the paper's source: {', '.join(f'`{label}`' for label in item.labels)}." if item.labels else ""
+        parts += [f"## {item.title}", item.what + labels, f"**{made.verdict.outcome}**: {made.verdict.because}"]
+        parts += made.notes
+        parts += [f"![{each.title}. {each.text}]({item.name}/{each.stem}.svg)" for each in made.figures]
+        for sheet in made.sheets:
+            parts += [f"### {sheet.title}", sheet.markdown(), *filter(None, [sheet.note])]
+        parts += ["### Comparisons", Sheet("", ("Comparison", "Verdict", "Because"), made.verdicts).markdown()]
+    return "\n\n".join(parts).replace("H*", r"H\*") + "\n"

@@ -1,94 +1,107 @@
-"""Compare our results with the paper's tables: which numbers agree, which differ, and which no strategy can reach."""
+"""The paper's two tables (``Table:hybrid``, ``Table:Random``), and our numbers beside every number that they print."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
-from ethbrake_marl.extensions.report.paper_rows import PaperRow
-from ethbrake_marl.extensions.reproduction.folder import Made, Parameter, csv_text
-from ethbrake_marl.extensions.reproduction.strategies import ABOUT_BASELINE, FULL_BRAKE, NAMES, PAIRWISE, harms
-from ethbrake_marl.extensions.reproduction.verdicts import HARM, PERCENT, PREDICTED, PROVEN, Verdict, compare_number
+from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.evaluation.statistics import decrease, mean, rate
+from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, PaperRow
+from ethbrake_marl.extensions.reproduction.curves import ALONE, HYBRID_PREDICTED, HYBRID_REALISED, drive_hybrid
+from ethbrake_marl.extensions.reproduction.limits import least_harm
+from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings, about
+from ethbrake_marl.extensions.reproduction.readings import (
+    ABOUT_BASELINE,
+    COUPLED,
+    DISTANCE,
+    FOUR,
+    NON_ETHICAL,
+    PREDICTED,
+    RANDOM,
+    READINGS,
+    REALISED,
+    Reading,
+    driven,
+)
+from ethbrake_marl.extensions.reproduction.verdicts import PERCENT, Verdict, compare_number
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
-from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
-from ethbrake_marl.first_edition.evaluation.statistics import mean, rate, relative_decrease
-from ethbrake_marl.first_edition.physics.state import Bools
+from ethbrake_marl.motion.layout import Floats
 
-_RATE, _MEAN_HARM, _DECREASE, _TOTAL = "collision rate", "average harm", "harm decrease", "total harm"
+RATE, AVERAGE, DECREASE = "collision rate", "average harm", "harm decrease"  # that the paper prints
+TOTAL, EXPECTED = "total harm", "predicted harm"
 
-_PREDICTED_HARM = "predicted harm"
-
-_PRINTED: Mapping[str, Column] = {_RATE: PERCENT, _MEAN_HARM: HARM, _DECREASE: PERCENT}
+COLUMNS: Mapping[str, Column] = {
+    RATE: replace(PERCENT, key="collision_rate"),
+    AVERAGE: Column("First-impact harm", "first_impact_harm"),
+    TOTAL: Column("Total harm", "total_harm"),
+    EXPECTED: Column("Predicted harm", "predicted_harm"),
+    DECREASE: replace(PERCENT, heading="Harm decrease", key="harm_decrease"),
+}
 
 NOBODY = "least possible (proven)"
+UNDERCUT = {RATE: "worlds in which no command avoids an impact", AVERAGE: "harm that no command undercuts"}
 
-_UNDERCUT = {_RATE: "worlds in which no command avoids an impact", _MEAN_HARM: "harm that no command undercuts"}
+Numbers = Mapping[str, Mapping[str, Estimate]]  # strategy -> quantity -> ours
 
 
-def collision_rate(collided: Bools) -> Estimate:
-    """Return the share of worlds with an impact (mask ``collided``, [n]), with its 95 % interval."""
-    return rate(int(collided.sum()), len(collided))
+def numbers_of(result: Result, least: Floats | None) -> Numbers:
+    """Return our numbers. ``least`` [n] is a proven lower bound of the harm in each world, which becomes a row."""
+    numbers, braking = {}, result.columns.get(NON_ETHICAL)
+    for name, columns in result.columns.items():
+        harm, expected = columns["first_impact_harm"], columns.get("predicted_harm", columns.get("expected_harm"))
+        own = {
+            RATE: rate(columns["collided"]),
+            AVERAGE: mean(harm),
+            TOTAL: mean(columns["total_harm"]),
+            EXPECTED: None if expected is None else mean(expected),
+            DECREASE: None if braking is None else decrease(harm, braking["first_impact_harm"]),
+        }
+        numbers[name] = {quantity: each for quantity, each in own.items() if each is not None}
+    if least is not None:
+        numbers[NOBODY] = {RATE: rate(least > 0.0), AVERAGE: mean(least), TOTAL: mean(least)}
+    return numbers
 
 
 @dataclass(frozen=True)
 class Beside:
-    """Our results to compare with a table of the paper, under one assumption on when Vehicle 2 may act."""
+    """Our numbers under one reading."""
 
-    title: str  # description of the assumption
-    evaluation: Evaluation  # outcomes of our strategies
-    # strategy in the paper -> strategies of ours that it may mean; the paper's number is compared with the first
-    ours: Mapping[str, Sequence[str]]
+    title: str  # the reading
+    worlds: int
+    numbers: Numbers = field(repr=False)
+    ours: Mapping[str, Sequence[str]]  # row of the paper -> our strategies that it may mean; the first is compared
 
-    @cached_property
-    def numbers(self) -> dict[str, dict[str, Estimate]]:
-        """Our results: strategy -> quantity (such as "collision rate") -> estimate.
-
-        Proven lower bounds for all strategies have the key ``NOBODY``.
-        """
-        numbers, braking = {}, self.evaluation.outcomes.get(NAMES[FULL_BRAKE])
-        for name, outcome in self.evaluation.outcomes.items():
-            harm, predicted = outcome.first_impact_harm, outcome.predicted_harm
-            own = {
-                _RATE: collision_rate(outcome.collided),
-                _MEAN_HARM: mean(harm),
-                _DECREASE: None if braking is None else relative_decrease(harm, braking.first_impact_harm),
-                _TOTAL: mean(outcome.total_harm),
-                _PREDICTED_HARM: None if predicted is None else mean(predicted),
-            }
-            numbers[name] = {quantity: estimate for quantity, estimate in own.items() if estimate is not None}
-        least = harms(self.evaluation).get(PROVEN)
-        if least is not None:
-            numbers[NOBODY] = {_RATE: collision_rate(least > 0.0), _MEAN_HARM: mean(least), _TOTAL: mean(least)}
-        return numbers
+    def sheet(self) -> Sheet:
+        """Return our numbers as a table."""
+        shown = {name: each for name, each in COLUMNS.items() if any(name in own for own in self.numbers.values())}
+        rows = [(name, *map(own.get, shown)) for name, own in self.numbers.items()]
+        note = f"{self.worlds:,} worlds; 95 % intervals; harm in m²/s². {ABOUT_BASELINE}"
+        return Sheet(self.title, ("Strategy", *shown.values()), rows, note)
 
     def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield our results that may correspond to a printed number, each as (name, estimate).
-
-        ``row`` is the paper's name of the strategy, and ``quantity`` is "collision rate", "average harm" or "harm
-        decrease". The printed number is compared with the first result; if the two differ, the verdict also names the
-        nearest result.
-        """
+        """Yield our numbers that a printed one may mean, with their names; the first is compared with it."""
         for name in self.ours[row]:
-            if quantity in self.numbers[name]:
-                yield f"{name} ({self.title})", self.numbers[name][quantity]
-            if quantity == _MEAN_HARM and name == NAMES[PAIRWISE] and _PREDICTED_HARM in self.numbers[name]:
-                yield f"{PREDICTED} ({self.title})", self.numbers[name][_PREDICTED_HARM]
-        if quantity == _MEAN_HARM:
+            own = self.numbers[name]
+            if quantity in own:
+                yield f"{name} ({self.title})", own[quantity]
+            if quantity == AVERAGE and name == REALISED:
+                yield f"{PREDICTED} ({self.title})", own[EXPECTED]
+        if quantity == AVERAGE:
             for name in self.ours[row]:
-                yield f"{name}, total harm ({self.title})", self.numbers[name][_TOTAL]
+                yield f"{name}, total harm ({self.title})", self.numbers[name][TOTAL]
 
 
 def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
-    """Compare each number in a table of the paper with our results under each assumption."""
+    """Compare every number that the paper prints with ours, under each reading."""
     verdicts = []
     for beside in besides:
         least = beside.numbers.get(NOBODY, {})
         for row in printed:
-            numbers = {_RATE: row.collision_rate, _MEAN_HARM: row.average_harm, _DECREASE: row.harm_decrease}
+            numbers = {RATE: row.collision_rate, AVERAGE: row.average_harm, DECREASE: row.harm_decrease}
             for quantity, number in numbers.items():
-                if not number:  # 0: decrease of the baseline itself; None: the paper prints no number
+                if not number:  # not printed, or the decrease of the baseline itself
                     continue
                 (_, ours), *own = beside.candidates(row.agent, quantity)
                 others = [other.candidates(row.agent, quantity) for other in besides if other is not beside]
@@ -97,8 +110,10 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
                         f"{row.agent}, {quantity} ({beside.title})",
                         number,
                         ours,
-                        show=_PRINTED[quantity],
-                        least=(_UNDERCUT[quantity], least[quantity]) if quantity in least else None,
+                        show=COLUMNS[quantity],
+                        least=(UNDERCUT[quantity], least[quantity])
+                        if quantity in least and quantity in UNDERCUT
+                        else None,
                         others=dict([*own, *chain(*others)]),
                     )
                 )
@@ -106,29 +121,19 @@ def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list
 
 
 def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdict:
-    """Return a verdict on the printed number of collisions of the hybrid ``chosen``.
-
-    In each world the hybrid chooses between the strategies ``one`` and ``other``, so it avoids a collision only in
-    worlds in which at least one of them does. Therefore it cannot avoid more collisions than the two together.
-    """
-    avoided = [row.episodes - row.collisions for row in (one, other, chosen)]
-    together = avoided[0] + avoided[1]
+    """Return the verdict on the printed collisions of a hybrid, which is one of two strategies in every world."""
+    first, second, avoided = (row.episodes - row.collisions for row in (one, other, chosen))
     text = (
-        f"{chosen.agent} is one of the two in every world, so it avoids at most {avoided[0]:,} + {avoided[1]:,} ="
-        f" {together:,} collisions; printed: {avoided[2]:,}"
+        f"{chosen.agent} is one of the two in every world, so it avoids at most {first:,} + {second:,} ="
+        f" {first + second:,} collisions; printed: {avoided:,}"
     )
     what = f"{chosen.agent} avoids no more than {one.agent} and {other.agent} together (arithmetic of the printed rows)"
-    return Verdict(what, "agrees" if avoided[2] <= together else "cannot agree", text)
+    return Verdict(what, "agrees" if avoided <= first + second else "cannot agree", text)
 
 
 def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
-    """Return a verdict on whether the decrease of harm that the paper prints follows from the printed mean harms.
-
-    The decrease is relative to ``baseline``. The verdict is "agrees" if the printed and the computed decrease differ by
-    less than 0.01 percentage points.
-    """
-    follows = 1.0 - row.average_harm / baseline.average_harm
-    printed = row.harm_decrease or 0.0
+    """Return whether a printed decrease follows from the printed harms, to 0.01 percentage points."""
+    follows, printed = 1.0 - row.average_harm / baseline.average_harm, row.harm_decrease or 0.0
     text = (
         f"1 - {row.average_harm:g} / {baseline.average_harm:g} = {100.0 * follows:.2f} %; printed {100 * printed:g} %"
     )
@@ -136,51 +141,56 @@ def decrease_verdict(row: PaperRow, baseline: PaperRow) -> Verdict:
     return Verdict(what, "agrees" if abs(follows - printed) < 0.0001 else "cannot agree", text)
 
 
-def rows_table(beside: Beside) -> Sheet:
-    """Return a table of our results under one assumption on when Vehicle 2 may act, with the proven lower bounds."""
-    columns: dict[str, Column | str] = {
-        _RATE: PERCENT, _MEAN_HARM: "First-impact harm", _TOTAL: "Total harm", _PREDICTED_HARM: "Predicted harm",
-        _DECREASE: replace(PERCENT, heading="Harm decrease"),
-    }  # fmt: skip
-    if not any(_DECREASE in numbers for numbers in beside.numbers.values()):
-        del columns[_DECREASE]
-    rows = [(name, *map(numbers.get, columns)) for name, numbers in beside.numbers.items()]
-    note = f"{beside.evaluation.worlds.n:,} worlds; 95 % intervals; harm in m²/s². {ABOUT_BASELINE}"
-    return Sheet(beside.title, ("Strategy", *columns.values()), rows, note)
-
-
-def beside_printed(
-    stem: str,
-    printed: Sequence[PaperRow],
-    besides: Sequence[Beside],
-    arithmetic: Sequence[Verdict],
-    parameters: Sequence[Parameter],
-    notes: Sequence[str] = (),
-) -> Made:
-    """Compare a table of the paper with our results, and return verdicts, tables and data.
-
-    ``stem`` is the name of the CSV file, without ending. ``arithmetic`` are verdicts on whether the paper's printed
-    numbers are consistent, which need none of our results. ``parameters`` are quantities that affect our results.
-    ``notes`` say what was run and what was not.
-    """
-    columns: dict[str, list[str]] = {
-        "Strategy": [row.agent for row in printed],
-        "Collisions": [f"{row.collisions:,}" for row in printed],
-        "Rate": [f"{100.0 * row.collision_rate:g} %" for row in printed],
-        "Average harm": [f"{row.average_harm:g}" for row in printed],
-    }
-    if any(row.harm_decrease for row in printed):
-        columns["Decrease"] = [f"{100.0 * (row.harm_decrease or 0.0):g} %" for row in printed]
-    data = [
-        (beside.title, name, quantity, beside.evaluation.worlds.n, numbers[quantity])
-        for beside in besides
-        for name, numbers in beside.numbers.items()
-        for quantity in _PRINTED
-        if quantity in numbers
+def printed_sheet(printed: Sequence[PaperRow]) -> Sheet:
+    """Return the paper's rows as a table."""
+    columns = ("Strategy", "Collisions", "Rate", "Average harm", "Decrease")
+    rows = [
+        (
+            *(row.agent, f"{row.collisions:,}", f"{100.0 * row.collision_rate:g} %", f"{row.average_harm:g}"),
+            *([] if row.harm_decrease is None else [f"{100.0 * row.harm_decrease:g} %"]),
+        )
+        for row in printed
     ]
-    csv = csv_text(("reading", "strategy", "quantity", "worlds", "value", "low", "high"), data)
-    tables = [
-        Sheet("The paper's rows, as printed", [*columns], [*zip(*columns.values(), strict=True)]),
-        *map(rows_table, besides),
-    ]
-    return Made([*arithmetic, *compare_rows(printed, besides)], parameters, tables, data={stem: csv}, notes=notes)
+    return Sheet("The paper's rows, as printed", columns[: len(rows[0])], rows)
+
+
+def beside(title: str, name: str, reading: Reading, result: Result, ours: Mapping[str, Sequence[str]]) -> Beside:
+    """Return our numbers in a shipped scenario under a reading."""
+    return Beside(title, result.n, numbers_of(result, least_harm(reading.scenario(name), result)), ours)
+
+
+def reproduce_hybrid_table(settings: Settings) -> Made:
+    """Reproduce the table of 5,000 worlds. The paper does not say at which of its two sets of speeds: we do both."""
+    ours = {"E-V2X-BM": (REALISED, COUPLED), "Standalone DRL": (ALONE,), "Hybrid": (HYBRID_PREDICTED, HYBRID_REALISED)}
+    besides, notes = [], []
+    for name, speeds in ((RANDOM, "speeds 18 to 22 m/s"), (DISTANCE, "speeds 20, 18, 20 m/s")):
+        for reading in READINGS:
+            result = drive_hybrid(name, settings, reading)
+            besides.append(beside(f"{speeds}, {reading.name}", name, reading, result, ours))
+            notes.append(about(result))
+    printed = {row.agent: row for row in PAPER_ROWS if row.table == "hybrid test"}
+    verdicts = [selection_verdict(*(printed[agent] for agent in ours)), *compare_rows([*printed.values()], besides)]
+    note = (
+        "The paper does not describe its policy that has not converged. The rows of Standalone DRL and Hybrid are of"
+        " ours: whether they agree depends on when a training is stopped."
+    )
+    sheets = [printed_sheet([*printed.values()]), *(each.sheet() for each in besides)]
+    return Made(verdicts, sheets, notes=[note, *notes])
+
+
+def reproduce_random_table(settings: Settings) -> Made:
+    """Reproduce the table of the random test."""
+    ours: dict[str, tuple[str, ...]] = {"Non-E": (NON_ETHICAL,), "E-V2X-BM": (REALISED, COUPLED)}
+    agents = {name: FOUR[name] for name in (NON_ETHICAL, REALISED, COUPLED)}
+    for kind in ("SAC", "PPO"):
+        realised, predicted = f"Hybrid {kind}, realised H*", f"Hybrid {kind}, predicted H*"
+        agents |= {realised: f"{kind.lower()}+episode", predicted: f"{kind.lower()}+episode:pairwise"}
+        ours[f"Hybrid {kind}"] = realised, predicted
+    besides, notes = [], [POLICIES]
+    for reading in READINGS:
+        result = driven(RANDOM, reading, agents, settings.episodes)
+        besides.append(beside(reading.name, RANDOM, reading, result, ours))
+        notes.append(about(result))
+    baseline, *others = printed = [row for row in PAPER_ROWS if row.table == "random test"]
+    verdicts = [*(decrease_verdict(row, baseline) for row in others), *compare_rows(printed, besides)]
+    return Made(verdicts, [printed_sheet(printed), *(each.sheet() for each in besides)], notes=notes)

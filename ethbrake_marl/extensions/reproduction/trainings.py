@@ -1,89 +1,112 @@
-"""Training runs of ``ethbrake reproduce --full``: for learning curves, an unconverged policy, and open settings.
-
-*Open settings* are settings that the paper does not state. ``learning_curves.LearningCurves`` manages the folder of a
-group.
-"""
+"""Trainings of a reproduction: learning curves at two delays, and a PPO that is stopped before it has converged."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
-from ethbrake_marl.first_edition.training.recipe import TrainingRecipe, load_recipe
+from ethbrake_marl.errors import InvalidInput, need
+from ethbrake_marl.files.plain import read_object
 
-STOPPED, OPEN = "stopped", "open"
+if TYPE_CHECKING:
+    from ethbrake_marl.extensions.reproduction.made import Settings
 
-CURVES = {delay: (delay, f"{delay}-ppo-paper", f"{delay}-sac-paper") for delay in ("low", "high")}  # delay -> groups
-
-HARM_COLUMN = "eval/first_impact_harm"  # column of a training's table
-
-_STATED_STATE = (  # the paper's state: positions and speeds of all vehicles, and actions of the others
-    "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
-    "rear_1.closing_speed", "rear_1.acceleration",
-)  # fmt: skip
+HIGH, LOW, STOPPED = "high", "low", "stopped"
+STATUS = "run.json"  # of a run
 
 
-@dataclass(frozen=True, slots=True)
-class TrainedRecipe:
-    """A recipe, and the length of its training run."""
+class Plan(NamedTuple):
+    """Trainings by one recipe in one scenario, one for each seed."""
 
-    recipe: str  # name of a shipped recipe
-    decisions: int  # length of the training, in decisions
-    every_updates: int  # number of updates between two evaluations
-    per_s: int  # decisions per second on one core (Intel Xeon), to estimate the time of the training
-
-    def load(self, name: str, **changes: Any) -> TrainingRecipe:
-        """Return the recipe as ``name``, with ``decisions``, ``every_updates`` and new values ``changes``."""
-        recipe = load_recipe(self.recipe)
-        evaluation = {**recipe.evaluation.model_dump(), "every_updates": self.every_updates}
-        if "log_every_updates" in type(recipe).model_fields:  # otherwise the table has a row for every update
-            changes["log_every_updates"] = self.every_updates
-        return recipe.replace(name=name, total_steps=self.decisions, evaluation=evaluation, **changes)
+    scenario: str
+    recipe: str
+    decisions: int
+    every_updates: int  # between two measurements
+    seeds: int
+    per_s: int  # decisions in a second on one core (Intel Xeon), to tell how long it takes
 
 
-PPO_PAPER = TrainedRecipe("ppo-paper", 100_000, 1, 5_000)
-
-EARLY = TrainedRecipe("ppo", 100_000, 4, 16_000)  # a fifteenth of the decisions of recipe ``ppo``
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """Group of training runs: several recipes on one scenario, stored in one folder."""
-
-    name: str  # name of the group; also the name of its folder
-    scenario: str  # name of a shipped scenario
-    # name of the recipe in the group -> settings of the training, and the recipe
-    trained: Mapping[str, tuple[TrainedRecipe, TrainingRecipe]]
-    seeds: int  # number of seeds of each recipe; the seeds are 0, 1, ...
+def _curves(scenario: str) -> tuple[Plan, ...]:
+    return (
+        Plan(scenario, "ppo", 400_000, 4, 3, 16_000),
+        Plan(scenario, "sac", 60_000, 30, 3, 3_000),
+        Plan(scenario, "ppo-paper", 100_000, 1, 3, 5_000),
+        Plan(scenario, "sac-paper", 20_000, 1_000, 3, 170),
+    )
 
 
-def groups() -> dict[str, Group]:
-    """Return all groups of training runs by name, in the order in which they are trained: the quickest first."""
-    base = PPO_PAPER.load("ppo-paper").reward.model_dump(exclude_defaults=True)
-    changed = {
-        "risk-0": {"risk": 0.0},
-        "risk-1": {"risk": 1.0},
-        "jerk-1e-4": {"jerk": 1e-4},
-        "terminal-0": {"terminal": 0.0},
-    }
-    variants: dict[str, dict[str, Any]] = {
-        "ppo-paper": {},
-        **{f"ppo-paper-{name}": {"reward": {**base, **own}} for name, own in changed.items()},
-        "ppo-paper-state": {"observation": _STATED_STATE},
-    }
+GROUPS = {
+    STOPPED: (Plan("paper-random", "ppo", 100_000, 4, 1, 16_000),),  # a fifteenth of the recipe's decisions
+    HIGH: _curves("paper-delay-high"),
+    LOW: _curves("paper-delay-low"),
+}
 
-    def curves(suffix: str, *recipes: TrainedRecipe) -> list[Group]:
-        trained = {each.recipe: (each, each.load(each.recipe)) for each in recipes}
-        return [Group(f"{delay}{suffix}", f"paper-delay-{delay}", trained, 3) for delay in CURVES]
 
-    every = [
-        Group(STOPPED, "paper-random", {"ppo-stopped": (EARLY, EARLY.load("ppo-stopped"))}, 1),
-        *curves("", TrainedRecipe("ppo", 400_000, 4, 16_000), TrainedRecipe("sac", 60_000, 30, 3_000)),
-        *curves("-ppo-paper", PPO_PAPER),
-        Group(
-            OPEN, "paper-random", {name: (PPO_PAPER, PPO_PAPER.load(name, **own)) for name, own in variants.items()}, 2
-        ),
-        *curves("-sac-paper", TrainedRecipe("sac-paper", 20_000, 1_000, 170)),
+def runs_of(folder: Path, group: str, plan: Plan) -> list[Path]:
+    """Return the folders of the runs of a plan, one for each seed."""
+    return [folder / "trainings" / group / f"{plan.recipe}-seed{seed}" for seed in range(plan.seeds)]
+
+
+def is_finished(run: Path) -> bool:
+    """Return whether a run has finished. Raises ``InvalidInput`` if its status is damaged."""
+    status = run / STATUS
+    return status.is_file() and read_object(status).get("status") == "finished"
+
+
+def trained(folder: Path, group: str) -> dict[str, list[Path]]:
+    """Return the runs of a group: recipe -> folder for each seed. A recipe with an unfinished run is left out."""
+    every = {plan.recipe: runs_of(folder, group, plan) for plan in GROUPS[group]}
+    return {recipe: runs for recipe, runs in every.items() if all(map(is_finished, runs))}
+
+
+def seconds_left(folder: Path, groups: Iterable[str]) -> float:
+    """Return about how long the runs take that have not finished, in processor seconds."""
+    left = [
+        plan.decisions / plan.per_s
+        for group in groups
+        for plan in GROUPS[group]
+        for run in runs_of(folder, group, plan)
+        if not is_finished(run)
     ]
-    return {group.name: group for group in every}
+    return sum(left)
+
+
+def train(settings: Settings, groups: Iterable[str]) -> bool:
+    """Do, or continue, the runs of some groups that have not finished. Return False if Ctrl-C stopped one.
+
+    Raises ``MissingExtra`` without torch, and the errors of ``eb.train`` and ``eb.resume``.
+    """
+    for group in groups:
+        for plan in GROUPS[group]:
+            for seed, run in enumerate(runs_of(settings.folder, group, plan)):
+                if not (is_finished(run) or _train(plan, run, seed, settings)):
+                    return False
+    return True
+
+
+def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
+    need("torch")
+    from ethbrake_marl.training.recipe import load_recipe
+    from ethbrake_marl.training.train import resume, train as train_policy
+
+    if (run / STATUS).is_file():
+        return resume(run, on_progress=settings.tell).status == "finished"
+    recipe = load_recipe(plan.recipe)
+    changes = {"log_every_updates": plan.every_updates} if hasattr(recipe, "log_every_updates") else {}
+    measured = {**recipe.evaluation.model_dump(), "every_updates": plan.every_updates}
+    recipe = recipe.replace(evaluation=measured, **changes)
+    run.parent.mkdir(parents=True, exist_ok=True)
+    result = train_policy(recipe, plan.scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
+    return result.status == "finished"
+
+
+def unconverged(settings: Settings) -> str:
+    """Return the spec of a policy "obtained from training before convergence occurred", which is trained if need be.
+
+    Raises ``InvalidInput`` if Ctrl-C stopped its training.
+    """
+    if not train(settings, [STOPPED]):
+        raise InvalidInput("the training of the policy that has not converged was interrupted; repeat the command")
+    ((run,),) = trained(settings.folder, STOPPED).values()
+    return f"policy@{run / 'policy-last'}"

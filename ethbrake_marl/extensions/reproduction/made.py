@@ -1,0 +1,70 @@
+"""What an item of a reproduction needs, and what comes out of it. An item is a figure or a table of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from matplotlib.figure import Figure
+
+from ethbrake_marl.evaluation.captions import caption, ranges_of
+from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.extensions.reproduction.verdicts import Verdict, summarise
+from ethbrake_marl.files.sheet import Sheet
+from ethbrake_marl.progress import OnProgress
+
+PAPER_EPISODES = 10_000
+
+POLICIES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5 and 0.8 s; they are not the paper's."
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a reproduction is made."""
+
+    folder: Path  # of all results, and of the trainings
+    full: bool = False  # use trainings for learning curves
+    episodes: int = PAPER_EPISODES  # largest number of worlds of an item
+    tell: OnProgress = lambda progress: None
+
+
+class Drawn(NamedTuple):
+    """A figure."""
+
+    stem: str  # of the files' names
+    title: str
+    text: str  # description
+    figure: Figure
+
+
+class Made(NamedTuple):
+    """What an item shows."""
+
+    verdicts: Sequence[Verdict]  # one for each comparison with the paper, at least one
+    sheets: Sequence[Sheet] = ()  # tables
+    figures: Sequence[Drawn] = ()
+    notes: Sequence[str] = ()  # what was run
+
+    @property
+    def verdict(self) -> Verdict:
+        """All verdicts in one."""
+        return summarise(self.verdicts)
+
+
+class Item(NamedTuple):
+    """A figure or a table of the paper."""
+
+    name: str  # on the command line, and of the folder
+    labels: tuple[str, ...]  # in the paper's source
+    title: str
+    what: str
+    make: Callable[[Settings], Made]
+    most_s: float  # processor time with as many worlds as in the paper, without trainings
+    trained: tuple[str, ...] = ()  # groups of trainings; without ``full``, only what takes seconds is trained
+
+
+def about(result: Result) -> str:
+    """Return one line about the worlds of a result."""
+    return f"{caption({**result.about, **ranges_of(result.worlds)})}."
