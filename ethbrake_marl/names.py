@@ -7,7 +7,7 @@
     wrapper = NAME[:ARGUMENT], a search or a shield around what stands before it
 
 Two tables hold the names, agents and wrappers; packages add to them by entry points, as this one does. An entry
-``NAME.ARGUMENT`` stands for this argument alone. An agent's entry may also be a list of specs (a group, ``ladder``).
+``NAME.ARGUMENT`` stands for this argument, the last one. An agent's entry may also be a list of specs (a group, ``ladder``).
 """
 
 from __future__ import annotations
@@ -279,8 +279,9 @@ def _make(core: str, settings: AgentSettings) -> Driver:
 
 def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | None = None) -> tuple[Entry, str | None]:
     """Return the entry of a name and the argument that is left for it."""
-    if argument and f"{name}.{argument}" in table:
-        return table[f"{name}.{argument}"], None
+    rest, _, last = argument.rpartition(":")
+    if argument and f"{name}.{last}" in table:
+        return table[f"{name}.{last}"], rest or None
     if name not in table and policy is not None and table is AGENTS:
         return AGENTS["policy"], name  # ppo@PATH: the algorithm that trained the policy
     if name not in table:

@@ -114,7 +114,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     game = team.game(game)
     if game.shield is None:
         state = game.begin(alert)
-        memories = {body: begun(agent, alert, body) for body, agent in team.drivers.items()}
+        memories = {body: begun(agent, alert, body) for body, agent in game.agents(team.drivers).items()}
         state = state._replace(memories={**state.memories, **memories})
         game = driven_by(game, team.drivers)
         actions = np.zeros((alert.n, 0))
@@ -135,7 +135,8 @@ def drive(game: Game, alert: State, team: Team) -> State:
 
 def driven_by(game: Game, drivers: Mapping[int, Agent]) -> Game:
     """Return the game in which the learners' agents decide as scripts do, from the first decision on."""
-    return game._replace(scripts={**game.scripts, **drivers}, rules=game.rules._replace(learners=NOBODY))
+    scripts = {**game.scripts, **game.agents(drivers)}
+    return game._replace(scripts=scripts, rules=game.rules._replace(learners=NOBODY))
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:

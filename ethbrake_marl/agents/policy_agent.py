@@ -51,6 +51,7 @@ class LearnedAgent:
     policy: Policy
     name: str = "learned"
     knows: str = MESSAGES
+    observation: View | None = None  # None: that of the policy
 
     def __post_init__(self) -> None:
         """Raise ``InvalidInput`` for something else than a policy of one action."""
@@ -61,12 +62,20 @@ class LearnedAgent:
             )
 
     def check(self, game: Game, body: int) -> None:
-        """Warn (``Unfamiliar``) of a policy that was trained on another physics."""
-        then, now = self.policy.manifest.versions.get(PHYSICS), physics_digest()
+        """Warn (``Unfamiliar``) of a policy that was trained on another physics, or at another time step."""
+        manifest, step_s = self.policy.manifest, game.rules.time_step_s
+        then, now = manifest.versions.get(PHYSICS), physics_digest()
         if then not in (None, now):
             warnings.warn(
                 f"{self.name}: was trained on other physics ({then!r:.20}) than this installation's ({now!r}), so it"
                 " may drive worse than reported; train it again",
+                Unfamiliar,
+                stacklevel=2,
+            )
+        if abs(manifest.time_step_s - step_s) > 1e-9:
+            warnings.warn(
+                f"{self.name}: decided every {manifest.time_step_s:g} s in its training, but decides every {step_s:g} s"
+                f" in scenario {game.name!r}",
                 Unfamiliar,
                 stacklevel=2,
             )
@@ -77,7 +86,8 @@ class LearnedAgent:
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
         """Return the commands of vehicle ``body``, [n] m/s2."""
         policy = self.policy
-        seen = policy.observation.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
+        view = self.observation or policy.observation
+        seen = view.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
         return to_command(state, body, policy(seen)[:, 0].astype(np.float64)), None
 
 

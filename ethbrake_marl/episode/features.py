@@ -146,8 +146,11 @@ def register_feature(
         raise InvalidInput(
             f"feature {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter"
         )
-    if name in WHOLE_GROUPS or SIDE.fullmatch(name):
+    if name in WHOLE_GROUPS or name in GROUPS or SIDE.fullmatch(name):
         raise InvalidInput(f"feature {name!r}: this is the name of a group; give another name")
+    inside = [group for group, features in {**WHOLE_GROUPS, "front_1": NEIGHBOUR}.items() if name in names_in(features)]
+    if inside:
+        raise InvalidInput(f"feature {name!r}: the group {inside[0]} has a feature of this name; give another name")
     if not callable(function) or not (function.__doc__ or "").strip():
         raise InvalidInput(f"feature {name!r}: must be a function with a docstring that describes the feature")
     numbers = {"scale": scale, "low": low, "high": high, "unknown": unknown}
@@ -164,6 +167,11 @@ def register_feature(
     meaning = " ".join(str(function.__doc__).split())
     entry = Own(Feature(name, str(unit), float(scale), float(low), float(high), meaning), of, function, float(unknown))
     FEATURES.add(name, entry, lambda other: other == entry)
+
+
+def names_in(features: Sequence[Feature]) -> list[str]:
+    """Return the names of features in their group."""
+    return [feature.name for feature in features]
 
 
 def register_feature_group(

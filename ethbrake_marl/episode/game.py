@@ -13,7 +13,7 @@ from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
-from ethbrake_marl.motion.layout import Floats, Ints
+from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
 
 class Script(Protocol):
@@ -113,6 +113,14 @@ class Game(NamedTuple):
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step, and what it did: ``step`` without shield and without terms of the reward."""
         return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
+
+    def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
+        """Return the agents of some vehicles, body -> agent, so that each sees what it may see."""
+        return drivers
+
+    def hides(self, alert: State, body: int) -> Bools:
+        """Return of whom vehicle ``body`` does not know everything at its first decision, [n, N + 1]."""
+        return alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
 
     def own_infos(self, state: State) -> dict[str, Any]:
         """Return the infos that only this game has: name -> [n] or [n, N]."""

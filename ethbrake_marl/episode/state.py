@@ -60,17 +60,13 @@ class State(NamedTuple):
 
     def take(self, rows: Any) -> State:
         """Return the episodes ``rows`` (indices, a mask or a slice)."""
-        memories = {who: take(memory, rows) for who, memory in self.memories.items()}
-        line, car, clock, know, wanted = (array[rows] for array in self[:5])
-        return State(line, car, clock, know, wanted, memories)
+        state: State = take(self, rows)
+        return state
 
     def put(self, rows: Any, new: State, *, donate: bool = False) -> State:
         """Return this state with the episodes ``new`` in ``rows``. ``donate``: its own arrays may be reused."""
-        line, car, clock, know, wanted = (
-            put(old, rows, part, donate) for old, part in zip(self[:5], new[:5], strict=True)
-        )
-        memories = {who: put(memory, rows, new.memories[who], donate) for who, memory in self.memories.items()}
-        return State(line, car, clock, know, wanted, memories)
+        state: State = put(self, rows, new, donate)
+        return state
 
     @staticmethod
     def join(parts: Sequence[State], merged: Callable[[Sequence[Any]], Any] = np.concatenate) -> State:
@@ -78,9 +74,8 @@ class State(NamedTuple):
 
         ``merged`` returns one array of those of the parts; by default they stand one after the other.
         """
-        memories = {who: join([part.memories[who] for part in parts], merged) for who in parts[0].memories}
-        line, car, clock, know, wanted = (merged(each) for each in zip(*(part[:5] for part in parts), strict=True))
-        return State(line, car, clock, know, wanted, memories)
+        state: State = mapped(lambda *arrays: merged(arrays), *parts)
+        return state
 
     def read_only(self) -> State:
         """Return the same episodes, whose arrays cannot be changed by mistake."""
@@ -198,31 +193,33 @@ class State(NamedTuple):
         return out
 
 
-def take(memory: Any, rows: Any) -> Any:
-    """Return ``rows`` of a memory: None, an array with one row per world, or a tuple of memories."""
+def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
+    """Return a memory with ``function(array, ...)`` in place of each array; ``others`` are memories of the same kind.
+
+    A memory is None, an array with one row per world, or a tuple or mapping of memories, such as a state.
+    """
     if isinstance(memory, tuple):
-        parts = [take(part, rows) for part in memory]
+        parts = [mapped(function, *each) for each in zip(memory, *others, strict=True)]
         return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
-    return None if memory is None else memory[rows]
+    if isinstance(memory, Mapping):
+        return {who: mapped(function, each, *(other[who] for other in others)) for who, each in memory.items()}
+    return None if memory is None else function(memory, *others)
+
+
+def take(memory: Any, rows: Any) -> Any:
+    """Return ``rows`` of a memory."""
+    return mapped(lambda array: array[rows], memory)
 
 
 def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
     """Return a memory with ``new`` in ``rows``: a copy, or the same arrays if they are donated."""
-    if isinstance(memory, tuple):
-        parts = [put(old, rows, part, donate) for old, part in zip(memory, new, strict=True)]
-        return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
-    if memory is not None:
-        memory = memory if donate else memory.copy()
-        memory[rows] = new
-    return memory
 
+    def written(old: Any, part: Any) -> Any:
+        array = old if donate else old.copy()
+        array[rows] = part
+        return array
 
-def join(memories: Sequence[Any], merged: Callable[[Sequence[Any]], Any]) -> Any:
-    """Return memories of one kind as one."""
-    if isinstance(memories[0], tuple):
-        parts = [join(part, merged) for part in zip(*memories, strict=True)]
-        return type(memories[0])(*parts) if hasattr(memories[0], "_fields") else tuple(parts)
-    return None if memories[0] is None else merged(memories)
+    return mapped(written, memory, new)
 
 
 @kernel

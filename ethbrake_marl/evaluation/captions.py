@@ -109,7 +109,8 @@ def _knowledge(rows: Sequence[SummaryRow]) -> str:
         return ""
     text = (
         f"In {100 * hidden:.1f} % of these worlds the V2X channel hides something from a controlled vehicle at its"
-        " first decision: messages have not arrived, or another vehicle reacts later than its message says."
+        " first decision: messages have not arrived, are old or lack something, or another vehicle reacts later than"
+        " its message says."
     )
     through = ", ".join(row.agent for row in rows if row.sees_through)
     if through:

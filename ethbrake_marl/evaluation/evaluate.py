@@ -18,6 +18,7 @@ from ethbrake_marl.agents.drive import MESSAGES, MODEL, SENSORS, STATE as TRUE_S
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, naming_extras, unknown_name
+from ethbrake_marl.evaluation.familiar import warn_unfamiliar
 from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
 from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured
 from ethbrake_marl.motion.digest import physics_digest
@@ -132,6 +133,7 @@ def evaluate(
     """
     drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
     _check(drawn.worlds, agents, game)
+    warn_unfamiliar(agents, drawn.worlds)
     chosen = (*DEFAULT, *measures)
     alert, n = drawn.worlds, drawn.worlds.n
     calls: Any = (
@@ -151,7 +153,7 @@ def evaluate(
         columns["world"] = np.arange(n)
     return Result(
         {team: _joined([part[team] for part in parts]) for team in agents},
-        {**columns, "hidden": hidden_from(alert, learners)},
+        {**columns, "hidden": hidden_from(alert, game)},
         chosen,
         {name: known_by(team) for name, team in agents.items()},
         {name: policies_of(team.drivers) for name, team in agents.items()},
@@ -201,16 +203,14 @@ def _joined(parts: Sequence[Columns]) -> Columns:
     }
 
 
-def hidden_from(alert: State, learners: Sequence[int]) -> Bools:
+def hidden_from(alert: State, game: Game) -> Bools:
     """Return whether the V2X channel hides something from a learner at its first decision, [n].
 
-    News of a vehicle have not arrived, or it reacts later than its messages say, because it waits for news itself.
+    The learner does not know all of a vehicle, or that one reacts later than its messages say, because it waits itself.
     """
-    latency, hidden = alert.car[:, LATENCY], np.zeros(alert.n, np.bool_)
-    late = latency > alert.car[:, OWN_LATENCY]
-    for i in learners:
-        unknown = (alert.know[:, i] > latency[:, [i]]) | late
-        hidden |= np.delete(unknown, [0, i], axis=1).any(axis=1)
+    late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
+    for i in game.rules.learners.tolist():
+        hidden |= np.delete(game.hides(alert, i) | late, [0, i], axis=1).any(axis=1)
     return hidden
 
 

@@ -69,7 +69,7 @@ class EpisodeShield:
         """Return the memory at the first decision ``state``, with the driver of each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
-        remembered = begun(agent, alert, body)
+        remembered = begun(game.agents({body: agent})[body], alert, body)
         known = alert._replace(wanted=state.wanted)
         choice = coupled(known, body, self.count, game.rules.horizon_s) if self.coupled else pairwise(known, body)
         backup = to_action(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
@@ -87,7 +87,7 @@ class EpisodeShield:
         """Return the action of the driver that was chosen at the alert, [n, 1], and the new memory."""
         memory: Memory = state.memories["shield"]
         (body,) = self.drivers
-        own, after = propose(self.drivers, state, {body: memory.agent})
+        own, after = propose(game.agents(self.drivers), state, {body: memory.agent})
         proposed = own if proposed is None else np.where(np.isnan(proposed), own, proposed)
         applied = np.where(memory.chosen[:, np.newaxis], own, memory.backup)
         differ = (np.abs(applied - proposed) > ROUNDING) & ~state.ended[:, np.newaxis]

@@ -51,23 +51,25 @@ def held(game: Game, actions: Floats) -> Floats:
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
-def best_constant(game: Game, state: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
+def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
     """Return the best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
 
+    Their harm is the largest over the states that a world may be in, which stand one after the other in ``states``.
     Tried are the plan's next actions, all of them a little harder or softer: deviations from a good plan are mended by
     small changes far more often than by a fixed set of constants that spans all brakes. With several learners, also
     these actions with another one of a single learner, from all of its brakes.
     """
-    learners, rows = game.rules.learners, np.arange(state.n)
-    planned = plans[rows, np.minimum(state.steps, plans.shape[1] - 1)]
+    learners, rows, each = game.rules.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
+    planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]
     actions = np.minimum(np.maximum(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0), 0.0)
     if len(learners) > 1:
         alone = np.repeat(planned[:, np.newaxis], len(learners) * len(ALONE), axis=1)
         for column in range(len(learners)):
             alone[:, column * len(ALONE) : (column + 1) * len(ALONE), column] = ALONE
         actions = np.concatenate([actions, alone], axis=1)
-    commands = actions * state.car[:, np.newaxis, BRAKING, learners]
-    harm = hold(state, state.wanted, learners.tolist(), commands, game.rules.horizon_s, count)[0]
+    commands = actions.repeat(each, axis=0) * states.car[:, np.newaxis, BRAKING, learners]
+    harm = hold(states, states.wanted, learners.tolist(), commands, game.rules.horizon_s, count)[0]
+    harm = harm.reshape(len(plans), each, -1).max(axis=1)
     best = harm.argmin(axis=1)
     return actions[rows, best, np.newaxis], harm[rows, best]
 
@@ -79,7 +81,7 @@ def rollout(
 
     ``state`` has the agents' memories.
     """
-    plans, rows = plans.copy(), np.arange(state.n)
+    plans, rows, drivers = plans.copy(), np.arange(state.n), game.agents(drivers)
     while (~state.ended & (state.harm(count) <= most)).any():
         actions, memories = propose(drivers, state, state.memories)
         now = np.minimum(state.steps, plans.shape[1] - 1)

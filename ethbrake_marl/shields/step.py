@@ -71,6 +71,7 @@ class Memory(NamedTuple):
     margin: Floats  # [n, L] bound minus the least price that was tried after the proposal (m2/s2)
     intervened: Bools  # [n, N] whether the last proposal was replaced
     replaced: Ints  # [n] number of actions that have been replaced
+    members: Any = None  # what a subclass remembers of the states that a world may be in
 
 
 # What may follow an action: its reason, and (shield, game, states after the action, plans, most) -> actions of every
@@ -91,7 +92,6 @@ class StepShield:
     """
 
     knows = MODEL
-    M = 1  # number of states that a world may be in; a subclass with more overrides ``seen`` and ``price``
 
     def __init__(
         self,
@@ -111,11 +111,10 @@ class StepShield:
         if drivers:
             self.rests.append((POLICY_ROLLOUT, agents_drive))
 
-    def seen(self, state: State, memory: Memory | None) -> State:
-        """Return the states that the worlds may be in now, M rows for each world, the nominal one first.
+    # A subclass for worlds that may be in one of M states overrides the next two, and calls ``start`` with the states.
 
-        ``memory`` None: at the first decision.
-        """
+    def seen(self, state: State, memory: Memory) -> State:
+        """Return the states that the worlds may be in now, M rows for each world, the nominal one first."""
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
@@ -133,13 +132,23 @@ class StepShield:
         return np.maximum(memory.price, memory.first + self.allowance) if self.allowance else memory.price
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
+        """Return the memory at the first decision ``state``."""
+        return self.start(game, alert, state, state, self.agents_at(game, alert))
+
+    def agents_at(self, game: Game, alert: State) -> dict[int, Any]:
+        """Return the memories of the shield's agents for new episodes, body -> memory."""
+        return {body: begun(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
+
+    def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
+        """Return the constant actions from which the first plan is chosen, [n, T, L] each."""
+        return first_plans(game, alert, state, self.count)
+
+    def start(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
         """Return the memory at the first decision ``state``: the best constant actions, or the agents' own play."""
-        states, rows = self.seen(state, None), np.arange(state.n)
-        plans = first_plans(game, alert, state, self.count)
+        rows, plans = np.arange(state.n), self.plans(game, alert, state, states)
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         plan, harm = np.stack(plans)[prices.argmin(axis=0), rows], prices.min(axis=0)
         caps = played(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
-        agents = {body: begun(agent, alert, body) for body, agent in self.drivers.items()}
         if agents:
             check_learners(game, agents)
             own = rollout(game, self.drivers, state._replace(memories={**state.memories, **agents}), plan, self.count)
@@ -158,7 +167,7 @@ class StepShield:
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
         """Return the actions to apply, [n, L], and the new memory."""
         memory: Memory = state.memories["shield"]
-        proposed, state = self.asked(state, proposed)
+        proposed, state = self.asked(game, state, proposed)
         if not donate:
             memory = memory._replace(plan=memory.plan.copy(), price=memory.price.copy())
         each, now = np.arange(state.n), np.minimum(state.steps, memory.plan.shape[1] - 1)
@@ -192,7 +201,7 @@ class StepShield:
             reason=np.where(running, reason, ENDED), margin=margin,
         )  # fmt: skip
 
-    def asked(self, state: State, proposed: Floats | None) -> tuple[Floats, State]:
+    def asked(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
         """Return the proposals, [n, L], NaN for none, and the state with the memories of the shield's agents.
 
         They propose what nobody else does. If one remembers, they are asked at every decision.
@@ -204,7 +213,7 @@ class StepShield:
                 raise InvalidInput("step: actions = None: this shield has no agents that could propose any")
             proposed = np.full((state.n, len(own)), np.nan)
         if own and (np.isnan(proposed).any() or any(each is not None for each in own.values())):
-            theirs, own = propose(self.drivers, state, own)
+            theirs, own = propose(game.agents(self.drivers), state, own)
             proposed = np.where(np.isnan(proposed), theirs, proposed)
         return proposed, state._replace(memories={**memories, **own})
 
@@ -217,16 +226,17 @@ class StepShield:
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
-        before = self.part(self.seen(state, memory), rows)
+        seen = self.seen(state, memory)
+        M = seen.n // state.n
+        before = part(seen, rows, M)
         least = self.price(game, before, plans, most, take(memory.caps, rows))
         reason = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE)
         for code, rest in rests:
             left = (reason == NO_CERTIFICATE).nonzero()[0]
             if not len(left):
                 break
-            here = self.part(before, left)
-            after, _ = game.follow(here, actions[left].repeat(self.M, axis=0))
-            after = after if self.M == 1 else after.take(np.arange(0, after.n, self.M))
+            here = part(before, left, M)
+            after, _ = game.follow(here, actions[left].repeat(M, axis=0))
             later, value = rest(self, game, after, plans[left], most[left])
             hopeful = (value <= most[left] + NEARLY).nonzero()[0]
             if len(hopeful):
@@ -234,7 +244,7 @@ class StepShield:
                 tried = np.empty((len(at), *plans.shape[1:]))
                 tried[:] = later[hopeful]
                 tried[np.arange(len(at)), now[at]] = actions[at]
-                states, caps = self.part(here, hopeful), take(memory.caps, rows[at])
+                states, caps = part(here, hopeful, M), take(memory.caps, rows[at])
                 value[hopeful] = self.price(game, states, tried, most[at], caps)
                 good = value[hopeful] <= most[at]
                 plans[at[good]], reason[at[good]] = tried[good], code
@@ -243,12 +253,6 @@ class StepShield:
         if len(good):
             memory.plan[rows[good]], memory.price[rows[good]] = plans[good], least[good]
         return reason, least
-
-    def part(self, states: State, rows: Ints) -> State:
-        """Return the M states of each of the worlds ``rows``, which increase."""
-        if len(rows) * self.M == states.n:
-            return states
-        return states.take(rows if self.M == 1 else (rows[:, np.newaxis] * self.M + np.arange(self.M)).ravel())
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         """Return what users may want to know: name -> [n] or [n, N]."""
@@ -269,6 +273,13 @@ class StepShield:
         }
 
 
+def part(states: State, rows: Ints, M: int) -> State:
+    """Return the M states of each of the worlds ``rows``, which increase."""
+    if len(rows) * M == states.n:
+        return states
+    return states.take(rows if M == 1 else (rows[:, np.newaxis] * M + np.arange(M)).ravel())
+
+
 @cache
 def trials(learners: int) -> Bools:
     """Return which of L proposals are tried together, [1 or 1 + L, L]: all of them, then one by one from the front."""
@@ -279,12 +290,13 @@ def trials(learners: int) -> Bools:
 def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
     """Fallback: the best constant actions. Where scripts look at the state, nothing is known before the play."""
     plans, estimate = best_constant(game, after, plans, shield.count)
-    return plans, np.zeros(after.n) if game.scripts else estimate
+    return plans, np.zeros(len(plans)) if game.scripts else estimate
 
 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback: the shield's own agents drive on."""
-    return rollout(game, shield.drivers, after, plans, shield.count, most), np.zeros(after.n)
+    """Fallback: the shield's own agents drive on, from the nominal state."""
+    nominal = after if after.n == len(plans) else after.take(slice(None, None, after.n // len(plans)))
+    return rollout(game, shield.drivers, nominal, plans, shield.count, most), np.zeros(len(plans))
 
 
 def make_step(team: Team, argument: str | None, settings: Any) -> Team:

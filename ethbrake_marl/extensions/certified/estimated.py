@@ -1,230 +1,271 @@
-"""The estimated world of one vehicle: the information that the vehicle received, completed from the scenario's ranges.
+"""The estimated line of one vehicle: what it has received, completed from the scenario's ranges.
 
-A vehicle is *known* if its message has arrived or it is in sight. The estimate combines these sources:
+A quantity of another vehicle that nothing has told yet is the median of its distribution, or an end of its range: the
+*lines* are the median line, and perhaps every *corner* of the ranges. Each line is played from the alert on, beside the
+episode, with the vehicle's own actions; the others follow their scripts. A line in which the vehicle would have
+received or measured something else than it has is no longer possible. If none is possible, the truth lies between the
+corners: then what was received replaces what was assumed, in all lines, and what nobody has told goes on as before.
 
-* A known vehicle is the source of its capacities, its mass, its own latency, and the newest state that was received
-  from it. The estimate extrapolates this state to the present. If a command was in force at the time of this state, the
-  vehicle is assumed to follow its script from that time on. Otherwise, the vehicle is assumed to coast until the time
-  at which it is expected to react.
-* The scenario is the source for a vehicle that is not known. Each quantity of an unknown vehicle is the median of its
-  distribution, or a chosen value of its range. An unknown vehicle is assumed to follow its script from the alert on.
-* The scenario is also the source for each quantity that the messages of a known vehicle lack (``v2x: tells``). The
-  received position of a vehicle is used only if its speed was received, too. The received command of a vehicle is used
-  only if its position and speed were received, too. A received intent (announced command) is not used, because the
-  script already predicts what the vehicle does.
-* The estimating vehicle measures its own state, its distance since the alert, and its impacts with known neighbours.
-
-The estimate reads nothing else of the true world, so information that was not received cannot change the estimate.
+Nothing else of the true state is read, so what was not received cannot change a line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.first_edition.agents.driving import script_agents
-from ethbrake_marl.first_edition.agents.protocol import fixed_commands
-from ethbrake_marl.first_edition.agents.received import Received, places_of
-from ethbrake_marl.first_edition.engine.scripts import Script
-from ethbrake_marl.first_edition.physics.estimates import move_on
-from ethbrake_marl.first_edition.physics.messages import BRAKING_CAPACITY, LATENCY, MASS
-from ethbrake_marl.first_edition.physics.motion import has_acted
-from ethbrake_marl.first_edition.physics.state import Bools, Floats, Vehicles, Worlds
-from ethbrake_marl.first_edition.scenario.sampling import middle_world
-from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS
+from ethbrake_marl.extensions.messages.belief import known_pieces
+from ethbrake_marl.extensions.messages.links import (
+    AT,
+    NAME,
+    OBSTACLE_HIT,
+    P_ACCELERATION,
+    P_BRAKING,
+    P_INTENT,
+    P_LATENCY,
+    P_MASS,
+    P_PLACE,
+    P_SPEED,
+    PIECES,
+    PLACE,
+    SAMPLE_FORCE,
+    SAMPLE_SPEED,
+    newest,
+    present,
+)
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.drive import solo
+from ethbrake_marl.motion.layout import (
+    BRAKE_RATE,
+    BRAKING,
+    COUNT,
+    DRIVING,
+    FIRST,
+    FORCE,
+    GAP,
+    HIT,
+    LATENCY,
+    LIMIT,
+    MASS,
+    OWN_LATENCY,
+    RELEASE_RATE,
+    RESTITUTION,
+    SPEED,
+    TOTAL,
+    Bools,
+    Floats,
+)
+from ethbrake_marl.worlds.channel import PER_LINK
+from ethbrake_marl.worlds.roles import HELD, LEARNER, first_command
+from ethbrake_marl.worlds.sampling import draw_once
+from ethbrake_marl.worlds.scenario import Scenario
 
-TOUCHING_M = 1e-9  # a gap below this counts as contact, because received positions are rounded
+SURPRISE = 1e-6  # by which a quantity (SI units, t) may differ from its prediction: messages are moved on with rounding
+RANGES = {"speeds_mps": SPEED, "braking_capacity_mps2": BRAKING, "mass_t": MASS, "latency_s": OWN_LATENCY}
+TOLD = {  # rows of `State.car` -> the piece of a message that tells them
+    BRAKING: P_BRAKING,
+    DRIVING: P_BRAKING,
+    BRAKE_RATE: P_BRAKING,
+    RELEASE_RATE: P_BRAKING,
+    LIMIT: P_BRAKING,
+    OWN_LATENCY: P_LATENCY,
+    MASS: P_MASS,
+}
+OF_IMPACTS = [HIT, FIRST, TOTAL, COUNT]
 
-OF_OTHERS = (
-    "place",
-    "speeds_mps",
-    "braking_capacity_mps2",
-    "mass_t",
-    "latency_s",
-    "news_s",
-)  # quantities that may be uncertain
 
+class Lines(NamedTuple):
+    """The M lines that vehicle ``body`` assumes as long as it has received nothing, the median one first."""
 
-@dataclass(frozen=True, slots=True)
-class Ranges:
-    """Ranges that a scenario declares for quantities of the vehicles that the estimating vehicle does not know.
-
-    Keys of the mappings ``middle``, ``low`` and ``high``: ``place`` (position relative to the estimating vehicle at the
-    alert, m), ``speeds_mps``, ``braking_capacity_mps2``, ``mass_t``, ``latency_s`` (latency without the delay of the
-    alert message, s) and ``news_s`` (time at which a vehicle has received the alert and may react, s; 0 without a
-    channel).
-
-    The argument ``share`` of the methods gives, for some pairs (quantity, vehicle index), the position of the value in
-    its range: 0 is the smallest value, 1 the largest. Every other unknown quantity gets its median. If ``share`` is
-    None, every unknown quantity gets its median.
-    """
-
-    vehicle: int  # index of the estimating vehicle
-    others: Mapping[int, Script]  # scripts of the other vehicles, by index; a vehicle without a script brakes fully
-    middle: Mapping[str, Floats]  # median of each quantity, [N]
-    low: Mapping[str, Floats]  # smallest value of each quantity, [N]
-    high: Mapping[str, Floats]  # largest value of each quantity, [N]
-    obstacle_gap_m: float  # gap of vehicle_1 to the obstacle, m; infinite without an obstacle
+    body: int
+    alert: State  # [M] at the alert
+    news_s: Floats  # [M, N + 1] when each vehicle has received the alert (s)
+    roles: tuple[str, ...]  # of the vehicles, front to rear
 
     @classmethod
-    def of(cls, scenario: Scenario, vehicle: int, others: Mapping[int, Script] | None = None) -> Ranges:
-        """Return the ranges that ``scenario`` declares, for the estimates of the vehicle with index ``vehicle``.
+    def of(cls, scenario: Scenario, body: int, *, corners: bool) -> Lines:
+        """Return the median line of a scenario, and its ``corners``: every unknown quantity at an end of its range.
 
-        ``others`` contains the scripts of the other vehicles by vehicle index; None: the scripts of the scenario.
-        Raises ``InvalidInput`` for a mixture of scenarios, because an unknown vehicle could belong to any scenario of
-        the mixture.
+        Unknown are the gaps, and of each other vehicle speed, braking capacity, mass, latency, and when it receives the
+        alert. Raises ``InvalidInput`` for a mixture, for others that agents drive, and for too many corners.
         """
+        where = f"scenario {scenario.name!r}: estimated agents and shields need"
         if scenario.members:
             names = ", ".join(member.name for member in scenario.members)
+            raise InvalidInput(f"{where} the ranges of one scenario, but this is a mixture; give one of {names}")
+        for other, (name, role) in enumerate(scenario.roles.items(), 1):
+            if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
+                raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
+        N, channel, of = scenario.vehicles, scenario.v2x.channel, scenario.equipped()
+        median = draw_once(scenario, lambda width, stream: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
+        late = np.array([channel.latest_reaction_s([0.0] * N, of)])
+        usual = channel.news(np.zeros((1, N)), np.full((1, PER_LINK * N * N), 0.5), of)[0] if late.any() else late
+        sides = [("gaps_m", p, *ends) for p, ends in enumerate(scenario.bounds("gaps_m"), 1)]
+        sides += [(key, j, *ends) for key in RANGES for j, ends in enumerate(scenario.bounds(key), 1) if j != body]
+        sides += [("news_s", j, 0.0, float(late[0, j - 1])) for j in range(1, N + 1) if j != body]
+        sides = [side for side in sides if side[2] < side[3]] if corners else []
+        if 2 ** len(sides) > MOST_CORNERS:
             raise InvalidInput(
-                f"scenario {scenario.name!r} is a mixture of scenarios, but estimated agents and shields need the"
-                f" ranges of one scenario; give one of {names}"
+                f"robust:estimated: scenario {scenario.name!r} has {len(sides)} unknown quantities; their smallest and"
+                f" largest values make {2 ** len(sides)} combinations (corners), but at most {MOST_CORNERS} are"
+                " allowed; give fewer quantities a range"
             )
-        world = middle_world(scenario)
-        low, high = ({key: np.array(scenario.bounds(key)).T[k] for key in ("gaps_m", *OF_OTHERS[1:5])} for k in (0, 1))
-        named = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "speed_limit_mps")
-        one, N = np.ones((1, scenario.vehicles)), scenario.vehicles
-        heard = Vehicles.at_once(
-            one, one, np.zeros((1, N)), one, one, np.zeros(1)
-        )  # no latency except that of the alert message
-        if scenario.v2x.by_link:
-            heard = scenario.v2x.with_news(heard, np.full((1, scenario.v2x.width(N)), 0.5), scenario.equipped())
-        middle = {
-            "place": _places(world.gaps_m[0], world.gaps_m[0], vehicle),
-            "speeds_mps": world.speeds_mps[0],
-            **{key: getattr(world.vehicles, key)[0] for key in named},
-            "latency_s": world.vehicles.own_latency_s[0],
-            "news_s": heard.latency_s[0],
-        }
-        low["place"] = _places(low["gaps_m"], high["gaps_m"], vehicle)
-        high["place"] = _places(high["gaps_m"], low["gaps_m"], vehicle)
-        low["news_s"] = np.zeros(scenario.vehicles)
-        high["news_s"] = scenario.v2x.latest_reaction_s(low["news_s"], scenario.equipped())
-        others = script_agents(scenario, except_for=vehicle) if others is None else others
-        return cls(vehicle, others, middle, low, high, float(world.obstacle_gap_m[0]))
+        ends = [side[2:] for side in sides]
+        values = np.array([*product(*ends)]).reshape(-1, len(sides)) if sides else np.zeros((0, 0))
+        alert = median.take(np.zeros(1 + len(values), np.int64))
+        news = np.zeros((alert.n, N + 1))
+        news[:, 1:] = usual
+        for (key, column, *_), each in zip(sides, values.T, strict=True):
+            array = news if key == "news_s" else alert.line[:, GAP] if key == "gaps_m" else None
+            if array is None:
+                array = (alert.line if key == "speeds_mps" else alert.car)[:, RANGES[key]]
+            array[1:, column] = each
+        alert.car[:, LATENCY] = np.maximum(alert.car[:, OWN_LATENCY], news)
+        return cls(body, alert, news, tuple(scenario.roles.values()))
 
-    def at(self, share: Mapping[tuple[str, int], float] | None, key: str) -> Floats:
-        """Return the quantity ``key`` (a key of ``middle``) of every vehicle, [N]: the median, or the value at the
-        position that ``share`` gives.
+    def commands(self, car: Floats, wanted: Floats) -> Floats:
+        """Return the commands of scripts with these capacities, [n, N + 1] m/s2; other learners brake fully."""
+        wanted = wanted.copy()
+        for other, role in enumerate(self.roles, 1):
+            if other != self.body:
+                wanted[:, other] = first_command("full_brake" if role == LEARNER else role, car[:, BRAKING, other])
+        return wanted
+
+    def at_alert(self, alert: State, state: State) -> State:
+        """Return the lines at the alert, M rows for each world, if ``state`` is what is known at the first decision.
+
+        A vehicle of which everything is known then is as it was, and so is the gap between two of them.
         """
-        value = self.middle[key].copy()
-        for (name, j), part in () if share is None else share.items():
-            if name == key:
-                value[j] = self.low[key][j] + part * (self.high[key][j] - self.low[key][j])
-        return value
+        M, (pieces, news) = self.alert.n, self.received(state)
+        lines, true = self.alert.take(np.tile(np.arange(M), alert.n)), alert.take(np.arange(alert.n).repeat(M))
+        whole = pieces[:, :, :P_INTENT].all(axis=2)
+        whole[:, 0] = whole[:, 1]
+        acts = (whole & (news[:, SAMPLE_FORCE] != 0.0)).repeat(M, axis=0)
+        acts[:, self.body] = True
+        known = whole.repeat(M, axis=0)
+        line, car = (np.where(known[:, np.newaxis], *each) for each in zip(true[:2], lines[:2], strict=True))
+        both = known[:, :-1] & known[:, 1:]
+        line[:, GAP, :-1] = np.where(both, true.line[:, GAP, :-1], lines.line[:, GAP, :-1])
+        car[:, RESTITUTION] = true.car[:, RESTITUTION]
+        heard = np.maximum(car[:, OWN_LATENCY], np.tile(self.news_s, (alert.n, 1)))
+        car[:, LATENCY] = np.where(acts, true.car[:, LATENCY], heard)
+        return true._replace(line=line, car=car, wanted=self.commands(car, true.wanted))
 
-    @property
-    def uncertain(self) -> tuple[tuple[str, int], ...]:
-        """The quantities of the other vehicles for which the scenario declares a range instead of one value, as pairs
-        (quantity, vehicle index).
+    def received(self, state: State) -> tuple[Bools, Floats]:
+        """Return which pieces of each body are known, [n, N + 1, PIECES], and its newest sample (``messages.links``).
+
+        The place of the obstacle is known to Vehicle 1, and to who knows the place of Vehicle 1.
         """
-        others = [j for j in range(len(self.middle["place"])) if j != self.vehicle]
-        return tuple((key, j) for j in others for key in OF_OTHERS if self.low[key][j] < self.high[key][j])
+        if NAME in state.memories:
+            pieces, news = known_pieces(state, self.body), newest(state, self.body)
+        else:
+            known = state.know[:, self.body] <= state.time_s[:, np.newaxis]
+            known[:, [0, self.body]] = True
+            pieces, news = known[:, :, np.newaxis].repeat(len(PIECES), axis=2), present(state)
+        pieces[:, 0] = False
+        pieces[:, 0, P_PLACE] = pieces[:, 1, P_PLACE]
+        return pieces, news
 
-    def estimate(
-        self,
-        worlds: Worlds,
-        way_m: Floats,
-        share: Mapping[tuple[str, int], float] | None = None,
-        foretold: tuple[Worlds, Bools] | None = None,
-    ) -> Worlds:
-        """Return the estimated worlds of the estimating vehicle at the present time, [n].
+    def heard(self, state: State, lines: State) -> tuple[State, Bools, Bools]:
+        """Return the lines after what has been received by now, [n] whether one was possible, [n] whether one was not.
 
-        Raises ``InvalidInput`` if brakes build up.
-
-        Args:
-            worlds: the true worlds; only the information that the vehicle received is read.
-            way_m: [n] distance that the estimating vehicle has travelled since the alert, m.
-            share: positions of unknown quantities in their ranges, as the class docstring explains.
-            foretold: the predicted present worlds, including impacts, and a mask [n, N]: True for a vehicle whose
-                predicted state replaces the state in its last message. None: the estimate uses no prediction.
-
+        A line that is not possible becomes a copy of one that is; if none is, ``overwritten`` mends all of them.
         """
-        worlds.refuse_build_up(":estimated")
-        vehicle, (n, N) = self.vehicle, worlds.speeds_mps.shape
-        known, own, v = Received.by(worlds, vehicle), np.arange(N) == vehicle, worlds.vehicles
-        reported = {"mass_t": v.mass_t, "braking_capacity_mps2": v.braking_capacity_mps2,
-                    "driving_capacity_mps2": v.driving_capacity_mps2, "speed_limit_mps": v.speed_limit_mps}  # fmt: skip
-        some, pieces = known.pieces.any(axis=2), known.pieces
-        has = {"mass_t": pieces[..., MASS], "speed_limit_mps": some}
-        of = {
-            key: np.where(has.get(key, pieces[..., BRAKING_CAPACITY]), values, self.at(share, key))
-            for key, values in reported.items()
-        }
-        at_s = np.where(known.known, known.at_s, 0.0)
-        own_part = np.where(pieces[..., LATENCY], v.own_latency_s, self.at(share, "latency_s"))
-        latency = np.where(known.reacts, at_s, np.maximum(np.maximum(own_part, self.at(share, "news_s")), at_s))
-        past = v.latency_s[:, vehicle] <= worlds.time_s
-        latency[:, vehicle] = np.where(
-            past, v.latency_s[:, vehicle], np.maximum(v.own_latency_s[:, vehicle], worlds.time_s)
-        )
-        vehicles = Vehicles.at_once(
-            of["braking_capacity_mps2"], of["driving_capacity_mps2"], latency, of["mass_t"], of["speed_limit_mps"],
-            v.restitution, harm_weight=v.harm_weight,
-        )  # fmt: skip
-        place = np.where(known.known, known.place_m, self.at(share, "place") - way_m[:, np.newaxis])
-        speed = np.maximum(np.where(known.known, known.speed_mps, self.at(share, "speeds_mps")), 0.0)
-        usual_gaps = np.repeat(-np.diff(self.middle["place"])[np.newaxis], n, axis=0)
-        line = replace(
-            worlds, vehicles=vehicles, speeds_mps=np.minimum(speed, of["speed_limit_mps"]), pair_hit=known.hit,
-            command_mps2=np.zeros((n, N)), gaps_m=usual_gaps, messages=np.zeros((n, 0)),
-            obstacle_hit=known.obstacle_hit, road=np.zeros((n, 0)),
-        )  # fmt: skip
-        command = fixed_commands(self.others, line, "estimated", vehicle=vehicle)
-        speed, way = move_on(
-            line.speeds_mps, command, latency - at_s, of["speed_limit_mps"], worlds.time_s[:, None] - at_s
-        )
-        speed[:, vehicle], way[:, vehicle] = line.speeds_mps[:, vehicle], 0.0
-        place, hit = place + way, known.hit
-        if foretold is not None:
-            (expected, keeps), hit = foretold, hit | foretold[0].pair_hit
-            place = np.where(keeps, places_of(expected, vehicle), place)
-            speed = np.where(keeps, np.maximum(expected.speeds_mps, 0.0), speed)
-        place = _in_order(place, known.known, vehicle)
-        gaps = np.maximum(place[:, :-1] - place[:, 1:], 0.0)
-        usual_obstacle = self.obstacle_gap_m + self.middle["place"][0] - way_m
-        obstacle = np.where(np.isfinite(known.obstacle_m), known.obstacle_m, usual_obstacle)
-        command[:, own] = worlds.command_mps2[:, own]
-        return replace(
-            line,
-            pair_hit=hit,
-            speeds_mps=speed,
-            gaps_m=np.where(gaps < TOUCHING_M, 0.0, gaps),
-            command_mps2=np.where(has_acted(latency, worlds.time_s[:, np.newaxis]), command, 0.0),
-            obstacle_gap_m=np.maximum(obstacle - place[:, 0], 0.0),
-        )
+        n, M = state.n, lines.n // state.n
+        possible = self.agrees(state, lines)
+        some = possible.any(axis=1)
+        kept = np.where(possible | ~some[:, np.newaxis], np.arange(M), possible.argmax(axis=1)[:, np.newaxis])
+        changed = ~possible.all(axis=1)
+        if changed.any():
+            lines = lines.take((np.arange(n)[:, np.newaxis] * M + kept).ravel())
+        if not some.all():
+            rows = (~some).repeat(M).nonzero()[0]
+            lines = lines.put(rows, self.overwritten(state.take(rows // M), lines.take(rows)), donate=True)
+        return lines, some, changed
+
+    def agrees(self, state: State, lines: State) -> Bools:
+        """Return whether the vehicle would have received and measured in a line what it has, [n, M]."""
+        pieces, news = self.received(state)
+        mine, theirs = self.told(state, news), self.told(lines, self.received(lines)[1])
+        far = np.abs(theirs.reshape(state.n, -1, *mine.shape[1:]) - mine[:, np.newaxis]) > SURPRISE
+        hit = state.line[:, HIT, self.body - 1 : self.body + 1]
+        struck = lines.line[:, HIT, self.body - 1 : self.body + 1].reshape(state.n, -1, 2) != hit[:, np.newaxis]
+        wrong = (far & pieces[:, np.newaxis, :, :P_INTENT]).any(axis=(2, 3)) | struck.any(axis=2)
+        return np.asarray(~wrong)
+
+    def told(self, state: State, news: Floats) -> Floats:
+        """Return the pieces of all bodies but the intent, [n, N + 1, PIECES - 1], places relative to the vehicle."""
+        car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
+        car[:, :, 0] = 0.0
+        own = news[:, PLACE, self.body, np.newaxis]
+        sample = np.stack([news[:, PLACE] - own, news[:, SAMPLE_SPEED], news[:, SAMPLE_FORCE]], axis=1)
+        return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
+
+    def overwritten(self, state: State, lines: State) -> State:
+        """Return lines, one for each world, in which what was received replaces what was assumed.
+
+        Who was last seen without a force reacts at the earliest then. A sample is moved on to the present by the
+        vehicle's script, without contact. Whose place is unknown keeps its distance to the vehicle, but for the order
+        of the line. The vehicle measures its own motion and its own impacts.
+        """
+        body, (pieces, news), time = self.body, self.received(state), state.time_s[:, np.newaxis]
+        line, car = lines.line.copy(), lines.car.copy()
+        for row, piece in TOLD.items():
+            car[:, row, 1:] = np.where(pieces[:, 1:, piece], state.car[:, row, 1:], car[:, row, 1:])
+        known, acts = pieces[:, :, [P_PLACE, P_SPEED]].all(axis=2), pieces[:, :, P_ACCELERATION]
+        known[:, 0] = False
+        at = np.where(known, news[:, AT], 0.0)
+        late = np.maximum(np.maximum(car[:, OWN_LATENCY], np.resize(self.news_s, car[:, LATENCY].shape)), at)
+        late = np.where(known & acts & (news[:, SAMPLE_FORCE] != 0.0), at, np.where(known, late, car[:, LATENCY]))
+        car[:, LATENCY], car[:, LATENCY, body] = late, state.car[:, LATENCY, body]
+        wanted = self.commands(car, state.wanted)
+        speed, way = np.where(known, news[:, SAMPLE_SPEED], line[:, SPEED]), np.zeros(known.shape)
+        move_on(speed, way, wanted, late - at, car[:, LIMIT], np.where(known, time - at, 0.0))
+        line[:, SPEED] = speed
+        place = np.zeros(known.shape)
+        place[:, 2:] = -np.cumsum(line[:, GAP, 1:-1], axis=1)
+        place = np.where(known, news[:, PLACE] + way - news[:, PLACE, [body]], place - place[:, [body]])
+        ahead = np.where(pieces[:, 0, P_PLACE], news[:, PLACE, 0] - news[:, PLACE, body], line[:, GAP, 0] + place[:, 1])
+        in_order(place[:, body:0:-1], known[:, body:0:-1])
+        in_order(-place[:, body:], known[:, body:], out=place[:, body:])
+        fresh = known & (at >= time)
+        exact = fresh[:, 1:-1] & fresh[:, 2:]
+        line[:, GAP, 1:-1] = np.where(exact, state.gaps_m, np.maximum(place[:, 1:-1] - place[:, 2:], 0.0))
+        line[:, GAP, 0] = state.line[:, GAP, 0] if body == 1 else np.maximum(ahead - place[:, 1], 0.0)
+        force = np.where((late <= 0.0) | (late < time), wanted, 0.0)
+        line[:, FORCE] = np.where(fresh & acts, news[:, SAMPLE_FORCE], np.where(known, force, line[:, FORCE]))
+        line[:, FORCE, body] = state.line[:, FORCE, body]
+        line[:, OF_IMPACTS, body - 1 : body + 1] = state.line[:, OF_IMPACTS, body - 1 : body + 1]
+        if body > 1:
+            line[:, HIT, 0] = np.where(pieces[:, 1, P_PLACE], news[:, OBSTACLE_HIT, 1], line[:, HIT, 0])
+        return lines._replace(line=line, car=car, wanted=wanted)
 
 
-def _places(ahead_m: Floats, behind_m: Floats, vehicle: int) -> Floats:
-    """Return the position of each vehicle relative to ``vehicle``, [N] m: positive ahead, negative behind.
+def in_order(place: Floats, known: Bools, out: Floats | None = None) -> None:
+    """Correct places (m), from a vehicle outwards, so that nobody is nearer than who is before; in place.
 
-    ``ahead_m`` and ``behind_m`` [P] are gaps of the pairs, m; only the gaps in front of ``vehicle`` are read from
-    ``ahead_m``, and only the gaps behind ``vehicle`` from ``behind_m``.
+    Who is not ``known`` is at most as far away as the next known one beyond.
     """
-    front = np.cumsum(ahead_m[:vehicle][::-1])[::-1]
-    return np.concatenate([front, [0.0], -np.cumsum(behind_m[vehicle:])])
+    limit = np.where(known, place, np.inf)[:, ::-1]
+    within = np.minimum(place, np.minimum.accumulate(limit, axis=1)[:, ::-1])
+    ordered = np.maximum.accumulate(within, axis=1)
+    if out is None:
+        place[:] = ordered
+    else:
+        out[:] = -ordered
 
 
-def _in_order(place: Floats, known: Bools, vehicle: int) -> Floats:
-    """Correct estimated positions so that no vehicle is ahead of the vehicle in front of it; return the positions, [n,
-    N] m.
-
-    ``place`` [n, N] is the position of each vehicle relative to ``vehicle``, m; the function changes this array in
-    place. ``known`` [n, N] is True for vehicles whose position is certain; these positions do not change.
-    """
-    N = place.shape[1]
-    for way in (-1, 1):  # first the vehicles ahead, then the vehicles behind
-        side = np.arange(vehicle + way, -1 if way < 0 else N, way)
-        limit = np.full(len(place), np.inf)
-        for j in side[::-1]:  # from the far end: at most as far away as the next known vehicle beyond it
-            far = np.where(known[:, j], -way * place[:, j], np.minimum(-way * place[:, j], limit))
-            limit = np.where(known[:, j], np.minimum(far, limit), limit)
-            place[:, j] = -way * far
-        near = np.zeros(len(place))
-        for j in side:
-            near = np.maximum(near, -way * place[:, j])
-            place[:, j] = -way * near
-    return place
+@large
+def move_on(speed, way, wanted, onset, limit, age):
+    """Move vehicles on by ``age`` (s) without contact, from ``onset`` (s) on under ``wanted`` (m/s2); all [n, N + 1]."""
+    for k in range(speed.shape[0]):
+        for i in range(speed.shape[1]):
+            if age[k, i] > 0.0:
+                speed[k, i], way[k, i], _ = solo(
+                    max(speed[k, i], 0.0), wanted[k, i], onset[k, i], limit[k, i], age[k, i]
+                )

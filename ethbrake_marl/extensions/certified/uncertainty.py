@@ -1,283 +1,174 @@
-"""Uncertainty: an interval around each uncertain quantity of a world, and the *members* that represent all worlds in
-these intervals.
+"""Uncertainty: an interval around each uncertain quantity of a world, and the *members* that stand for all worlds in it.
 
-The true value of a quantity with the reported value x lies in [x - h, x + h]. The half-width h is a number in the
-quantity's unit, or a share of x (such as 5 %). Impossible values are cut off from the interval of a quantity:
-latencies, speeds and gaps below 0, and speeds above the speed limit of the vehicle. The *box* of a world is the set of
-all combinations of values in the intervals around the world's quantities. The *members* of a world are the reported
-world and every corner of its box: 2^d corners for d uncertain numbers. In shield mode ``robust`` the bound on the harm
-is proven for the members (``docs/internals/proofs/shield-corners.md``).
+The true value of a quantity with the nominal value x lies in [x - h, x + h]. The half-width h is a number in the
+quantity's unit, or a share of x (such as 5 %). What is impossible is cut off: latencies, speeds and gaps below 0, and
+speeds above the vehicle's limit. The *box* of a world is the set of all combinations of values. Its *members* are the
+nominal world and every corner of the box: 2^d corners for d uncertain numbers.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.first_edition.physics.state import Floats, Vehicles, Worlds
-from ethbrake_marl.first_edition.scenario.fields import QUANTITY
-from ethbrake_marl.first_edition.shields.checks import is_amount
+from ethbrake_marl.motion.layout import BRAKING, DRIVING, GAP, LATENCY, LIMIT, OWN_LATENCY, SPEED, Floats
+from ethbrake_marl.worlds.rules import CAR_ROWS, RULES
 
-OF_VEHICLES = (  # fields of ``Vehicles``
-    "braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t", "brake_rate_mps3", "release_rate_mps3",
-)  # fmt: skip
-
-QUANTITIES = (*OF_VEHICLES, "speeds_mps", "gaps_m", "friction")
-
-POSITIVE = (
-    "braking_capacity_mps2",
-    "mass_t",
-    "friction",
-    "brake_rate_mps3",
-    "release_rate_mps3",
-)  # quantities that must stay above 0
-
-_OF_FRICTION = (
-    0.0,
-    0.125,
-    0.25,
-    0.375,
-    0.625,
-    0.75,
-    0.875,
-    1.0,
-)  # positions in the interval; 0.5 is the reported value
-
-MOST_CORNERS = 1024  # largest number of corners of one world; each takes as much time as the world itself
-
-UNCERTAINTY_EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
-
-_FORM = f"must be quantity=half-width, for instance {UNCERTAINTY_EXAMPLE}"
-
-_ENTRY = re.compile(
+OF_LINE = {"speeds_mps": SPEED, "gaps_m": GAP}
+OF_CAR = {key: row for key, row in CAR_ROWS.items() if key not in ("speed_limit_mps", "harm_weight")}
+QUANTITIES = (*OF_CAR, *OF_LINE)
+MOST_CORNERS = 1024  # of one world; each takes as much time as the world itself
+EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
+ENTRY = re.compile(
     r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?\s*=\s*(?P<width>[^=%\s]+)(?P<share>%?)", re.ASCII
 )
+NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
-_NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
+class Interval(NamedTuple):
+    """Interval around one quantity, of one vehicle or pair, or of all."""
 
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Interval around one reported quantity, for one vehicle or pair, or for all vehicles or pairs."""
-
-    quantity: str  # one of QUANTITIES
+    quantity: str
     half_width: float  # in the quantity's unit, or a share of its value below 1
-    relative: bool = False  # True: ``half_width`` is a share of the value
-    place: int | None = None  # index of the vehicle or pair from 0; None: all of them
-
-    def __post_init__(self) -> None:
-        if self.quantity not in QUANTITIES:
-            raise unknown_name("uncertain quantity", self.quantity, QUANTITIES)
-        most, right = (
-            (1.0, "a share from 0 to below 100 %") if self.relative else (np.inf, "a finite number, at least 0")
-        )
-        if not is_amount(self.half_width, most):
-            raise InvalidInput(
-                f"uncertainty: half-width of {self.quantity} = {self.half_width!r}: the half-width must be {right}"
-            )
-        if self.place is not None and not (isinstance(self.place, int | np.integer) and self.place >= 0):
-            raise InvalidInput(
-                f"uncertainty: {self.quantity}: place = {self.place!r}: must be an index of a vehicle or pair, from 0"
-            )
-        if self.quantity == "friction" and self.place is not None:
-            raise InvalidInput(
-                "uncertainty: friction is one number for the whole line; write friction=..., not friction.vehicle_..."
-            )
+    relative: bool = False  # the half-width is a share
+    number: int | None = None  # of the vehicle or pair; None: all of them
 
     def __str__(self) -> str:
-        kind = "pair" if self.quantity == "gaps_m" else "vehicle"
-        where = "" if self.place is None else f".{kind}_{self.place + 1}"
+        kind = RULES[self.quantity].per
+        where = "" if self.number is None else f".{kind}_{self.number}"
         width = f"{100.0 * self.half_width:g}%" if self.relative else f"{self.half_width:g}"
         return f"{self.quantity}{where}={width}"
 
 
-_Side = tuple[str, int, Floats, Floats]  # one uncertain number: quantity, index, smallest and largest value [n]
+class Side(NamedTuple):
+    """One uncertain number of n worlds: an edge of their boxes."""
+
+    key: str
+    body: int  # column in the arrays of a state
+    low: Floats  # [n]
+    high: Floats  # [n]
 
 
-@dataclass(frozen=True, slots=True)
-class Uncertainty:
-    """Intervals around the reported quantities of a world. ``parse_uncertainty`` makes an ``Uncertainty`` from a text.
+class Uncertainty(NamedTuple):
+    """Intervals around the nominal quantities of a world; ``parse_uncertainty`` makes it."""
 
-    Raises ``InvalidInput`` if there is no interval, or if two intervals cover the same quantity of a vehicle or pair.
-    """
-
-    intervals: tuple[Interval, ...]  # intervals of the uncertain quantities
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.intervals, tuple) or not all(isinstance(each, Interval) for each in self.intervals):
-            raise InvalidInput(f"uncertainty: intervals = {self.intervals!r}: must be a tuple of Interval objects")
-        if not self.intervals:
-            raise InvalidInput(f"uncertainty: no interval; must have at least one, for instance {UNCERTAINTY_EXAMPLE}")
-        for k, one in enumerate(self.intervals):
-            for other in self.intervals[:k]:
-                same = None in (one.place, other.place) or one.place == other.place
-                if one.quantity == other.quantity and same:
-                    raise InvalidInput(
-                        f"uncertainty: {other} and {one} are intervals of the same quantity; give only one"
-                    )
+    intervals: tuple[Interval, ...]
 
     def __str__(self) -> str:
         return ",".join(str(interval) for interval in self.intervals)
 
-    @property
-    def moves_together(self) -> bool:
-        """True if the friction is uncertain, so that one uncertain number changes several quantities.
+    def members(self, alert: State) -> State:
+        """Return the members of worlds at the alert, M rows for each world: itself, then the corners of its box.
 
-        The largest and smallest gaps and speeds may then occur in worlds that are not corners of the box.
+        Corners are in the order of binary numbers, with the first interval as the lowest bit (0: smallest value).
+        Raises ``InvalidInput`` where an interval does not fit the worlds, and for more than ``MOST_CORNERS`` corners.
         """
-        return any(each.quantity == "friction" and each.half_width > 0.0 for each in self.intervals)
-
-    def members(self, worlds: Worlds) -> Worlds:
-        """Return the members of worlds at the alert, [n * M]: each world followed by the corners of its box.
-
-        The corners are in the order of binary numbers, with the first interval as the lowest bit (0: smallest value, 1:
-        largest value). An interval of width 0 does not increase the number of corners. For friction, eight values
-        replace the two ends of the interval, because friction changes all capacities together and harm may rise or fall
-        with it. Raises ``InvalidInput`` if an interval names a vehicle that does not exist, if a capacity or mass may
-        be 0, or if there are more than ``MOST_CORNERS`` corners.
-        """
-        sides = self._sides(worlds)
-        ends = [_OF_FRICTION if name == "friction" else (0.0, 1.0) for name, *_ in reversed(sides)]
-        corners = math.prod(map(len, ends)) if sides else 0
-        if corners > MOST_CORNERS:
+        sides = self.sides(alert)
+        if 2 ** len(sides) > MOST_CORNERS:
             raise InvalidInput(
-                f"uncertainty: {len(sides)} intervals in each world make {corners} combinations of values (corners),"
-                f" but at most {MOST_CORNERS} are allowed; give intervals for fewer vehicles or pairs, as in"
-                f" {UNCERTAINTY_EXAMPLE}"
+                f"uncertainty: {len(sides)} intervals in each world make {2 ** len(sides)} combinations of values"
+                f" (corners), but at most {MOST_CORNERS} are allowed; give intervals for fewer vehicles or pairs, as in"
+                f" {EXAMPLE}"
             )
-        every = [shares[::-1] for shares in product(*ends)] if sides else []
-        parts = [worlds] + [_placed(worlds, sides, shares.__getitem__) for shares in every]
-        return self.interleaved(parts)
+        corners = product((0.0, 1.0), repeat=len(sides)) if sides else ()
+        shares = [np.tile(each[::-1], (alert.n, 1)) for each in corners]
+        whole = State.join([alert, *(placed(alert, sides, share) for share in shares)])
+        return whole.take(np.arange(whole.n).reshape(-1, alert.n).T.ravel())
 
-    @staticmethod
-    def interleaved(parts: list[Worlds]) -> Worlds:
-        """Merge M batches of n worlds each into one batch [n * M]: world 0 of every batch, then world 1 of every batch,
-        and so on.
-        """
-        order = np.arange(parts[0].n * len(parts)).reshape(len(parts), parts[0].n).T.ravel()
-        return Worlds.concatenate(parts).take(order)
+    def draw(self, alert: State, rng: np.random.Generator, *, corners: bool = False) -> State:
+        """Return one world of the box of each: uniformly from the whole box, or one of its corners."""
+        sides = self.sides(alert)
+        shares = rng.random((alert.n, len(sides)))
+        return placed(alert, sides, np.round(shares) if corners else shares)
 
-    def draw(self, worlds: Worlds, rng: np.random.Generator, *, corners: bool = False) -> Worlds:
-        """For each of ``worlds`` [n], draw one world from its box: one of the corners if ``corners`` is True, otherwise
-        uniformly from the whole box.
-        """
-        sides = self._sides(worlds)
-        shares = rng.random((len(sides), worlds.n))
-        if corners:
-            shares = np.round(shares)
-        return _placed(worlds, sides, lambda k: shares[k])
-
-    def _sides(self, worlds: Worlds) -> list[_Side]:
-        """Return the uncertain numbers of ``worlds``, each as (quantity, index of the vehicle or pair, smallest value
-        [n], largest value [n]).
-        """
-        sides: list[_Side] = []
+    def sides(self, alert: State) -> list[Side]:
+        """Return the uncertain numbers of worlds; an interval of width 0 has none."""
+        sides = []
         for interval in self.intervals:
-            every, name = _values(worlds, interval.quantity), interval.quantity
-            if interval.half_width == 0.0:
-                continue
-            if not np.isfinite(every).all():
-                raise InvalidInput(
-                    f"uncertainty: {interval}: some worlds have no value of {name}; declare {name} in the scenario"
-                )
-            if interval.place is not None and interval.place >= every.shape[1]:
-                raise InvalidInput(
-                    f"uncertainty: {interval}: there is no such {'pair' if name == 'gaps_m' else 'vehicle'}, because"
-                    f" the line has only {every.shape[1]}"
-                )
-            for place in range(every.shape[1]) if interval.place is None else (interval.place,):
-                values = every[:, place]
-                half = interval.half_width * values if interval.relative else np.full(worlds.n, interval.half_width)
+            key, rule, bodies = interval.quantity, RULES[interval.quantity], alert.vehicles
+            last = rule.count(bodies)
+            if interval.number is not None and interval.number > last:
+                raise InvalidInput(f"uncertainty: {interval}: there is no such {rule.per}, because the line has {last}")
+            for body in range(1, last + 1) if interval.number is None else (interval.number,):
+                values, of = values_of(alert, key)[:, body], f" of {rule.owner(body - 1)}"
+                half = interval.half_width * (values if interval.relative else 1.0)
                 low, high = values - half, values + half
-                if name in POSITIVE and not (low > 0.0).all():
-                    k = int(np.argmin(low))
+                if key == "speeds_mps":
+                    high = np.minimum(high, np.maximum(alert.car[:, LIMIT, body], values))
+                good = np.isfinite(values) & ((low > 0.0) | (not rule.positive)) & (high <= rule.high)
+                if not good.all():
+                    k = int(np.argmin(good))
+                    right = rule.interval if np.isfinite(values[k]) else f"finite: declare {key} in the scenario"
                     raise InvalidInput(
-                        f"uncertainty: {interval}: the value {values[k]:g}{_of(name, place)} in world {k} may"
-                        f" be as low as {low[k]:g}; must be above 0: use a smaller half-width"
+                        f"uncertainty: {interval}: the value {values[k]:g}{of} in world {k} may be from {low[k]:g} to"
+                        f" {high[k]:g}; must be {right}"
                     )
-                most = worlds.vehicles.speed_limit_mps[:, place] if name == "speeds_mps" else np.inf
-                high, rule = np.minimum(high, most), QUANTITY.declared[name]
-                if not (high <= rule.high).all():
-                    k = int(np.argmax(high))
-                    raise InvalidInput(
-                        f"uncertainty: {interval}: the value {values[k]:g}{_of(name, place)} in world {k} may"
-                        f" be as high as {high[k]:g}; must be {rule.interval}"
-                    )
-                sides.append((name, place, np.maximum(low, 0.0), high))
+                if interval.half_width > 0.0:
+                    sides.append(Side(key, body, low if rule.positive else np.maximum(low, 0.0), high))
         return sides
 
 
+def values_of(alert: State, key: str) -> Floats:
+    """Return the nominal values of a quantity, one column per body; column 0 and the last pair have no meaning."""
+    return alert.line[:, OF_LINE[key]] if key in OF_LINE else alert.car[:, OF_CAR[key]]
+
+
+def placed(alert: State, sides: list[Side], shares: Floats) -> State:
+    """Return worlds whose uncertain numbers are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
+
+    Who brakes fully does so with the new capacity. Without a V2X channel, who reacts later also learns all later.
+    Raises ``InvalidInput`` if a script's command is beyond a capacity.
+    """
+    line, car, know, wanted = alert.line.copy(), alert.car.copy(), alert.know.copy(), alert.wanted.copy()
+    for (key, body, low, high), at in zip(sides, shares.T, strict=True):
+        value = np.where(at == 0.0, low, np.where(at == 1.0, high, low + at * (high - low)))
+        (line if key in OF_LINE else car)[:, (OF_LINE | OF_CAR)[key], body] = value
+    full = alert.wanted == -alert.car[:, BRAKING]
+    wanted[full] = -car[:, BRAKING][full]
+    if (alert.know[:, 1:, 1:] == alert.car[:, LATENCY, 1:, np.newaxis]).all():
+        know[:, 1:, 1:], car[:, OWN_LATENCY] = car[:, LATENCY, 1:, np.newaxis], car[:, LATENCY]
+    beyond = (wanted < -car[:, BRAKING]) | (wanted > car[:, DRIVING])
+    if beyond[:, 1:].any():
+        k, body = np.argwhere(beyond[:, 1:])[0] + [0, 1]
+        raise InvalidInput(
+            f"uncertainty: vehicle_{body} of world {k} is to accelerate with {wanted[k, body]:g} m/s2, which may be"
+            " beyond its capacity; use smaller half-widths, or another script"
+        )
+    return alert._replace(line=line, car=car, know=know, wanted=wanted)
+
+
 def parse_uncertainty(text: str) -> Uncertainty:
-    """Make an ``Uncertainty`` from a text of entries ``quantity=half-width``, separated by commas, as in
-    ``UNCERTAINTY_EXAMPLE``.
+    """Return the uncertainty of entries ``quantity=half-width``, separated by commas or colons, as in ``EXAMPLE``.
 
-    A half-width is a number in the quantity's unit, or a percentage of the reported value. ``.vehicle_2`` or
-    ``.pair_1`` after the quantity limits the entry to one vehicle or pair. Blanks around an entry and around its ``=``
-    are ignored. Raises ``InvalidInput`` if ``text`` does not have this form.
+    A half-width is a number in the quantity's unit, or a percentage of the nominal value. ``.vehicle_2`` or ``.pair_1``
+    after the quantity limits the entry to one vehicle or pair. Raises ``InvalidInput`` for another text.
     """
-    entries = [entry.strip() for entry in text.split(",")]
-    if "" in entries:
-        raise InvalidInput(f"uncertainty: {text!r}: entry {entries.index('') + 1} is empty; {_FORM}")
-    intervals = []
-    for entry in entries:
-        match = _ENTRY.fullmatch(entry)
-        if match is None or _NUMBER.fullmatch(match["width"]) is None:
-            raise InvalidInput(f"uncertainty: {entry!r}: {_FORM}")
-        name, width = match["name"], float(match["width"])
-        if name in QUANTITIES and match["what"] not in (None, "pair" if name == "gaps_m" else "vehicle"):
-            raise InvalidInput(
-                f"uncertainty: {entry!r}: only gaps_m may name a pair, as in gaps_m.pair_1; other"
-                " quantities may name a vehicle, as in mass_t.vehicle_2"
-            )
-        place = None if match["number"] is None else int(match["number"]) - 1
-        intervals.append(Interval(name, width / 100.0 if match["share"] else width, bool(match["share"]), place))
+    form = f"must be quantity=half-width, for instance {EXAMPLE}"
+    if not isinstance(text, str):
+        raise InvalidInput(f"uncertainty = {text!r:.60}: must be a text, for instance {EXAMPLE!r}")
+    intervals: list[Interval] = []
+    for entry in (each.strip() for each in re.split("[,:]", text)):
+        match = ENTRY.fullmatch(entry)
+        if match is None or NUMBER.fullmatch(match["width"]) is None:
+            raise InvalidInput(f"uncertainty: {entry!r}: {form}")
+        name, width, share = match["name"], float(match["width"]), bool(match["share"])
+        if name not in QUANTITIES:
+            raise unknown_name("uncertain quantity", name, QUANTITIES)
+        if match["what"] not in (None, RULES[name].per):
+            right = "only gaps_m may name a pair; other quantities may name a vehicle, as in mass_t.vehicle_2"
+            raise InvalidInput(f"uncertainty: {entry!r}: {right}")
+        if not width < (100.0 if share else math.inf):
+            raise InvalidInput(f"uncertainty: {entry!r}: must be a finite number, or a share below 100 %")
+        number = None if match["number"] is None else int(match["number"])
+        new = Interval(name, width / 100.0 if share else width, share, number)
+        for other in intervals:
+            if other.quantity == name and (None in (number, other.number) or number == other.number):
+                raise InvalidInput(f"uncertainty: {other} and {new} are intervals of the same quantity; give only one")
+        intervals.append(new)
     return Uncertainty(tuple(intervals))
-
-
-def _values(worlds: Worlds, quantity: str) -> Floats:
-    """Return the reported values of ``quantity``, one of ``QUANTITIES``: [n, P] for gaps, [n, 1] for friction,
-    otherwise [n, N].
-
-    Capacities are those on a dry road.
-    """
-    if quantity.endswith("_rate_mps3"):
-        return np.asarray(getattr(worlds.vehicles, quantity), np.float64)
-    return QUANTITY.declared[quantity].of(worlds)
-
-
-def _of(quantity: str, place: int) -> str:
-    owner = QUANTITY.declared[quantity].owner(place)
-    return f" of {owner}" if owner else ""
-
-
-def _placed(worlds: Worlds, sides: list[_Side], share: Callable[[int], Floats | float]) -> Worlds:
-    """Return the reported worlds, changed so that each uncertain number has a given position in its interval.
-
-    Without a V2X channel, a changed latency changes both the time at which the vehicle reacts and the time at which a
-    message arrives. With a V2X channel, a changed latency changes only the time at which the vehicle reacts. An
-    uncertain friction limits the capacities of all vehicles together.
-
-    ``share`` maps the index of an uncertain number in ``sides`` to the position of this number in its interval; a
-    position is one number for all worlds, or [n]; 0 is the smallest value, 1 the largest.
-    """
-    changed: dict[str, Any] = {}
-    for k, (quantity, place, low, high) in enumerate(sides):
-        values = changed.setdefault(quantity, _values(worlds, quantity).copy())
-        at = np.broadcast_to(np.asarray(share(k), np.float64), low.shape)
-        values[:, place] = np.where(at == 0.0, low, np.where(at == 1.0, high, low + at * (high - low)))
-    if "latency_s" in changed and worlds.vehicles.is_known_at_once:
-        latency = changed["latency_s"]
-        changed |= {"own_latency_s": latency, "known_from_s": Vehicles.known_at_once(latency)}
-    friction = changed.pop("friction", worlds.friction[:, np.newaxis])[:, 0]
-    vehicles = replace(worlds.vehicles, **{name: v for name, v in changed.items() if hasattr(worlds.vehicles, name)})
-    placed = replace(worlds, vehicles=vehicles, **{name: v for name, v in changed.items() if hasattr(worlds, name)})
-    if not worlds.road.shape[1]:
-        return placed
-    return placed.on_road(friction, {name: v for name, v in changed.items() if name.endswith("capacity_mps2")})

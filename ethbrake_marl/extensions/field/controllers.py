@@ -1,76 +1,54 @@
 """Controllers from the literature: car-following models, the driver models of UN R157, emergency braking.
 
-A *law* is the formula of a controller. The formula computes a command from the motion of the vehicle itself and of the
-vehicle ahead. ``LAWS`` lists all laws with their parameters and sources.
+A *law* is the formula of a controller: it computes a command from the motion of the vehicle itself and of the vehicle
+ahead. ``LAWS`` lists all laws with their parameters and sources.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import NamedTuple
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agents.drive import MESSAGES
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.first_edition.agents.protocol import Source
-from ethbrake_marl.first_edition.agents.received import Received
-from ethbrake_marl.first_edition.agents.settings import AgentSettings
-from ethbrake_marl.first_edition.engine.scripts import Script
-from ethbrake_marl.first_edition.physics.messages import ACCELERATION, MEASURED, Messages, refuse_untold
-from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
+from ethbrake_marl.motion.layout import BRAKING, DRIVING, FAR_M, FORCE, GAP, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 
-_TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap
+TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap
+SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
 
-_SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
-
-
-class Parameters:
-    """Parameters of one law as attributes with the names in ``LAWS``, in SI units."""
-
-    def __init__(self, **values: float) -> None:
-        self.__dict__.update(values)
-
-    def __getattr__(self, name: str) -> float:
-        raise AttributeError(name)
+Parameters = SimpleNamespace  # parameters of one law, with the names in ``LAWS``, in SI units
 
 
 class Seen(NamedTuple):
-    """Motion of one vehicle in ``n`` worlds, and what it knows from sensors or messages about the vehicle ahead.
+    """Motion of one vehicle in n worlds, and what it knows of the vehicle ahead; for Vehicle 1, of the obstacle.
 
-    If information about the vehicle ahead is old, its motion is extrapolated to the present time with its last known
-    acceleration. Vehicle 1 treats an obstacle like a vehicle ahead. If nothing is ahead, or if the vehicle knows
-    nothing about the vehicle ahead, the gap is infinite.
+    If nothing is ahead, or nothing is known of it, the gap is infinite.
     """
 
-    gap_m: Floats  # [n] gap to the vehicle or obstacle ahead; infinite if nothing is ahead
+    gap_m: Floats  # [n] gap to the vehicle or obstacle ahead
     speed_mps: Floats  # [n] own speed
     front_mps: Floats  # [n] speed of the vehicle or obstacle ahead
-    front_mps2: Floats  # [n] present commanded acceleration of the vehicle ahead
-    own_mps2: Floats  # [n] own present commanded acceleration
+    front_mps2: Floats  # [n] acceleration in force of the vehicle ahead
+    own_mps2: Floats  # [n] own acceleration in force
     step_s: float  # time until the next decision (s)
 
     @classmethod
-    def of(cls, worlds: Worlds, vehicle: int, step_s: float) -> Seen:
-        """Return the present motion of ``vehicle``, and what it knows about the vehicle ahead.
-
-        ``step_s`` is the time between two decisions, s.
-        """
-        received, own, none = Received.by(worlds, vehicle), worlds.command_mps2[:, vehicle], np.zeros(worlds.n)
-        gap, front, force = received.obstacle_m, none, none
-        if vehicle:
-            k = vehicle - 1
-            age = worlds.time_s - received.at_s[:, k]
-            then, force = received.speed_mps[:, k], received.command_mps2[:, k]
-            brakes = force < 0.0
-            age = np.minimum(age, np.where(brakes, np.maximum(then, 0.0) / np.where(brakes, -force, 1.0), np.inf))
-            front = np.where(age > 0.0, np.maximum(then + force * age, 0.0), then)
-            known = received.known[:, k] & received.pieces[:, k, ACCELERATION]
-            gap = np.where(known, received.place_m[:, k] + 0.5 * (then + front) * age, np.inf)
-        return cls(np.maximum(gap, _TOUCHING_M), worlds.speeds_mps[:, vehicle], front, force, own, step_s)
+    def of(cls, state: State, body: int, step_s: float) -> Seen:
+        """Return what vehicle ``body`` knows, of a state as it believes it."""
+        line, ahead = state.line, body - 1
+        known = state.know[:, body, ahead] <= state.time_s if ahead else line[:, GAP, 0] < FAR_M
+        front, force = np.where(known, line[:, [SPEED, FORCE], ahead].T, 0.0)
+        gap = np.where(known, np.maximum(line[:, GAP, ahead], TOUCHING_M), np.inf)
+        return cls(gap, line[:, SPEED, body], front, force, line[:, FORCE, body], step_s)
 
     @property
     def closing_mps(self) -> Floats:
@@ -195,13 +173,12 @@ class Law:
     # Function that returns for each world whether there is a danger, [n] bool. None: the law acts from the start.
     notices: Callable[[Seen, Parameters], Bools] | None = None
     stays: bool = False  # whether the reaction continues after the danger is over
-    # Names of the parameters that may be 0; all other parameters must be above 0.
-    may_be_zero: frozenset[str] = field(default=frozenset({"T", "s0", "rho", "reaction", "perception", "release"}))
 
 
-_MOST = 0.774 * 9.81  # m/s2
+MAY_BE_ZERO = ("T", "s0", "rho", "reaction", "perception", "release")  # parameters; all others must be above 0
+MOST = 0.774 * 9.81  # m/s2
 
-_FREE = {"free": 2.0, "speed": 0.4, "v0": 33.3}  # speed control to v0 beyond the headway `free` (s)
+FREE = {"free": 2.0, "speed": 0.4, "v0": 33.3}  # speed control to v0 beyond the headway `free` (s)
 
 LAWS: dict[str, Law] = {
     "idm": Law(
@@ -210,11 +187,11 @@ LAWS: dict[str, Law] = {
     ),
     "acc": Law(
         "adaptive cruise control of PATH", "Milanes and Shladover 2014, doi:10.1016/j.trc.2014.09.001",
-        {"T": 1.1, "s0": 0.0, "gap": 0.23, "rate": 0.07, **_FREE}, _acc,
+        {"T": 1.1, "s0": 0.0, "gap": 0.23, "rate": 0.07, **FREE}, _acc,
     ),
     "cacc": Law(
         "cooperative adaptive cruise control of PATH", "the same, with the defaults of SUMO's CACC",
-        {"T": 1.0, "s0": 2.5, "gap": 0.45, "rate": 0.0125, **_FREE}, _cacc,
+        {"T": 1.0, "s0": 2.5, "gap": 0.45, "rate": 0.0125, **FREE}, _cacc,
     ),
     "rss": Law(
         "responsibility-sensitive safety", "Shalev-Shwartz, Shammah and Shashua 2017, arXiv 1708.06374",
@@ -222,13 +199,13 @@ LAWS: dict[str, Law] = {
     ),
     "r157_human": Law(
         "competent and careful human driver of UN R157", "UN R157, annex 3, and its performance model of the JRC",
-        {"perception": 0.4, "reaction": 0.75, "release": 0.4, "jerk": 12.65, "most": _MOST, "front": 5.0,
+        {"perception": 0.4, "reaction": 0.75, "release": 0.4, "jerk": 12.65, "most": MOST, "front": 5.0,
          "headway": 2.0, "ttc": 2.0}, _human, _human_notices, stays=True,
     ),
     "r157_fsm": Law(
         "fuzzy safety model of UN R157", "Mattas et al. 2022, doi:10.1016/j.aap.2022.106743",
         {"reaction": 0.75, "b_min": 4.0, "b_max": 6.0, "b_front": 7.0, "margin": 2.0, "margin_safe": 2.0,
-         "jerk": 12.65, "most": _MOST}, _fsm, _fsm_notices,
+         "jerk": 12.65, "most": MOST}, _fsm, _fsm_notices,
     ),
     "aeb": Law(
         "automatic emergency braking: full braking where time to collision or required deceleration pass a limit",
@@ -240,13 +217,9 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``.
 
-    The memory of the controller is the time at which it noticed a danger, [n] s: infinite if it has noticed no danger,
-    and NaN before the first decision.
-
-    The reaction time begins when the controller notices a danger. If there is a danger at the first decision, the
-    reaction time begins at the alert, so it overlaps with the latency. If ``law.stays`` is true (law ``r157_human``),
-    the controller keeps reacting after the danger is over. If ``law.stays`` is false (law ``r157_fsm``), the reaction
-    ends with the danger, and the next danger starts a new reaction time.
+    Its memory is the time at which it noticed a danger, [n] s: infinite if it has noticed none, and NaN before the first
+    decision. The reaction time begins then; if there is a danger at the first decision, it begins at the alert, so it
+    overlaps with the latency. It ends with the danger, and the next danger starts a new one, unless ``law.stays``.
 
     Args:
         name: name of the agent, such as ``idm:T=1.0``.
@@ -256,58 +229,57 @@ class Controller:
 
     """
 
-    knows = Source.MESSAGES  # the agent decides on received messages
+    knows = MESSAGES
+    needs_ahead = ("place", "speed", "acceleration")  # pieces of messages without which it does not drive
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
-        self.name, self.law, self.parameters, self.time_step_s = name, law, Parameters(**parameters), step_s
+        self.name, self.law, self.parameters, self.step_s = name, law, Parameters(**parameters), step_s
 
-    def begin(self, alert: Worlds, vehicle: int, scripts: Mapping[int, Script]) -> Floats:
-        """Return the memory before the first decision: an array [n] of NaN.
+    def check(self, game: Game, body: int) -> None:
+        """Raise ``InvalidInput`` if decisions come at another time step."""
+        step_s = game.rules.time_step_s
+        if not math.isclose(step_s, self.step_s):
+            raise InvalidInput(
+                f"agent {self.name!r} was made for decisions every {self.step_s:g} s, but scenario {game.name!r} has"
+                f" one every {step_s:g} s; make it with make_agent({self.name!r}, scenario={game.name!r})"
+            )
 
-        Raises ``InvalidInput`` if the law needs a quantity of the vehicle ahead that neither messages nor sensors
-        provide.
-        """
-        ahead = vehicle - 1
-        if vehicle and np.isinf(Messages.of(alert).seen_from_s(vehicle, ahead)).any():
-            refuse_untold(alert, [vehicle], f"agent {self.name!r}", MEASURED, [ahead])
+    def begin(self, alert: State, body: int) -> Floats:
+        """Return the memory before the first decision: an array [n] of NaN."""
         return np.full(alert.n, np.nan)
 
-    def act(self, worlds: Worlds, memory: Floats, vehicle: int) -> tuple[Floats, Floats]:
+    def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
         """Return the command, [n] m/s2, limited by the vehicle's capacities, and the new memory [n]."""
-        seen, p, vehicles = Seen.of(worlds, vehicle, self.time_step_s), self.parameters, worlds.vehicles
+        seen, p = Seen.of(state, body, self.step_s), self.parameters
         command = self.law.command(seen, p)
         if self.law.notices is not None:
-            now = np.where(np.isnan(memory), 0.0, worlds.time_s)
+            now = np.where(np.isnan(memory), 0.0, state.time_s)
             before = np.where(np.isnan(memory), np.inf, memory)
             gone = before if self.law.stays else np.inf
             memory = np.where(self.law.notices(seen, p), np.minimum(before, now), gone)
-            elapsed, perceiving = worlds.time_s - memory + _SAME_S, getattr(p, "perception", 0.0)
+            elapsed, perceiving = state.time_s - memory + SAME_S, getattr(p, "perception", 0.0)
             waiting = np.where(elapsed < perceiving, 0.0, np.minimum(seen.own_mps2, -getattr(p, "release", 0.0)))
             command = np.where(elapsed < perceiving + p.reaction, waiting, command)
-        least, most = -vehicles.braking_capacity_mps2[:, vehicle], vehicles.driving_capacity_mps2[:, vehicle]
-        return np.clip(command, least, most), memory
+        return np.clip(command, -state.car[:, BRAKING, body], state.car[:, DRIVING, body]), memory
 
 
-def make_controller(argument: str | None, settings: AgentSettings) -> Controller:
+def make_controller(argument: str | None, settings: Any) -> Controller:
     """Return the controller with the name ``settings.spec``, such as ``idm:T=1.0``.
 
-    ``argument`` are the values of parameters in this name, such as ``T=1.0`` or ``T=1.0:a=2``; None: default values.
-
-    Raises ``UnknownName`` for a parameter that the law does not have. Raises ``InvalidInput`` if a value is not a
-    number or is out of range, or if a parameter is repeated.
+    ``argument`` are values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``; None: default values. Raises
+    ``UnknownName`` for a parameter that the law does not have, and ``InvalidInput`` for a bad value.
     """
-    name = settings.spec.partition(":")[0]
-    law, where = LAWS[name], f"agent {settings.spec!r}"
+    law, where = LAWS[settings.spec.partition(":")[0]], f"agent {settings.spec!r}"
     parameters: dict[str, float] = {}
     for part in [] if argument is None else argument.split(":"):
         key, _, text = part.partition("=")
         if key not in law.parameters:
             raise unknown_name(f"{where}: parameter", key, law.parameters)
-        value = parse_numeral(text)
-        if value is None or not (0.0 < value < math.inf or (value == 0.0 and key in law.may_be_zero)):
-            least = "of 0 or more" if key in law.may_be_zero else "above 0"
+        value, zero = parse_numeral(text), key in MAY_BE_ZERO
+        if value is None or not (0.0 < value < math.inf or (value == 0.0 and zero)):
             raise InvalidInput(
-                f"{where}: {key} must be a finite number {least}, for instance {key}={law.parameters[key]:g}"
+                f"{where}: {key} must be a finite number {'of 0 or more' if zero else 'above 0'}, for instance"
+                f" {key}={law.parameters[key]:g}"
             )
         if key in parameters:
             raise InvalidInput(f"{where}: parameter {key} is given twice; give it once")
@@ -317,30 +289,18 @@ def make_controller(argument: str | None, settings: AgentSettings) -> Controller
         raise InvalidInput(
             f"{where}: b_min = {parameters['b_min']:g}: must be at most b_max, which is {parameters['b_max']:g}"
         )
-    return Controller(settings.spec, law, parameters, settings.time_step_s)
+    return Controller(settings.spec, law, parameters, 0.1 if settings.scenario is None else settings.scenario.time_step_s)
 
 
-IDM = Part(make_controller, form="idm[:T=1.5]", about="the intelligent driver model", knows=Source.MESSAGES)
+def _entry(form: str, about: str) -> Part:
+    return Part(make_controller, form=form, about=about, knows=MESSAGES)
 
-ACC = Part(make_controller, form="acc[:T=1.1]", about="adaptive cruise control of PATH", knows=Source.MESSAGES)
 
-CACC = Part(
-    make_controller, form="cacc[:T=1.0]", about="its cooperative one, at a shorter distance", knows=Source.MESSAGES
-)
-
-RSS = Part(make_controller, form="rss[:rho=1.0]", about="brakes within the safe distance of RSS", knows=Source.MESSAGES)
-
-R157_HUMAN = Part(
-    make_controller,
-    form="r157_human[:reaction=0.75]",
-    about="the careful and competent driver of UN R157",
-    knows=Source.MESSAGES,
-)
-
-R157_FSM = Part(
-    make_controller, form="r157_fsm[:reaction=0.75]", about="the fuzzy safety model of UN R157", knows=Source.MESSAGES
-)
-
-AEB = Part(make_controller, form="aeb[:ttc=1.5]", about="automatic emergency braking", knows=Source.MESSAGES)
-
-FIELD = ("idm", "acc", "cacc", "rss", "r157_human", "r157_fsm", "aeb")  # the agents of ``--agents field``
+IDM = _entry("idm[:T=1.5]", "the intelligent driver model")
+ACC = _entry("acc[:T=1.1]", "adaptive cruise control of PATH")
+CACC = _entry("cacc[:T=1.0]", "its cooperative one, at a shorter distance")
+RSS = _entry("rss[:rho=1.0]", "brakes within the safe distance of RSS")
+R157_HUMAN = _entry("r157_human[:reaction=0.75]", "the careful and competent driver of UN R157")
+R157_FSM = _entry("r157_fsm[:reaction=0.75]", "the fuzzy safety model of UN R157")
+AEB = _entry("aeb[:ttc=1.5]", "automatic emergency braking")
+FIELD = [*LAWS]  # the agents of ``--agents field``

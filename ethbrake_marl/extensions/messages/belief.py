@@ -120,12 +120,19 @@ def ages_s(state: State) -> Floats:
     return ages
 
 
-def require_pieces(state: State, observers: Sequence[int], who: str, needs: Sequence[str] = LOOK_AHEAD) -> None:
-    """Raise ``InvalidInput`` if messages lack a piece that ``who``, who drives ``observers``, needs of the others.
+def require_pieces(
+    state: State,
+    observers: Sequence[int],
+    who: str,
+    needs: Sequence[str] = LOOK_AHEAD,
+    senders: Sequence[int] | None = None,
+) -> None:
+    """Raise ``InvalidInput`` if messages lack a piece that ``who``, who drives ``observers``, needs of ``senders``.
 
-    One that drives several vehicles needs messages of them, too.
+    None: of all vehicles. One that drives several vehicles needs messages of them, too.
     """
-    for sender in range(1, state.vehicles + 1) if NAME in state.memories else ():
+    senders = range(1, state.vehicles + 1) if senders is None else senders
+    for sender in senders if NAME in state.memories else ():
         contents = state.memories[NAME].contents[:, sender]
         missing = [piece for piece in needs if not contents[:, PIECES.index(piece)].all()]
         if missing and tuple(observers) != (sender,):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.agents.drive import MESSAGES, SENSORS
+from ethbrake_marl.agents.policy_agent import LearnedAgent, PolicyAgent
 from ethbrake_marl.episode.features import GROUPS, Own, side_of
 from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.episode.observe import Observations, Plan, View
@@ -27,7 +31,7 @@ from ethbrake_marl.extensions.messages.links import (
     after_step,
     begun,
 )
-from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
 STOPS = [P_PLACE, P_SPEED, P_BRAKING, P_LATENCY]
 NEEDS = {  # feature of a neighbour -> pieces without which it reads 0
@@ -50,7 +54,7 @@ class GameWithMessages(Game):
     @classmethod
     def of(cls, game: Game) -> GameWithMessages:
         """Return the game with vehicles and scripts that believe what messages and sensors tell them."""
-        views = tuple(BelievedView(view) for view in game.views)
+        views = tuple(believed_view(view) for view in game.views)
         return cls(*game._replace(views=views, scripts={i: Believer(script) for i, script in game.scripts.items()}))
 
     def first_decision(self, alert: State) -> State:
@@ -64,6 +68,18 @@ class GameWithMessages(Game):
         """Return the state after one step, and what the step did. The memory of ``state`` is not reused."""
         after, step = super().follow(state, actions)
         return believed_after(state, after), step
+
+    def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
+        """Return agents that act on what their vehicles believe, except those that know the true state."""
+        return {body: believing(agent) for body, agent in drivers.items()}
+
+    def hides(self, alert: State, body: int) -> Bools:
+        """Return of whom vehicle ``body`` does not know everything at its first decision, [n, N + 1]."""
+        memory: Memory = alert.memories[NAME]
+        unseen = memory.seen_s[:, body] > alert.car[:, LATENCY, body, np.newaxis]
+        lacks = ~memory.contents[:, :, [P_BRAKING, P_LATENCY, P_MASS]].all(axis=2)
+        old = memory.is_periodic | ~memory.contents[:, :, [P_PLACE, P_SPEED, P_ACCELERATION]].all(axis=2)
+        return np.asarray(super().hides(alert, body) | lacks | (old & unseen))
 
     def own_infos(self, state: State) -> dict[str, Any]:
         """Return the infos of messages, and those of the shield.
@@ -87,6 +103,20 @@ def believed_after(before: State, after: State) -> State:
 
 def _remembering(state: State, memory: Memory) -> State:
     return state._replace(memories={**state.memories, NAME: memory})
+
+
+def believing(agent: Any) -> Any:
+    """Return an agent that sees what its vehicle believes, if it is one that knows sensors and messages."""
+    view = agent.policy.observation if isinstance(agent, LearnedAgent) else getattr(agent, "observation", None)
+    if isinstance(agent, LearnedAgent | PolicyAgent):
+        return replace(agent, observation=believed_view(view))
+    return Believer(agent) if getattr(agent, "knows", None) in (SENSORS, MESSAGES) else agent
+
+
+@cache
+def believed_view(view: View) -> BelievedView:
+    """Return the view of what the observer believes."""
+    return BelievedView(view)
 
 
 class BelievedView(View):
@@ -153,8 +183,19 @@ class Believer:
     def __init__(self, script: Script) -> None:
         self.script = script
 
+    @property
+    def name(self) -> str:
+        """Name of the script."""
+        return str(getattr(self.script, "name", type(self.script).__name__))
+
     def begin(self, alert: State, body: int) -> Any:
-        """Return the script's memory for new episodes."""
+        """Return the script's memory for new episodes. Raises ``InvalidInput`` if it will not know what it needs.
+
+        A script may have ``needs_ahead``: pieces of a message that it needs of the vehicle ahead, until it sees it.
+        """
+        needs = getattr(self.script, "needs_ahead", ())
+        if needs and body > 1 and np.isinf(alert.memories[NAME].seen_s[:, body, body - 1]).any():
+            require_pieces(alert, [body], f"agent {self.name!r}", needs, [body - 1])
         return self.script.begin(believed(alert, body), body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:

@@ -1,0 +1,247 @@
+"""Shields and E-V2X-BM in estimated lines (``estimated``): they use only what their vehicle has received.
+
+**Claim of the shield with corners**, ``robust:estimated``. Let B be its bound at the first decision. If the true world
+is one of the lines that are possible then, the harm of the episode is at most B, to the last bit, whatever is proposed
+and whatever messages are lost.
+
+**Proof.** Each line is played by the episode's own step with the actions that are applied, so the line that is the true
+world is the true episode, and it is never found impossible. The proof of the step shield holds in each line that
+remains; with fewer lines the price of the plan does not rise, and another plan is held only if it costs less. ∎
+
+Without corners, in the median line alone, nothing is promised. Between the corners the harm may be above the bound. The
+info ``trusted`` is false once no line is possible.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import Agent, Team
+from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.agents.pairwise import pairwise
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.episode.step import advance_worlds, failure
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines
+from ethbrake_marl.extensions.certified.robust import Members, MembersShield, apart, joined, opened
+from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints, scratch_for
+from ethbrake_marl.registry import Part
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield, Memory as EpisodeMemory
+from ethbrake_marl.shields.step import Memory, part
+from ethbrake_marl.worlds.scenario import Scenario
+
+KNOWS = "estimated model"
+
+
+class EstimatedShield(MembersShield):
+    """Shield of one learner that certifies actions in its estimated lines.
+
+    Args:
+        drivers: body -> agent, as for ``StepShield``.
+        scenario: of the worlds.
+        harm_count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
+        corners: certify also in the corners of the ranges, not only in the median line.
+
+    """
+
+    knows = KNOWS
+
+    def __init__(
+        self,
+        drivers: Mapping[int, Agent] | None = None,
+        *,
+        scenario: Scenario,
+        harm_count: str = "first",
+        corners: bool = False,
+    ) -> None:
+        super().__init__(drivers, harm_count=harm_count)
+        self.lines = lines_of_learner(scenario, corners)
+
+    def begin(self, game: Game, alert: State, state: State) -> Memory:
+        """Return the memory at the first decision ``state``."""
+        lines, possible, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
+        median = lines.take(slice(None, None, self.lines.alert.n))
+        memory = self.start(game, median, median, lines, self.agents_at(game, alert))
+        return memory._replace(members=Members(apart(lines, state.n), possible))
+
+    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
+        """Return the action to apply, [n, 1], and the new memory."""
+        memory: Memory = state.memories["shield"]
+        lines, possible, changed = self.lines.heard(state, joined(memory.members.states))
+        trusted = memory.members.trusted & (possible | state.ended)
+        rows = (changed & ~state.ended).nonzero()[0]
+        if len(rows):
+            memory = self.planned_again(game, memory, lines, rows)
+        memory = memory._replace(members=Members(apart(lines, state.n), trusted))
+        return super().decide(game, with_shield(state, memory), proposed, donate=donate)
+
+    def planned_again(self, game: Game, memory: Memory, lines: State, rows: Ints) -> Memory:
+        """Return the memory in which the worlds ``rows`` hold the cheapest of their plan and new first plans."""
+        here = part(lines, rows, self.lines.alert.n)
+        median, plan, price = here.take(slice(None, None, self.lines.alert.n)), memory.plan.copy(), memory.price.copy()
+        plans = [plan[rows], *self.plans(game, median, median, here)]
+        prices = np.stack([self.price(game, here, each) for each in plans])
+        plan[rows], price[rows] = np.stack(plans)[prices.argmin(axis=0), np.arange(len(rows))], prices.min(axis=0)
+        return memory._replace(plan=plan, price=price)
+
+
+class EstimatedEpisodeShield(EpisodeShield):
+    """Algorithm 1 in the median line: at the first decision, the policy or E-V2X-BM gets the whole episode.
+
+    Args:
+        drivers: body of the learner -> its policy.
+        scenario: of the worlds.
+        harm_count: harm that is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
+        bound: H*: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
+
+    """
+
+    knows = KNOWS
+
+    def __init__(
+        self,
+        drivers: Mapping[int, Agent] | None,
+        *,
+        scenario: Scenario,
+        harm_count: str = "first",
+        bound: str = "coupled",
+    ) -> None:
+        super().__init__(drivers, harm_count=harm_count, bound=bound)
+        self.lines = lines_of_learner(scenario, corners=False)
+
+    def begin(self, game: Game, alert: State, state: State) -> EpisodeMemory:
+        """Return the memory at the first decision ``state``."""
+        median, _, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
+        return super().begin(game, median, median)
+
+
+class Estimate(NamedTuple):
+    """What the agent remembers of n episodes."""
+
+    median: State  # line at the last decision
+    command: Floats  # [n] m/s2; NaN: none yet
+
+
+class EstimatedEV2XBM:
+    """E-V2X-BM in the median line, which chooses again when something is received that the line did not foretell.
+
+    Args:
+        scenario: of the worlds.
+        is_pairwise: by the paper's closed form, instead of the simulation of the line.
+        count: harm that is minimised, of the ``first`` impact of each pair or ``total``.
+
+    """
+
+    knows = KNOWS
+
+    def __init__(self, scenario: Scenario, is_pairwise: bool = False, count: str = "first") -> None:
+        self.scenario, self.is_pairwise, self.count = scenario, is_pairwise, count
+        self.name = f"e_v2x_bm{':pairwise' if is_pairwise else ''}:estimated"
+        self.lines: dict[int, Lines] = {}  # body -> its median line
+        if scenario.members:
+            Lines.of(scenario, 1, corners=False)  # refuses
+
+    def begin(self, alert: State, body: int) -> Estimate:
+        """Return the median line, and no command."""
+        if body not in self.lines:
+            self.lines[body] = Lines.of(self.scenario, body, corners=False)
+        median = self.lines[body].at_alert(alert, alert)._replace(memories={})
+        return Estimate(median, np.full(alert.n, np.nan))
+
+    def act(self, state: State, memory: Estimate, body: int) -> tuple[Floats, Estimate]:
+        """Return the commands of vehicle ``body``, [n] m/s2, and the new memory."""
+        wanted = memory.median.wanted.copy()
+        wanted[:, body] = state.wanted[:, body]
+        foretold = advanced(memory.median._replace(wanted=wanted), state.time_s.copy())
+        median, command = self.lines[body].overwritten(state, foretold), memory.command.copy()
+        rows = (differ(foretold, median) | np.isnan(command)).nonzero()[0]
+        if len(rows):
+            here = median.take(rows)
+            choice = pairwise(here, body) if self.is_pairwise else None
+            choice = choice or coupled(here, body, self.count, self.scenario.horizon_s)
+            command[rows] = -choice.deceleration_mps2
+        return command, Estimate(median, command)
+
+
+def differ(one: State, other: State) -> Bools:
+    """Return whether lines differ in speeds, gaps or vehicles, [n]. It does not matter since when a vehicle reacts."""
+    parts = []
+    for line in (one, other):
+        car = line.car[:, :, 1:].copy()
+        car[:, LATENCY] = np.maximum(car[:, LATENCY], line.time_s[:, np.newaxis])
+        parts.append((line.line[:, SPEED, 1:], line.line[:, GAP, :-1], car.reshape(line.n, -1)))
+    near = [np.isclose(mine, theirs, 0.0, SURPRISE).all(axis=1) for mine, theirs in zip(*parts, strict=True)]
+    return np.asarray(~np.all(near, axis=0))
+
+
+def lines_of_learner(scenario: Scenario, corners: bool) -> Lines:
+    """Return the lines of the only learner. Raises ``InvalidInput`` if there are several, or none."""
+    if len(scenario.learners) != 1:
+        raise InvalidInput(
+            f"shield: scenario {scenario.name!r} has {len(scenario.learners)} learners; an estimated shield needs"
+            " exactly one: make the environment with learners=['vehicle_2'], or use mode step"
+        )
+    return Lines.of(scenario, scenario.learners[0], corners=corners)
+
+
+def with_shield(state: State, memory: Memory) -> State:
+    """Return the state with another memory of the shield."""
+    return state._replace(memories={**state.memories, "shield": memory})
+
+
+def advanced(state: State, until_s: Floats) -> State:
+    """Return the line at ``until_s`` [n] if all hold their commands."""
+    line, clock = state.line.copy(), state.clock.copy()
+    failed = advance_worlds(line, state.car, state.time_s.copy(), until_s, state.wanted, scratch_for(line.shape[2]))
+    if failed >= 0:
+        raise failure(state, failed, state.time_s[failed], until_s[failed])
+    clock[:, TIME] = until_s
+    return state._replace(line=line, clock=clock)
+
+
+def make_step(team: Team, argument: str | None, settings: Any) -> Team:
+    """Return the team ``TEAM+step:estimated``."""
+    return with_lines(team, argument, settings, corners=False)
+
+
+def make_robust(team: Team, argument: str | None, settings: Any) -> Team:
+    """Return the team ``TEAM+robust:estimated``."""
+    return with_lines(team, argument, settings, corners=True)
+
+
+def with_lines(team: Team, argument: str | None, settings: Any, corners: bool) -> Team:
+    """Return a team with an estimated shield. Raises ``InvalidInput`` for an argument."""
+    if argument is not None:
+        raise InvalidInput(f"agent {settings.spec!r}: nothing but estimated can follow the colon")
+    scenario, count = settings.needed_scenario(), settings.harm_count
+    return team._replace(shield=EstimatedShield(team.drivers, scenario=scenario, harm_count=count, corners=corners))
+
+
+def make_episode(team: Team, argument: str | None, settings: Any) -> Team:
+    """Return the team ``TEAM+episode:estimated`` or ``TEAM+episode:pairwise:estimated``."""
+    scenario, count = settings.needed_scenario(), settings.harm_count
+    shield = EstimatedEpisodeShield(team.drivers, scenario=scenario, harm_count=count, bound=argument or "coupled")
+    return team._replace(shield=shield)
+
+
+def make_e_v2x_bm(argument: str | None, settings: Any) -> EstimatedEV2XBM:
+    """Return the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``."""
+    if argument not in (None, "pairwise"):
+        raise InvalidInput(f"agent {settings.spec!r}: must be e_v2x_bm:estimated or e_v2x_bm:pairwise:estimated")
+    return EstimatedEV2XBM(settings.needed_scenario(), argument == "pairwise", settings.harm_count)
+
+
+def _entry(make: Any, form: str, about: str) -> Part:
+    return Part(make, form=form, about=about, knows=KNOWS)
+
+
+STEP = _entry(make_step, "step:estimated", "certified in the median line that its vehicle estimates")
+CORNERS = _entry(make_robust, "robust:estimated", "also in the corners of the ranges of what was not received")
+EPISODE = _entry(make_episode, "episode[:pairwise]:estimated", "the paper's hybrid in the line that its vehicle estimates")
+E_V2X_BM = _entry(
+    make_e_v2x_bm, "e_v2x_bm[:pairwise]:estimated", "computed from received information and the scenario's ranges"
+)

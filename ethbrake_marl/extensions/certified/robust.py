@@ -1,0 +1,162 @@
+"""The robust shield: its bound holds in the nominal world and in every corner of its box of possible worlds.
+
+It is the step shield with one change: the price of a plan is the largest harm over all members of a world
+(``uncertainty``). The members are played beside the episode, with the actions that are applied, by the episode's own
+step; so the proof of the step shield holds in each of them. It does not hold between the corners
+(docs/internals/proofs/shield-corners.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import MODEL, Agent, Team
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.state import State, mapped, take
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.certified.uncertainty import EXAMPLE, parse_uncertainty
+from ethbrake_marl.motion.layout import BRAKING, COUNT, GAP, SPEED, Bools, Floats
+from ethbrake_marl.registry import Part
+from ethbrake_marl.shields.fallbacks import held
+from ethbrake_marl.shields.step import Memory, StepShield
+
+SHARES = np.linspace(0.0, -1.0, 101)  # constant actions that are tried at the alert for the worst member
+INSIDE = 1e-9  # by which a gap (m) or speed (m/s) may lie outside the range of the members
+
+
+class Members(NamedTuple):
+    """The states that n worlds may be in."""
+
+    states: State  # arrays [n, M, ...], the nominal state first
+    trusted: Bools  # [n] whether everything that was observed was possible
+
+
+class MembersShield(StepShield):
+    """A step shield for worlds that may be in one of M states."""
+
+    def seen(self, state: State, memory: Memory) -> State:
+        """Return the members, M rows for each world, with the memories of the shield's agents."""
+        states = joined(memory.members.states)
+        rows = np.arange(state.n).repeat(states.n // state.n)
+        own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
+        return states._replace(memories={**states.memories, **own})
+
+    def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
+        """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2, or above ``most``."""
+        M = states.n // len(plans)
+        each = np.broadcast_to(most, len(plans)).repeat(M)
+        return super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1)
+
+    def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
+        """Return the plans of the step shield for the nominal state, and the best constant one in the worst state."""
+        learners, n = game.rules.learners, state.n
+        actions = np.repeat(SHARES[:, np.newaxis], len(learners), axis=1)
+        commands = actions * states.car[:, np.newaxis, BRAKING, learners]
+        harm = hold(states, states.wanted, learners.tolist(), commands, game.rules.horizon_s, self.count)[0]
+        best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
+        return [*super().plans(game, alert, state, states), held(game, actions[best])]
+
+    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
+        """Return the actions to apply, [n, L], and the new memory, whose members have made the step."""
+        applied, memory = super().decide(game, state, proposed, donate=donate)
+        states = joined(memory.members.states)
+        after, _ = game.follow(states, applied.repeat(states.n // state.n, axis=0))
+        return applied, memory._replace(members=memory.members._replace(states=apart(after, state.n)))
+
+    def infos(self, game: Game, state: State) -> dict[str, Any]:
+        """Return what users may want to know: name -> [n] or [n, N]."""
+        return {**super().infos(game, state), "trusted": state.memories["shield"].members.trusted}
+
+
+class RobustShield(MembersShield):
+    """Shield whose bound holds in the nominal world and in every corner of its box, not between them.
+
+    Its info ``trusted`` is false once a gap or speed was seen, before any impact, that no world in the box has.
+
+    Args:
+        drivers: body -> agent, as for ``StepShield``.
+        uncertainty: intervals around the nominal quantities, such as ``gaps_m=0.5,mass_t=10%``.
+        harm_count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
+        allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
+
+    """
+
+    knows = MODEL
+
+    def __init__(
+        self,
+        drivers: Mapping[int, Agent] | None = None,
+        *,
+        uncertainty: str,
+        harm_count: str = "first",
+        allowance: float = 0.0,
+    ) -> None:
+        super().__init__(drivers, harm_count=harm_count, allowance=allowance)
+        self.uncertainty = parse_uncertainty(uncertainty)
+
+    def begin(self, game: Game, alert: State, state: State) -> Memory:
+        """Return the memory at the first decision. Raises ``InvalidInput`` where the intervals do not fit."""
+        states = opened(game, self.uncertainty.members(alert))
+        if (states.time_s >= game.rules.horizon_s).any():
+            raise InvalidInput(
+                f"uncertainty: {self.uncertainty}: the first decision may be as late as {states.time_s.max():g} s; must"
+                f" be before the horizon, {game.rules.horizon_s:g} s"
+            )
+        memory = self.start(game, alert, state, states, self.agents_at(game, alert))
+        return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
+
+    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
+        """Return the actions to apply, [n, L], and the new memory."""
+        members: Members = state.memories["shield"].members
+        trusted = members.trusted & may_be_in(state, members.states)
+        applied, memory = super().decide(game, state, proposed, donate=donate)
+        return applied, memory._replace(members=memory.members._replace(trusted=trusted))
+
+
+def opened(game: Game, alerts: State) -> State:
+    """Return worlds at their first decision."""
+    return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).begin(alerts)
+
+
+def apart(states: State, n: int) -> State:
+    """Return states, M rows for each of n worlds, as arrays [n, M, ...], which have one row per world."""
+    return mapped(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
+
+
+def joined(states: State) -> State:
+    """Return states with arrays [n, M, ...] as M rows for each world."""
+    return mapped(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
+
+
+def may_be_in(state: State, members: State) -> Bools:
+    """Return whether gaps and speeds lie in the range of the members, [n]; True once anybody has had an impact.
+
+    Before any impact, gaps and speeds are monotone in each quantity, so every world in the box lies in this range.
+    """
+    struck = state.line[:, COUNT].any(axis=1) | members.line[:, :, COUNT].any(axis=(1, 2))
+    inside = np.ones(state.n, np.bool_)
+    for row, columns in ((SPEED, slice(1, None)), (GAP, slice(1, -1))):
+        now, ends = state.line[:, row, columns], members.line[:, :, row, columns]
+        low, high = ends.min(axis=1) - INSIDE, ends.max(axis=1) + INSIDE
+        inside &= ((low <= now) & (now <= high)).all(axis=1)
+    return inside | struck
+
+
+def make_robust(team: Team, argument: str | None, settings: Any) -> Team:
+    """Return the team ``TEAM+robust:INTERVALS``."""
+    if argument is None:
+        example = EXAMPLE.replace(",", ":")
+        raise InvalidInput(f"agent {settings.spec!r}: needs intervals, for instance {settings.spec}:{example}")
+    return team._replace(shield=RobustShield(team.drivers, uncertainty=argument, harm_count=settings.harm_count))
+
+
+ROBUST = Part(
+    make_robust,
+    form="robust:INTERVALS",
+    about="as +step for uncertain quantities, in the corners of their intervals, such as +robust:gaps_m=0.5:mass_t=10%",
+    knows=MODEL,
+)
