@@ -23,10 +23,10 @@ from typing import NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds
+from ethbrake_marl.extensions.messages.declared import USUAL
 from ethbrake_marl.files.sheet import Column
-from ethbrake_marl.first_edition.evaluation.seeds import mean_over_seeds
-from ethbrake_marl.first_edition.physics.messages import USUAL_PIECES
-from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.motion.layout import Floats
 
 LINES = {  # line of vehicles -> scenario, channel
     "`paper-random`": ("paper-random", {"preset": "paper"}),
@@ -35,9 +35,9 @@ LINES = {  # line of vehicles -> scenario, channel
 }
 ALL = "the usual pieces"
 CONTENTS: dict[str, tuple[str, ...]] = {
-    ALL: USUAL_PIECES,
-    **{f"without {one.replace('_', ' ')}": tuple(each for each in USUAL_PIECES if each != one) for one in USUAL_PIECES},
-    "with intent": (*USUAL_PIECES, "intent"),
+    ALL: USUAL,
+    **{f"without {one.replace('_', ' ')}": tuple(each for each in USUAL if each != one) for one in USUAL},
+    "with intent": (*USUAL, "intent"),
     "the alert alone": (),
 }
 SEEN = ["own", "front_1", "rear_1", "role", "front_1.intent", "rear_1.intent"]
@@ -78,8 +78,8 @@ def harms(runs: Path, line: str, contents: str, effort: Effort) -> Floats:
     scenario = scenario_of(line, contents)
     folders = [learn(runs, line, contents, effort.steps, seed) for seed in range(effort.seeds)]
     agents = {folder.name: eb.LearnedAgent(eb.load_policy(folder / "policy-last")) for folder in folders}
-    result = eb.evaluate(scenario.sample(effort.worlds, SEED), agents, scenario=scenario, seed=SEED, aftermath=False)
-    return np.stack([result.outcome(name).ledger.world_harm("total") for name in agents])
+    result = eb.evaluate(scenario, agents, episodes=effort.worlds, seed=SEED)
+    return np.stack([result[name]["total_harm"] for name in agents])
 
 
 def table(runs: Path, effort: Effort) -> list[list[str]]:

@@ -34,11 +34,12 @@ from morl_baselines.multi_policy.capql.capql import CAPQL
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.studies.machine import this_machine
-from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
+from ethbrake_marl.names import team_of
 
 SCENARIO, WORLDS, SEED, PARTS = "paper-random", 2000, 990201, 5
 WEIGHTS = [(i / PARTS, j / PARTS, (PARTS - i - j) / PARTS) for i in range(PARTS + 1) for j in range(PARTS + 1 - i)]
 ROOF = 20.0  # m2/s2, above each vehicle's harm in every point
+COUNTS = ("first", "total")
 PACKAGES = ("morl-baselines", "mo-gymnasium", "gymnasium", "torch", "numpy", "ethbrake-marl")
 
 
@@ -81,10 +82,12 @@ def measure(agent: CAPQL, scenario: eb.Scenario) -> dict[str, Any]:
         return eb.policy_agent(lambda seen: agent.eval(seen, np.tile(weight, (len(seen), 1))), clip=True)
 
     agents = {"full": eb.make_agent("full_brake"), **{str(weight): driver(weight) for weight in WEIGHTS}}
-    result = eb.evaluate(scenario.sample(WORLDS, SEED), agents, scenario=scenario)
+    teams = {name: team_of(agent, scenario) for name, agent in agents.items()}
+    worlds, game = scenario.sample(WORLDS, SEED), eb.open_game(scenario)[1]
+    last = [eb.drive(game, worlds, team) for team in teams.values()]
     numbers: dict[str, Any] = {}
-    for count in HARM_COUNTS:
-        full, *points = (result.outcome(name).vehicle_harm(count).mean(axis=0).round(4) for name in agents)
+    for count in COUNTS:
+        full, *points = (state.borne_harm(count).mean(axis=0).round(4) for state in last)
         numbers[count] = {
             "full_braking": full.tolist(),
             "hypervolume": float(hypervolume(-full, [-point for point in points])),
@@ -104,7 +107,7 @@ def main(words: list[str]) -> int:
     given = parser.parse_args(words)
     torch.set_num_threads(1)
     scenario = eb.load_scenario(SCENARIO)
-    eb.evaluate(scenario.sample(10, SEED), {"coast": eb.make_agent("coast")}, scenario=scenario)  # compiles the physics
+    eb.evaluate(scenario, "coast", episodes=10)  # compiles the physics
     numbers: dict[str, Any] = {
         "algorithm": "CAPQL",
         "scenario": SCENARIO,
@@ -121,7 +124,7 @@ def main(words: list[str]) -> int:
         found = measure(agent, scenario)
         numbers["trainings"].append({"seed": seed, "cpu_seconds": round(seconds, 1), "steps": steps, **found})
         given.output.write_text(json.dumps(numbers) + "\n", "utf-8")
-        print(seed, steps, {count: found[count]["hypervolume_below_roof"] for count in HARM_COUNTS}, flush=True)
+        print(seed, steps, {count: found[count]["hypervolume_below_roof"] for count in COUNTS}, flush=True)
     return 0
 
 
