@@ -57,8 +57,12 @@ def drive(scenario: eb.Scenario, n: int, lines: Mapping[str, dict[str, str]]) ->
 
     ``lines``: name of a channel -> settings of ``v2x``.
     """
+    eb.register_measure("first_bound", first_bound, unit="m2/s2")
     agents = list(dict.fromkeys((*ALONE, *LIMITS, *LIMITS.values())))
-    return {name: eb.evaluate(scenario.replace(v2x=v2x), agents, episodes=n, seed=SEED) for name, v2x in lines.items()}
+    return {
+        name: eb.evaluate(scenario.replace(v2x=v2x), agents, episodes=n, seed=SEED, measures="first_bound")
+        for name, v2x in lines.items()
+    }
 
 
 def price(over: eb.Result, agent: str, count: str) -> Estimate:
