@@ -26,22 +26,11 @@ DRAWN = {"standard_normal", "normal", "lognormal", "exponential", "gamma", "beta
 
 SQUARES = "squares of arrays, which numpy multiplies, or powers of whole numbers"
 TRAINED = "training: torch's own sums differ by machine, too"
-PRINTED = "drawn or printed, with few digits"
 REMAINS = {
-    ("first_edition/envs/trace.py", "**"): SQUARES,
-    ("first_edition/envs/rendering.py", "math.cos"): PRINTED,
-    ("first_edition/envs/rendering.py", "math.sin"): PRINTED,
-    ("first_edition/evaluation/seeds.py", "scipy.stats"): "resampling and sorting: sums and products alone",
-    ("first_edition/evaluation/statistics.py", "**"): SQUARES,
-    (
-        "first_edition/evaluation/statistics.py",
-        "scipy.special",
-    ): "quantiles for the ends of an interval; the last bit of the t quantile"
-    " differs for 1 in 1,000 counts where the processor has no FMA. Means and errors are exact sums",
-    ("first_edition/training/recipe.py", "math.cos"): TRAINED,
     ("evaluation/statistics.py", "**"): SQUARES,
     ("evaluation/statistics.py", "math.cbrt"): "ends of an interval for few recordings",
-    ("evaluation/statistics.py", "scipy.special"): "quantiles for the ends of an interval, as in the first edition",
+    ("evaluation/statistics.py", "scipy.special"): "quantiles for the ends of an interval; the last bit of the t"
+    " quantile differs for 1 in 1,000 counts where the processor has no FMA. Means and errors are exact sums",
     ("training/recipe.py", "math.cos"): TRAINED,
 }
 
@@ -81,7 +70,7 @@ def calls_in(folder: Path) -> set[tuple[str, str]]:
     """(file, what it calls) below a folder, but those of extensions."""
     found = set()
     for path in sorted(folder.rglob("*.py")):
-        if PACKAGE / "extensions" not in (path.parents if folder == PACKAGE else ()):
+        if not {PACKAGE / "extensions", PACKAGE / "first_edition"} & {*(path.parents if folder == PACKAGE else ())}:
             for node in ast.walk(tree_of(path)):
                 found |= {(path.relative_to(folder).as_posix(), name) for name in called(node)}
     return found

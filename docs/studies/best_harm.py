@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ethbrake_marl.extensions.search.regret import Between
+from ethbrake_marl.extensions.search.shipped import shipped_tables
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.search.best_harm import fold_episodes, search_list, task_problem
 from ethbrake_marl.extensions.search.limits import Unproven, prove, unproven_because
-from ethbrake_marl.extensions.search.regret import Between
-from ethbrake_marl.extensions.search.shipped import shipped_tables
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target

@@ -14,7 +14,7 @@ from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, flow_text, parse_yaml
-from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.worlds.scenario import Scenario
 
 
 def test_plain_file__is_read_up_to_the_limit(tmp_path: Path) -> None:

@@ -45,12 +45,12 @@ PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # that the light kinds of --ci look 
 # Each interface, the physics with its golden worlds, and what touches most of the packages.
 TESTS = (
     "contract",
-    "first_edition/envs",
-    "first_edition/physics",
+    "faces",
+    "motion",
     "golden",
-    "first_edition/scenario",
-    "first_edition/agents",
-    "first_edition/evaluation",
+    "worlds",
+    "agents",
+    "evaluation",
     "files",
     "extensions/report",
     "cli",

@@ -14,7 +14,7 @@ from ethbrake_marl.first_edition.engine.profiles import profile_problem
 from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
 from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
 from tests.first_edition.shield.test_step_shield import Remembering
-from tests.fixtures.asked import Asked
+from tests.first_edition.rest.fixture_asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(80, 3).worlds

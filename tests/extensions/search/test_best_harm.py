@@ -41,8 +41,8 @@ from ethbrake_marl.first_edition.scenario.catalogue import group_of_scenarios, l
 from ethbrake_marl.first_edition.scenario.schema import Scenario
 from ethbrake_marl.first_edition.scenario.task import Task
 from tests.docs.site import load
-from tests.failing_worlds import planted_list, without
-from tests.fixtures.lines import line
+from tests.first_edition.rest.failing_worlds import planted_list, without
+from tests.first_edition.rest.fixture_lines import line
 from tests.programmes.hostile import tables
 
 BUDGET = 800

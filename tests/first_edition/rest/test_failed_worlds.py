@@ -14,7 +14,7 @@ from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 from ethbrake_marl.first_edition.shields.certify import Backup, certify
 from ethbrake_marl.first_edition.shields.running import begin_running
 from ethbrake_marl.first_edition.shields.step import StepShield
-from tests.failing_worlds import planted_list
+from tests.first_edition.rest.failing_worlds import planted_list
 
 PAPER = load_scenario("paper-random")
 N, PLANTED = 9, [2, 6]
