@@ -50,11 +50,12 @@ TABLES: dict[str, tuple[str, ...]] = {
 PICTURES: dict[str, tuple[str, ...]] = {
     "emergency.png": ("ethbrake watch --agents full_brake,universal --output emergency.png",),
     "deceleration.png": (
-        'python -c "import ethbrake_marl as eb; from ethbrake_marl.first_edition.scenario import Task;'
-        " from ethbrake_marl.extensions.report import deceleration_curve, deceleration_figure, write_picture;"
+        'python -c "import ethbrake_marl as eb;'
+        " from ethbrake_marl.extensions.report.deceleration import deceleration_figure;"
+        " from ethbrake_marl.extensions.report.style import write_picture;"
         " scenario = eb.load_scenario('paper-random');"
-        " curve = deceleration_curve(scenario.sample(1, 7, first=5).worlds, Task(scenario, scenario.learners));"
-        " figure = deceleration_figure(curve, title='paper-random, world 5 of the list of seed 7');"
+        " title = 'paper-random, world 5 of the list of seed 7';"
+        " figure = deceleration_figure(scenario.sample(1, 7, first=5), scenario, title=title);"
         " write_picture('deceleration.png', figure)\"",
     ),
     **{

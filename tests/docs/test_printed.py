@@ -7,14 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 import ethbrake_marl as eb
+from ethbrake_marl.agents.pairwise import CANDIDATES, find_candidates, pairwise, predicted_harm
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise, pairwise_harm
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.scenario.tables import worlds_from_table
+from ethbrake_marl.motion.layout import BRAKING, LATENCY
 from ethbrake_marl.training.recipe_file import new_recipe_text
 from ethbrake_marl.worlds.explain import new_scenario_text
 from tests.docs.printed import BLOCK, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
@@ -46,14 +46,15 @@ def test_table_of_shipped_lists__is_printed_by_its_command(capsys: pytest.Captur
 def test_reference_values__are_those_of_the_closed_form() -> None:
     for world, *ends in rows("results/baselines", "## Values of the closed form")[1:]:
         gaps, speeds, latency = ([float(word) for word in part.split(",")] for part in world.split(";"))
-        scenario = load_scenario("paper-random").replace(latency_s=[0.0, *latency])
+        scenario = eb.load_scenario("paper-random").replace(latency_s=[0.0, *latency])
         start = {f"gap_{k}_m": [gap] for k, gap in enumerate(gaps, 1)}
         start |= {f"speed_{k}_mps": [speed] for k, speed in enumerate(speeds, 1)}
-        worlds = worlds_from_table(scenario, start)
-        found = optimise_pairwise(worlds, 1)
-        told = [found.spares_front_mps2, found.spares_rear_mps2, found.deceleration_mps2, found.harm]
-        told.append(pairwise_harm(worlds, [6, 7, 6]).sum(axis=1))
-        assert missing_figures(" ".join(ends), " ".join(repr(float(each[0])) for each in told)) == [], world
+        alert, at = eb.worlds_from_table(scenario, start), np.empty(CANDIDATES)
+        line, car = alert.line[0], alert.car[0]
+        find_candidates(line, car[BRAKING], car[LATENCY], 2, at)  # the ends of the interval are among them
+        best, full = pairwise(alert, 2), predicted_harm(line, car[BRAKING], car[LATENCY], 2, car[BRAKING, 2])
+        told = [*at.tolist(), float(best.deceleration_mps2[0]), float(best.harm[0]), float(full)]
+        assert missing_figures(" ".join(ends), " ".join(map(repr, told))) == [], world
 
 
 @pytest.mark.parametrize(
