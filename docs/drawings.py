@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.rendering.picture import COLOURS, vehicle_colour
 from ethbrake_marl.extensions.report.style import DASHES, GREY, add_caption, new_figure, style_axes, write_picture
-from ethbrake_marl.first_edition.envs.rendering import COLOURS, vehicle_colour
-from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 FOLDER = Path(__file__).parent / "figures"
 SEED = 7
@@ -33,13 +32,14 @@ CASES = {  # gap (m), closing speed (m/s), closing acceleration (m/s2), how the 
 
 def draw_timeline(agent: str = "full_brake") -> Figure:
     """What each vehicle does in world 0 of paper-random, its impacts, and its speed."""
-    scenario = eb.load_scenario("paper-random")
-    record = eb.record_episode(scenario.sample(1, SEED).worlds, eb.make_agent(agent), scenario=scenario)
+    scenario, game = eb.open_game("paper-random")
+    worlds, team = scenario.sample(1, SEED), eb.Team.of({"vehicle_2": eb.make_agent(agent)}, agent)
+    record = eb.record_episode(worlds, team, game)
     figure = new_figure(8.0, 4.6)
     lanes, speeds = figure.subplots(2, 1, sharex=True, height_ratios=(1.0, 1.2))
     names: set[str] = set()
     for i in range(record.speeds_mps.shape[1]):
-        latency = float(record.initial.vehicles.latency_s[0, i])
+        latency = float(worlds.latency_s[0, i])
         for start, end, phase in phases(record.time_s, record.speeds_mps[:, i], record.command_mps2[:, i], latency):
             label = "_" + phase if phase in names else phase
             names.add(phase)
@@ -47,14 +47,14 @@ def draw_timeline(agent: str = "full_brake") -> Figure:
         speeds.plot(
             record.time_s,
             record.speeds_mps[:, i],
-            color=vehicle_colour(i),
+            color=vehicle_colour(i + 1),
             linestyle=DASHES[i],
             label=f"Vehicle {i + 1}",
         )
     rows = record.impacts
     for time, pair, closing in zip(rows.time_s, rows.pair, rows.closing_speed_mps, strict=True):
-        lanes.plot([time, time], [pair, pair + 1], color="black", linewidth=1.4, marker="X", markersize=8)
-        lanes.annotate(f" impact, {closing:.1f} m/s", (time, pair + 0.5), fontsize=9, va="center")
+        lanes.plot([time, time], [pair - 1, pair], color="black", linewidth=1.4, marker="X", markersize=8)
+        lanes.annotate(f" impact, {closing:.1f} m/s", (time, pair - 0.5), fontsize=9, va="center")
     for axes in (lanes, speeds):
         style_axes(axes)
     lanes.set_yticks(range(record.speeds_mps.shape[1]), [f"Vehicle {k + 1}" for k in range(record.speeds_mps.shape[1])])
@@ -125,14 +125,14 @@ def draw_knowledge() -> Figure:
     return figure
 
 
-def _knowledge(axes: Axes, scenario: Scenario) -> None:
-    known = scenario.sample(1, SEED).worlds.vehicles.known_from_s[0]
+def _knowledge(axes: Axes, scenario: eb.Scenario) -> None:
+    known = scenario.sample(1, SEED).know[0, 1:, 1:]
     labels = []
     for i in range(len(known)):
         for j in (k for k in range(len(known)) if k != i):
             row = len(labels)
             labels.append(f"{i + 1} knows of {j + 1}")
-            axes.barh(row, 9.0, left=known[i, j], height=0.6, color=vehicle_colour(j))
+            axes.barh(row, 9.0, left=known[i, j], height=0.6, color=vehicle_colour(j + 1))
             axes.annotate(
                 f"{known[i, j]:.2f} s ", (known[i, j], row), fontsize=8.5, va="center",
                 ha="right" if known[i, j] > 0.2 else "left", color="black" if known[i, j] > 0.2 else "white",

@@ -14,60 +14,60 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+import ethbrake_marl as eb
+from ethbrake_marl.evaluation.evaluate import known_by
+from ethbrake_marl.evaluation.statistics import difference
 from ethbrake_marl.extensions.studies.machine import this_machine
-from ethbrake_marl.first_edition.agents.protocol import Driver
-from ethbrake_marl.first_edition.evaluation.lineup import make_lineup
-from ethbrake_marl.first_edition.evaluation.outcome import Outcome
-from ethbrake_marl.first_edition.evaluation.rollout import evaluate
-from ethbrake_marl.first_edition.evaluation.statistics import paired_difference
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.scenario.sample import Sample
-from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.names import make_teams
 
 AGENTS = (
     "ppo+search", "ppo", "universal", "full_brake+search", "e_v2x_bm",
     *(f"best_harm:{candidates}" for candidates in (1000, 3000, 10_000, 40_000)),
 )  # fmt: skip
 WORLDS, SEED, REPEATS = 1000, 8, 2
-CHUNK = 500  # worlds simulated together, equal for all agents
+AT_ONCE = 500  # worlds simulated together, equal for all agents
 HEAD = ("agent", "knows", "CPU, ms per world", "first-impact", "total", "difference")
 
 
 def drive(
-    sample: Sample, agents: Mapping[str, Driver], scenario: Scenario, repeats: int
-) -> dict[str, tuple[float, Outcome]]:
-    """Return the median processor time per world (ms) and the outcome of every agent. The agents drive in turn."""
-    few = sample.take(np.arange(min(sample.worlds.n, 2)))
-    evaluate(few, agents, scenario=scenario, chunk=CHUNK)  # compiles kernels and reads tables, before the measurement
-    spent: dict[str, list[float]] = {name: [] for name in agents}
-    outcomes: dict[str, Outcome] = {}
+    worlds: eb.State, teams: Mapping[str, eb.Team], game: eb.Game, repeats: int
+) -> dict[str, tuple[float, eb.State]]:
+    """Return the median processor time per world (ms) and the last states of every team. The teams drive in turn."""
+    parts = [worlds.take(slice(first, first + AT_ONCE)) for first in range(0, worlds.n, AT_ONCE)]
+    for team in teams.values():
+        eb.drive(game, worlds.take(slice(0, 2)), team)  # compiles kernels and reads tables, before the measurement
+    spent: dict[str, list[float]] = {name: [] for name in teams}
+    last = {}
     for _ in range(repeats):
-        for name, agent in agents.items():
+        for name, team in teams.items():
             begin = time.process_time()
-            outcomes[name] = evaluate(sample, {name: agent}, scenario=scenario, chunk=CHUNK).outcome(name)
-            spent[name].append(1e3 * (time.process_time() - begin) / sample.worlds.n)
-    return {name: (float(np.median(spent[name])), outcomes[name]) for name in agents}
+            last[name] = [eb.drive(game, part, team) for part in parts]
+            spent[name].append(1e3 * (time.process_time() - begin) / worlds.n)
+    return {name: (float(np.median(spent[name])), eb.State.join(_plain(last[name]))) for name in teams}
 
 
-def rows_of(driven: Mapping[str, tuple[float, Outcome]], against: str) -> list[Sequence[str]]:
-    """Return the rows of the table, fastest agent first.
+def _plain(states: Sequence[eb.State]) -> list[eb.State]:
+    return [state._replace(memories={}) for state in states]
 
-    The difference in first-impact harm from agent ``against`` is paired by world, with its 95 % interval.
+
+def rows_of(driven: Mapping[str, tuple[float, eb.State]], teams: Mapping[str, eb.Team]) -> list[Sequence[str]]:
+    """Return the rows of the table, fastest team first.
+
+    The difference in first-impact harm from the first team is paired by world, with its 95 % interval.
     """
-    reference, rows = driven[against][1].first_impact_harm, []
-    for name, (spent_ms, outcome) in sorted(driven.items(), key=lambda each: each[1][0]):
-        harm = outcome.first_impact_harm
-        change = paired_difference(harm, reference)
+    against, rows = next(iter(teams)), []
+    for name, (spent_ms, last) in sorted(driven.items(), key=lambda each: each[1][0]):
+        change = difference(last.harm("first"), driven[against][1].harm("first"))
         low, high = change.interval or (change.value, change.value)
-        difference = "" if name == against else f"{change.value:+.3f} [{low:+.3f}, {high:+.3f}]"
-        means = [f"{each.mean():.3f}" for each in (harm, outcome.total_harm)]
-        rows.append([f"`{name}`", outcome.knows.text, f"{spent_ms:.2f}", *means, difference])
+        shown = "" if name == against else f"{change.value:+.3f} [{low:+.3f}, {high:+.3f}]"
+        means = [f"{last.harm(count).mean():.3f}" for count in ("first", "total")]
+        rows.append([f"`{name}`", known_by(teams[name]), f"{spent_ms:.2f}", *means, shown])
     return rows
 
 
 if __name__ == "__main__":
-    scenario = load_scenario("paper-random")
-    agents = make_lineup(sys.argv[1:] or AGENTS, scenario)
-    rows = rows_of(drive(scenario.sample(WORLDS, SEED), agents, scenario, REPEATS), next(iter(agents)))
+    scenario, game = eb.open_game("paper-random")
+    teams = make_teams(sys.argv[1:] or AGENTS, scenario)
+    rows = rows_of(drive(scenario.sample(WORLDS, SEED), teams, game, REPEATS), teams)
     print("\n".join(f"| {' | '.join(cells)} |" for cells in (HEAD, ["---"] * len(HEAD), *rows)))
     print(f"\nMachine: {this_machine()}")

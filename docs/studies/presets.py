@@ -8,12 +8,12 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl import load_scenario
-from ethbrake_marl.first_edition.scenario.channel import PRESETS
+from ethbrake_marl.worlds.channel import CHANNELS
 
 base = load_scenario("cooperation-2-paper")
-for preset in PRESETS[1:]:
-    vehicles = base.replace(v2x=preset, latency_s=0).sample(100_000, seed=7).worlds.vehicles
-    reacts, known = vehicles.latency_s, vehicles.known_from_s
-    columns = (reacts[:, 1], reacts[:, 2], known[:, 1, 2])
+for preset in [*CHANNELS][1:]:
+    worlds = base.replace(v2x=preset, latency_s=0).sample(100_000, seed=7)
+    reacts, known = worlds.latency_s, worlds.know  # the latter by body: 1 is Vehicle 1
+    columns = (reacts[:, 1], reacts[:, 2], known[:, 2, 3])
     cells = [f"{np.median(c):.2f}, {np.quantile(c, 0.95):.2f}" for c in columns]
-    print(f"| `{preset}` | {' | '.join(cells)} | {np.isinf(known[:, 2, 0]).mean():.1%} |")
+    print(f"| `{preset}` | {' | '.join(cells)} | {np.isinf(known[:, 3, 1]).mean():.1%} |")

@@ -14,15 +14,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+import ethbrake_marl as eb
+from ethbrake_marl.evaluation.statistics import difference, mean, rate
 from ethbrake_marl.extensions.report.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.first_edition.agents.making import make_agent
-from ethbrake_marl.first_edition.evaluation.evaluation import Evaluation
-from ethbrake_marl.first_edition.evaluation.rollout import evaluate
-from ethbrake_marl.first_edition.evaluation.statistics import mean, paired_difference, rate
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.scenario.channel import CHANNELS
-from ethbrake_marl.first_edition.scenario.schema import Scenario
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.worlds.channel import CHANNELS
 
 SCENARIO, WORLDS, SEED = "cooperation-2-paper", 1000, 7
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
@@ -33,7 +30,7 @@ LIMITS = {  # agent that decides on received messages -> the same agent that kno
     f"{POLICY}+step:estimated": f"{POLICY}+step",
     f"{POLICY}+robust:estimated": f"{POLICY}+step",  # no robust shield is exact
 }
-COUNTS = ("first", "total")
+COUNTS = {"first": "first_impact_harm", "total": "total_harm"}
 CAPTION = (
     f"{SCENARIO} over each channel: {WORLDS:,} worlds of the list of seed {SEED}. Harm of the agent that decides on"
     " received messages, minus harm of the same agent that knows the line exactly; 95 % intervals, paired by world."
@@ -50,44 +47,47 @@ def channels() -> dict[str, dict[str, str]]:
     return named
 
 
-def drive(scenario: Scenario, n: int, lines: Mapping[str, dict[str, str]]) -> dict[str, Evaluation]:
+def first_bound(game: eb.Game, alert: eb.State, last: eb.State) -> Floats | None:
+    """Bound of the agent's shield at the alert, m2/s2."""
+    return getattr(last.memories.get("shield"), "first", None)
+
+
+def drive(scenario: eb.Scenario, n: int, lines: Mapping[str, dict[str, str]]) -> dict[str, eb.Result]:
     """Evaluate all agents and their exact counterparts in the first ``n`` worlds of the list, over every channel.
 
     ``lines``: name of a channel -> settings of ``v2x``.
     """
-    results = {}
-    for name, v2x in lines.items():
-        over = scenario.replace(v2x=v2x)
-        agents = {spec: make_agent(spec, scenario=over) for spec in (*ALONE, *LIMITS, *LIMITS.values())}
-        results[name] = evaluate(over.sample(n, SEED), agents, scenario=over, seed=SEED, aftermath=False).complete()
-    return results
+    eb.register_measure("first_bound", first_bound, unit="m2/s2")
+    agents = list(dict.fromkeys((*ALONE, *LIMITS, *LIMITS.values())))
+    return {
+        name: eb.evaluate(scenario.replace(v2x=v2x), agents, episodes=n, seed=SEED, measures="first_bound")
+        for name, v2x in lines.items()
+    }
 
 
-def price(over: Evaluation, agent: str, count: str) -> Estimate:
+def price(over: eb.Result, agent: str, count: str) -> Estimate:
     """Return the harm of the agent minus the harm of its exact counterpart, over one channel."""
-    own, limit = (over.outcome(spec).ledger.world_harm(count) for spec in (agent, LIMITS[agent]))
-    return paired_difference(own, limit)
+    own, limit = (over[spec][COUNTS[count]] for spec in (agent, LIMITS[agent]))
+    return difference(own, limit)
 
 
-def above(over: Evaluation, agent: str) -> Estimate | None:
+def above(over: eb.Result, agent: str) -> Estimate | None:
     """Return the share of worlds with more harm than the first bound of the agent's shield; None without a shield."""
-    own = over.outcome(agent)
-    if "+" not in agent or own.predicted_harm is None:
-        return None
-    return rate(int((own.first_impact_harm > own.predicted_harm + 1e-6).sum()), len(own.total_harm))
+    own = over[agent]
+    return rate(own["first_impact_harm"] > own["first_bound"] + 1e-6) if "first_bound" in own else None
 
 
-def tables(found: Mapping[str, Evaluation]) -> str:
+def tables(found: Mapping[str, eb.Result]) -> str:
     """Return Markdown tables: one of the agents without counterpart, and one per compared agent; a row per channel."""
     head = ["channel", *(f"`{agent}`, {count}" for agent in ALONE for count in COUNTS)]
     lines = [
-        [name, *(mean(over.outcome(agent).ledger.world_harm(count)).in_words() for agent in ALONE for count in COUNTS)]
+        [name, *(mean(over[agent][COUNTS[count]]).in_words() for agent in ALONE for count in COUNTS)]
         for name, over in found.items()
     ]
     return "\n\n".join([markdown(head, lines), *(compared(found, agent) for agent in LIMITS)])
 
 
-def compared(found: Mapping[str, Evaluation], agent: str) -> str:
+def compared(found: Mapping[str, eb.Result], agent: str) -> str:
     """Return the table of one agent and its exact counterpart."""
     words = (f"`{LIMITS[agent]}`", f"`{agent}`", "price")
     head = ["channel", *(f"{word}, {count}" for count in COUNTS for word in words)]
@@ -95,7 +95,7 @@ def compared(found: Mapping[str, Evaluation], agent: str) -> str:
     for name, over in found.items():
         cells = [name]
         for count in COUNTS:
-            harms = (over.outcome(spec).ledger.world_harm(count).mean() for spec in (LIMITS[agent], agent))
+            harms = (over[spec][COUNTS[count]].mean() for spec in (LIMITS[agent], agent))
             cells += [*(f"{harm:.2f}" for harm in harms), price(over, agent, count).in_words()]
         share = above(over, agent)
         lines.append(cells if share is None else [*cells, share.in_words(scale=100, unit=" %")])
@@ -108,7 +108,7 @@ def markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     return "\n".join(["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(cells) + " |" for cells in lines)])
 
 
-def draw(found: Mapping[str, Evaluation]) -> Figure:
+def draw(found: Mapping[str, eb.Result]) -> Figure:
     """Draw the prices: a group of bars per channel, a bar per agent, a panel per count of harm."""
     units = ("price, first-impact harm (m²/s²)", "price, total harm (m²/s²)")
     figure, at, width = new_figure(8.4, 7.2), np.arange(len(found)), 0.8 / len(LIMITS)
@@ -132,6 +132,6 @@ def draw(found: Mapping[str, Evaluation]) -> Figure:
 
 
 if __name__ == "__main__":
-    results = drive(load_scenario(SCENARIO), WORLDS, channels())
+    results = drive(eb.load_scenario(SCENARIO), WORLDS, channels())
     write_picture(sys.argv[1], draw(results), force=True)
     print(tables(results))

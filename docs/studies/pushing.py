@@ -15,8 +15,7 @@ import torch
 from stable_baselines3 import PPO
 
 import ethbrake_marl as eb
-from ethbrake_marl.first_edition.game.step_outcome import StepOutcome
-from ethbrake_marl.first_edition.physics.state import Floats
+from ethbrake_marl.motion.layout import Floats
 
 SHAPED = {"harm": 0.05, "shaping": 0.05, "shaping_discount": 0.99}
 BLOCKS = {  # program -> scenario, parallel worlds, reward
@@ -34,9 +33,9 @@ MEASURES = {  # heading -> measure, factor, digits
 }
 
 
-def speed(step: StepOutcome) -> Floats:
-    """Return minus the speed of each vehicle in m/s."""
-    return -step.speeds_mps
+def speed(before: eb.State, step: eb.Step, after: eb.State) -> Floats:
+    """Minus the speed of each vehicle, m/s."""
+    return -after.speeds_mps
 
 
 def train(block: str, seed: int) -> PPO:
@@ -52,9 +51,11 @@ def train(block: str, seed: int) -> PPO:
 def measure(block: str, model: PPO) -> dict[str, float]:
     """Return the measures of the policy on worlds that no training uses."""
     agents = {block: eb.policy_agent(model, clip=True)}
-    (row,) = eb.summarise(eb.evaluate(agents=agents, scenario=BLOCKS[block.partition("-")[0]][0], episodes=WORLDS))
-    values = {name: estimate.value for name, estimate in row.estimates.items() if estimate is not None}
-    return values | {"moving": row.exploits.moving}
+    scenario = BLOCKS[block.partition("-")[0]][0]
+    asked = "vehicle_1_shoved_m,sampled_harm"
+    columns = eb.evaluate(scenario, agents, episodes=WORLDS, measures=asked)[block]
+    values = {name: float(columns[name].mean()) for name, _, _ in MEASURES.values() if name in columns}
+    return values | {"moving": float((columns["ended"] == "horizon").mean())}
 
 
 def line(block: str, seeds: list[dict[str, float]]) -> str:
@@ -69,6 +70,6 @@ def line(block: str, seeds: list[dict[str, float]]) -> str:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    eb.register_measure("speed", speed, unit="m/s", by="step")
+    eb.register_term("speed", speed, unit="m/s")
     rows = [line(block, [measure(block, train(block, seed)) for seed in SEEDS]) for block in sys.argv[1:]]
     print("\n".join([f"| {' | '.join(['block', *MEASURES])} |", "| --- |" + " ---: |" * len(MEASURES), *rows]))

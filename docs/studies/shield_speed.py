@@ -11,75 +11,56 @@ import time
 
 import numpy as np
 
-from ethbrake_marl.extensions.certified.robust_step import RobustShield
-from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.first_edition.agents.driving import episode_engine
-from ethbrake_marl.first_edition.evaluation.lineup import make_agents
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
-from ethbrake_marl.first_edition.shields.certify import certify
-from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
-from ethbrake_marl.first_edition.shields.step import StepShield
+import ethbrake_marl as eb
+from ethbrake_marl.names import team_of
 
-SCENARIO = load_scenario("paper-random")
+SCENARIO, GAME = eb.open_game("paper-random")
 
 
-def batch_rate(intervals: str | None, n: int) -> tuple[float, int]:
-    """Return decisions per second of a batch of ``n`` worlds with random proposals, and the members per world."""
-    shield = RobustShield(SCENARIO, 1, uncertainty=None if intervals is None else parse_uncertainty(intervals))
-    shield.begin(SCENARIO.sample(n, 3).worlds, np.arange(n))
-    rng = np.random.default_rng(0)
-    shield.decide(rng.uniform(-1.0, 1.0, n))
+def shielded(spec: str) -> eb.Game:
+    """Return the game behind the shield of an agent."""
+    return team_of(eb.make_agent(spec, scenario=SCENARIO), SCENARIO).game(GAME)
+
+
+def batch_rate(spec: str, n: int) -> float:
+    """Return decisions per processor second of a batch of ``n`` worlds with random proposals."""
+    game, rng = shielded(spec), np.random.default_rng(0)
+    game.step(game.begin(SCENARIO.sample(2, 3)), np.zeros((2, 1)))  # compiles
+    state = game.begin(SCENARIO.sample(n, 3))
     done, start = 0, time.process_time()
-    while not shield.memory.running.finished.all():
-        done += int((~shield.memory.running.finished).sum())
-        shield.decide(rng.uniform(-1.0, 1.0, n))
-    return done / (time.process_time() - start), shield.memory.running.members
+    while not state.ended.all():
+        done += int((~state.ended).sum())
+        state, _ = game.step(state, rng.uniform(-1.0, 1.0, (n, 1)))
+    return done / (time.process_time() - start)
 
 
-def single_times(decisions: int) -> list[float]:
-    """Return the wall-clock seconds of each decision."""
-    rng, took = np.random.default_rng(0), []
-    while len(took) < decisions:
-        shield = StepShield(SCENARIO, 1)
-        shield.begin(SCENARIO.sample(1, 3, first=len(took)).worlds, np.arange(1))
-        while not shield.memory.running.finished.all():
-            proposed = rng.uniform(-1.0, 1.0, 1)
-            begun = time.perf_counter()
-            decision = certify(shield.memory.running, proposed, shield.memory.backup, shield.bound)
-            took.append(time.perf_counter() - begun)
-            shield.memory = shield.memory._replace(running=decision.after, backup=decision.backup)
-    return took
-
-
-def policy_times(decisions: int, later: bool) -> list[float]:
-    """Return the processor seconds of each decision of a learned policy behind the shield, one world at a time.
-
-    ``later``: the setting ``later_rollouts`` of the shield.
-    """
-    (policy,) = make_agents(["ppo"], SCENARIO).values()
-    took: list[float] = []
-    world = 0
-    while len(took) < decisions:
-        driver = ShieldedDriver(policy, SCENARIO, later_rollouts=later)
-        engine = episode_engine(SCENARIO.sample(1, 3, first=world).worlds, driver, SCENARIO, 1)
-        while not engine.ended.all():
-            nothing, begun = np.full((1, 1), np.nan), time.process_time()
-            engine.guard.decide(engine, engine.guarded, nothing)  # changes nothing
-            took.append(time.process_time() - begun)
-            engine.step({})
-        world += 1
+def single_times(spec: str, decisions: int, clock: str) -> list[float]:
+    """Return the seconds of each decision, one world at a time; without proposals the shield's own agent proposes."""
+    game, rng, took = shielded(spec), np.random.default_rng(0), list[float]()
+    assert game.shield is not None
+    now = time.perf_counter if clock == "wall" else time.process_time
+    for world in range(decisions):
+        state = game.begin(SCENARIO.sample(1, 3, first=world))
+        while not state.ended.all() and len(took) < decisions:
+            proposed = rng.uniform(-1.0, 1.0, (1, 1)) if clock == "wall" else None
+            begun = now()
+            game.shield.decide(game, state, proposed, donate=False)
+            took.append(now() - begun)
+            state, _ = game.step(state, proposed)
     return took
 
 
 def main(decisions: int = 5_000) -> None:
     """Print one line per measurement."""
-    for intervals, n in ((None, 4096), ("gaps_m=0.5", 1000), ("braking_capacity_mps2=10%,gaps_m=0.5", 1000)):
-        rate, members = batch_rate(intervals, n)
-        print(f"{members} members per world ({intervals or 'step mode'}): {rate:,.0f} decisions/s batched", flush=True)
+    for spec, n in (
+        ("coast+step", 4096),
+        ("coast+robust:gaps_m=0.5", 1000),
+        ("coast+robust:braking_capacity_mps2=10%,gaps_m=0.5", 1000),
+    ):
+        print(f"{spec}: {batch_rate(spec, n):,.0f} decisions/s batched", flush=True)
     for label, took in (
-        ("one decision", single_times(decisions)),
-        ("one decision with ppo, inference included, with later rollouts", policy_times(decisions, True)),
-        ("one decision with ppo, inference included, without later rollouts", policy_times(decisions, False)),
+        ("one decision", single_times("coast+step", decisions, "wall")),
+        ("one decision with ppo, inference included", single_times("ppo+step", decisions, "processor")),
     ):
         middle, slow = np.quantile(took, [0.5, 0.99]) * 1e6
         print(f"{label}: p50 {middle:.0f} us, p99 {slow:.0f} us", flush=True)

@@ -22,18 +22,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Column, Sheet
-from ethbrake_marl.first_edition.agents.e_v2x_bm.coupled import optimise_coupled
-from ethbrake_marl.first_edition.agents.e_v2x_bm.pairwise import optimise_pairwise
-from ethbrake_marl.first_edition.envs.making import make_engine
-from ethbrake_marl.first_edition.envs.pettingzoo import parallel_env
-from ethbrake_marl.first_edition.game.harm import empty_ledger
-from ethbrake_marl.first_edition.physics.advance import advance
-from ethbrake_marl.first_edition.physics.forecast import forecast
-from ethbrake_marl.first_edition.physics.jit import compiled
-from ethbrake_marl.first_edition.physics.state import Floats, Worlds
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.layout import Floats
 
 SCENARIO = "paper-random"
 SEED = 7
@@ -112,40 +106,41 @@ def measure(*, quick: bool = False) -> list[Speed]:
 
 
 def braking(n: int, share: float) -> Work:
-    """Simulate worlds from the first decision until all are at rest; Vehicle 2 brakes with a share of its capacity."""
-    worlds = make_engine(SCENARIO, n, seed=SEED).worlds
-    command = -worlds.vehicles.braking_capacity_mps2
-    command[:, 1] *= share
-    return until_rest(worlds, command)
+    """Steps from the first decision until all worlds are at rest; Vehicle 2 brakes with a share of its capacity."""
+    scenario, game = eb.open_game(SCENARIO)
+    return until_rest(game, game.begin(scenario.sample(n, SEED)), np.full((n, 1), -share))
 
 
-def until_rest(worlds: Worlds, command_mps2: Floats) -> Work:
-    """``advance`` and the ledger: steps with constant commands, until all worlds are at rest."""
-    after, steps = worlds, 0
-    while after.speeds_mps.any() and steps < MOST_STEPS:
-        after, steps = advance(after, command_mps2, STEP_S)[0], steps + 1
+def until_rest(game: eb.Game, begun: eb.State, actions: Floats) -> Work:
+    """``Game.step``: motion, harm, rewards and ends of episodes, with constant actions, until all have ended."""
+    state, steps = begun, 0
+    while not state.ended.all() and steps < MOST_STEPS:
+        state, steps = game.step(state, actions)[0], steps + 1
 
     def work() -> int:
-        now, ledger = worlds, empty_ledger(worlds)
+        now = begun
         for _ in range(steps):
-            now, impacts = advance(now, command_mps2, STEP_S)
-            ledger = ledger.add(impacts)
-        return steps * worlds.n
+            now, _ = game.step(now, actions)
+        return steps * begun.n
 
     return work
 
 
 def stepping(n: int, steps: int = 100) -> Work:
-    """Steps of the engine: motion, ledger, rewards, ends of episodes, the learner's observation, and new episodes."""
-    engine = make_engine(SCENARIO, n, seed=SEED)
-    learners = np.array(engine.learners)
-    actions = np.full((n, len(learners)), -SHARE)
+    """Steps of all worlds: motion, harm, rewards, ends of episodes, the learner's observation, and new episodes."""
+    _, game = eb.open_game(SCENARIO)
+    state, actions = game.start(n, SEED, 0), np.full((n, 1), -SHARE)
+    first = n
 
     def work() -> int:
+        nonlocal state, first
         for _ in range(steps):
-            ended = engine.step(actions).ended
-            engine.renew(np.flatnonzero(ended))
-            engine.observe_all(learners)
+            state, _ = game.step(state, actions, donate=True)
+            rows = np.flatnonzero(state.ended)
+            if len(rows):
+                state = state.put(rows, game.start(len(rows), SEED, first), donate=True)
+                first += len(rows)
+            game.observe(state, game.rules.learners)
         return steps * n
 
     return work
@@ -167,8 +162,8 @@ def vec_env(n: int, steps: int = 100) -> Work:
 
 def parallel(n: int, episodes: int = 20) -> Work:
     """Whole episodes of one world (``n`` is 1) with PettingZoo's parallel API, including resets."""
-    environment = parallel_env(SCENARIO)
-    actions = {f"vehicle_{i + 1}": np.array([-SHARE], np.float32) for i in environment.engine.learners}
+    environment = eb.parallel_env(SCENARIO, agents="learners")
+    actions = {name: np.array([-SHARE], np.float32) for name in environment.possible_agents}
     environment.reset(seed=SEED)
 
     def work() -> int:
@@ -184,21 +179,21 @@ def parallel(n: int, episodes: int = 20) -> Work:
 
 
 def _sampling(n: int) -> Work:
-    scenario = load_scenario(SCENARIO)
-    return lambda: scenario.sample(n, SEED).worlds.n
+    scenario = eb.load_scenario(SCENARIO)
+    return lambda: scenario.sample(n, SEED).n
 
 
-def _optimise(optimise: Callable[[Worlds, int], Any], n: int) -> Work:
-    worlds = load_scenario(SCENARIO).sample(n, SEED).worlds
-    return lambda: len(optimise(worlds, 1).harm)
+def _optimise(optimise: Callable[..., Any], n: int) -> Work:
+    worlds = eb.load_scenario(SCENARIO).sample(n, SEED)
+    return lambda: len(optimise(worlds, 2).harm)
 
 
 def _forecast(n: int, candidates: int = 16) -> Work:
-    scenario = load_scenario(SCENARIO)
-    worlds = scenario.sample(n, SEED).worlds
-    command = -worlds.vehicles.braking_capacity_mps2
-    tried = command[:, [1]] * np.linspace(0.0, 1.0, candidates)
-    return lambda: forecast(worlds, command, 1, tried, scenario.horizon_s)[0].size
+    scenario = eb.load_scenario(SCENARIO)
+    worlds = scenario.sample(n, SEED)
+    wanted = np.hstack([np.zeros((n, 1)), -worlds.braking_capacity_mps2])
+    tried = (wanted[:, [2]] * np.linspace(0.0, 1.0, candidates))[:, :, np.newaxis]
+    return lambda: eb.hold(worlds, wanted, [2], tried, scenario.horizon_s, "first")[0].size
 
 
 def _calibration(n: int) -> Work:
@@ -206,8 +201,8 @@ def _calibration(n: int) -> Work:
     return lambda: int(brake_apart(speeds, ways, 1000))
 
 
-@compiled
-def brake_apart(speeds: Floats, ways: Floats, steps: int) -> int:
+@large
+def brake_apart(speeds, ways, steps):
     """Run the calibration: vehicles brake independently, and restart when they are at rest. Return the world-steps."""
     for _ in range(steps):
         for k in range(speeds.shape[0]):
@@ -251,12 +246,12 @@ def _rate_of(
 BENCHMARKS: tuple[Benchmark, ...] = (
     _rate_of("calibration", "constant deceleration, no event", _calibration, 1024),
     *(
-        _rate_of(f"advance and ledger, {share:.0%}", _BRAKING.format(share), partial(braking, share=share), n, 15e6)
+        _rate_of(f"step, {share:.0%}", _BRAKING.format(share), partial(braking, share=share), n, 15e6)
         for n in (1024, 4096)
         for share in (SHARE, 1.0)
     ),
-    _rate_of("engine step", _DRIVING, stepping, 1024, 8e6),
-    _rate_of("engine step", _DRIVING, stepping, 4096, 8e6),
+    _rate_of("step with new episodes", _DRIVING, stepping, 1024, 8e6),
+    _rate_of("step with new episodes", _DRIVING, stepping, 4096, 8e6),
     _rate_of("Stable-Baselines3 VecEnv", _DRIVING, vec_env, 512, 4e6),
     _rate_of("PettingZoo parallel", "whole episodes, resets included", parallel, 1, 80e3),
     Benchmark(
@@ -268,11 +263,9 @@ BENCHMARKS: tuple[Benchmark, ...] = (
         _start_seconds,
     ),
     _rate_of("sampling", "a list of worlds, refused draws included", _sampling, 10_000, unit="worlds/s"),
-    _rate_of(
-        "E-V2X-BM pairwise", "one optimum per world", partial(_optimise, optimise_pairwise), 10_000, unit="worlds/s"
-    ),
-    _rate_of("E-V2X-BM coupled", "one optimum per world", partial(_optimise, optimise_coupled), 1000, unit="worlds/s"),
-    _rate_of("forecast", "16 constant commands per world, to the horizon", _forecast, 1000, unit="runs/s"),
+    _rate_of("E-V2X-BM pairwise", "one optimum per world", partial(_optimise, pairwise), 10_000, unit="worlds/s"),
+    _rate_of("E-V2X-BM coupled", "one optimum per world", partial(_optimise, coupled), 1000, unit="worlds/s"),
+    _rate_of("hold", "16 constant commands per world, to the horizon", _forecast, 1000, unit="runs/s"),
 )
 
 

@@ -15,30 +15,26 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.style import add_caption, name_axes, new_panels, series_style, write_picture
-from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
-from ethbrake_marl.first_edition.scenario.schema import Scenario
 
 WORLDS, SEED = 2000, 7
 GAPS_S = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4)
 AGENTS = ("full_brake", "e_v2x_bm", "idm", "universal", "best_harm")
+COUNTS = {"first": "first_impact_harm", "total": "total_harm"}
 SCENARIOS = ("paper-random", "realistic-motorway")
 LEAST = 0.05  # no share is shown if the mean harm of full braking (m2/s2) is below this
 
 
-def with_time_gap(base: Scenario, gap_s: float) -> Scenario:
+def with_time_gap(base: eb.Scenario, gap_s: float) -> eb.Scenario:
     """Return ``base`` with a speed of 20 m/s and the time gap ``gap_s`` for all vehicles."""
     content = {key: value for key, value in base.declared().items() if key not in ("gaps_m", "speeds_mps")}
     deviations = content.get("speed_deviations_mps", {"uniform": [-2, 2]})
     return eb.load_scenario(content | {"time_gaps_s": gap_s, "line_speed_mps": 20, "speed_deviations_mps": deviations})
 
 
-def mean_harm(scenario: Scenario) -> dict[str, list[float]]:
+def mean_harm(scenario: eb.Scenario) -> dict[str, list[float]]:
     """Return the mean harm of each agent on the same worlds in m2/s2, by count of harm."""
-    agents = {name: eb.make_agent(name, scenario=scenario) for name in AGENTS}
-    result = eb.evaluate(scenario.sample(WORLDS, SEED).worlds, agents, scenario=scenario, aftermath=False)
-    return {
-        count: [float(result.outcome(name).ledger.world_harm(count).mean()) for name in AGENTS] for count in HARM_COUNTS
-    }
+    result = eb.evaluate(scenario, AGENTS, episodes=WORLDS, seed=SEED)
+    return {count: [float(result[name][column].mean()) for name in AGENTS] for count, column in COUNTS.items()}
 
 
 def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
@@ -65,10 +61,10 @@ def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
 
 
 if __name__ == "__main__":
-    table: dict[str, dict[str, np.ndarray]] = {count: {} for count in HARM_COUNTS}
+    table: dict[str, dict[str, np.ndarray]] = {count: {} for count in COUNTS}
     for name in SCENARIOS:
         harms = [mean_harm(with_time_gap(eb.load_scenario(name), gap_s)) for gap_s in GAPS_S]
-        for count in HARM_COUNTS:
+        for count in COUNTS:
             table[count][name] = np.array([each[count] for each in harms])
             for gap_s, row in zip(GAPS_S, table[count][name], strict=True):
                 saved = " ".join(f"{1.0 - harm / row[0]:6.1%}" if row[0] > LEAST else "     –" for harm in row[1:])

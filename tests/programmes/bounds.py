@@ -43,18 +43,7 @@ KINDS = (*RESOLUTIONS, *(f"{resolution}-light" for resolution in RESOLUTIONS))
 EXTRAS = ("train", "dev")
 PYTHONS = ("3.11", "3.12", "3.13", "3.14")  # that the light kinds of --ci look for
 # Each interface, the physics with its golden worlds, and what touches most of the packages.
-TESTS = (
-    "contract",
-    "first_edition/envs",
-    "first_edition/physics",
-    "golden",
-    "first_edition/scenario",
-    "first_edition/agents",
-    "first_edition/evaluation",
-    "files",
-    "extensions/report",
-    "cli",
-)
+TESTS = ("contract", "faces", "motion", "golden", "worlds", "agents", "evaluation", "files", "extensions/report", "cli")
 CALM = "ignore::DeprecationWarning"  # that something will go from another package is what other versions differ in
 
 

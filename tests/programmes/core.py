@@ -27,14 +27,13 @@ OPTIONS = {
     "--whole": {"action": "store_true", "help": "run all cases of all tests of the core (minutes)"},
 }
 COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefile", "README.md", "pyproject.toml")
-APART = ("docs", "programmes", "second")  # tests of the whole repository, not only of the core
+APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
 INSTALLATION = ("test_imports.py",)  # start many processes
 RUN = "runs/core"
 COMMANDS = {
     "trains PPO on paper-random": ("train", "--steps", "20000", "--output", RUN),
     "evaluates": ("evaluate", "--agents", f"full_brake,e_v2x_bm,ppo@{RUN}", "--episodes", "500"),
     "evaluates behind the shield": ("evaluate", "--agents", f"ppo@{RUN}+step,ppo@{RUN}+episode", "--episodes", "200"),
-    "compares the modes of the shield": ("shield", "--agents", f"ppo@{RUN}", "--episodes", "100"),
     "lists the agents": ("agent", "list"),
 }
 IMPORTED = "import ethbrake_marl as eb; [getattr(eb, name) for name in eb.__all__]"

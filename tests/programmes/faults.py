@@ -422,10 +422,11 @@ class Copy:
 
 
 def _digests(self: Copy, pipe: int) -> None:
-    """In a child: what kernels of each file are named by, as long as no kernel changes."""
-    from ethbrake_marl.first_edition.physics.jit import digest_of_sources
+    """In a child: the folder of the machine code of each file, as long as no kernel changes."""
+    from ethbrake_marl.motion.compiling import folder_of
 
-    found = {str(file): digest_of_sources(file) for file in sorted((self.folder / PACKAGE.name).rglob("*.py"))}
+    files = sorted((self.folder / PACKAGE.name).rglob("*.py"))
+    found = {str(file): str(folder_of(str(file))) for file in files if b"compiling import" in file.read_bytes()}
     os.write(pipe, json.dumps(found).encode())
 
 
@@ -436,9 +437,10 @@ def _run(self: Copy, pipe: int, tests: list[str], compiled: bool, own_kernels: b
     numba.config.DISABLE_JIT = not compiled
     os.environ["NUMBA_DISABLE_JIT"] = str(int(not compiled))
     if compiled and not own_kernels:
-        from ethbrake_marl.first_edition.physics import jit
+        from ethbrake_marl.motion import compiling
 
-        jit.digest_of_sources = cache(lambda source: self.digests.get(str(source), ""))
+        own = compiling.folder_of
+        compiling.folder_of = cache(lambda file: Path(self.digests[file]) if file in self.digests else own(file))
     plugin = Listener(tests, None if compiled else EACH_S, pipe)
     files = list(dict.fromkeys(test.partition("::")[0] for test in tests))
     status = int(pytest.main([*PYTEST, *([] if every else ["-x"]), *files], plugins=[plugin]))

@@ -31,11 +31,8 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.names import open_game
-from ethbrake_marl.first_edition.policies.shipped import shipped_policies
-from ethbrake_marl.first_edition.scenario.tables import read_worlds
-from ethbrake_marl.first_edition.training.session import train
-from tests.first_edition.learning.tiny import LINKS, OUTSIDE, PRECIOUS, link_out
+from ethbrake_marl.policies.bundle import shipped_policies
+from ethbrake_marl.training.recipe_file import new_recipe_text
 from tests.programmes import Cases, Given, Told
 
 CPU_LIMIT_S, WALL_LIMIT_S = 10, 90.0
@@ -43,6 +40,18 @@ MEMORY_LIMIT_BYTES = 2 << 30  # in addition to the memory of the loaded librarie
 LINE_LIMIT = 2_000  # characters
 REFUSED, BROKEN = 2, 99  # exit status of an error, and of a traceback
 DEED = "DEED: "
+OUTSIDE, PRECIOUS = "outside", "precious.txt"  # beside a run: what nothing may touch
+# What may stand in a run as a link out of it -> where it leads, and whether the run must be refused then.
+LINKS = {
+    "checkpoints": ("", True),
+    "tensorboard": ("", True),
+    "run.lock": (PRECIOUS, True),
+    "progress.csv": (PRECIOUS, False),
+    "config.json": (PRECIOUS, True),
+    "team.json": (PRECIOUS, False),
+    "policy": ("", False),
+    "tensorboard/events.out.tfevents.1.x": (PRECIOUS, False),
+}
 
 Command = tuple[str, ...] | Callable[[], object]
 Build = Callable[[Path], object]
@@ -79,7 +88,7 @@ roles:
   vehicle_2: learner
   vehicle_3: full_brake
 """
-RECIPE = eb.load_recipe("ppo").replace(name="mine").text("")
+RECIPE = new_recipe_text("mine", eb.load_recipe("ppo"))
 STATES = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n" + 3 * "7,7,20,18,20\n"
 PYTHON = "from pathlib import Path\nPath('pwned').touch()\ndef make(**given): pass\n"
 TITLE = "title: A line of three"
@@ -152,7 +161,7 @@ def texts() -> Iterator[Case]:
 
 
 def read_states() -> object:
-    return read_worlds(eb.load_scenario("paper-random"), Path("mine.csv"))
+    return eb.read_worlds(eb.load_scenario("paper-random"), Path("mine.csv"))
 
 
 # ---------------------------------------------------------------- archives of arrays
@@ -168,8 +177,8 @@ class Touch:
 @cache
 def good_table() -> bytes:
     """Return a valid table of best known harm, of three worlds."""
-    scenario, game = open_game("paper-random")
-    return best_harm(game, scenario.sample(3, seed=7), budget=1, threads=1).content()
+    scenario, game = eb.open_game("paper-random")
+    return best_harm(game, scenario.sample(3, 7), budget=1, threads=1).content()
 
 
 def tables() -> dict[str, bytes]:
@@ -261,6 +270,15 @@ def runs(stopped: Path) -> Iterator[Case]:
         yield Case(f"run: {name}", ("train", "--resume", "run"), partial(with_run, change), may_be_valid)
 
 
+def link_out(name: str, run: Path) -> None:
+    """Put a link out of the run in the place of something in it."""
+    path = run / name
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    path.symlink_to(run.parents[1] / OUTSIDE / LINKS[name][0])
+
+
 def list_outside(run: Path) -> None:
     status = json.loads((run / "run.json").read_text())
     (run / "run.json").write_text(json.dumps({**status, "written": [f"../../{OUTSIDE}/{PRECIOUS}", "..", 7]}))
@@ -282,7 +300,7 @@ def stopped_run(folder: Path) -> Path:
         n_envs=4, batch_size=16, n_steps=8, n_epochs=1, total_steps=256, checkpoint_every_updates=2, network=small,
         evaluation=evaluation,
     )  # fmt: skip
-    train(recipe, eb.load_scenario("paper-random"), folder / "run", measure=lambda training: measure)
+    eb.train(recipe, "paper-random", folder / "run", measure=lambda training: measure)
     assert json.loads((folder / "run" / "run.json").read_text())["status"] == "interrupted"
     return folder / "run"
 

@@ -10,8 +10,8 @@ from multiprocessing.context import ForkProcess
 from pathlib import Path
 
 import ethbrake_marl as eb
-from ethbrake_marl.first_edition.training.checkpoint import newest_usable
-from ethbrake_marl.first_edition.training.session import resume, train
+from ethbrake_marl.training.checkpoint import newest as newest_checkpoint
+from ethbrake_marl.training.train import resume, train
 from tests.programmes import Cases, Given, Told
 
 SOON_S = 300.0
@@ -131,9 +131,9 @@ def torn_writes(kills: int, folder: Path, rng: random.Random) -> Told:
         if not list(run.glob("checkpoints/.ethbrake-*.partial")):
             continue  # the write was finished
         hit += 1
-        state, damaged = newest_usable(run / "checkpoints")
+        state, damaged = newest_checkpoint(run / "checkpoints")
         usable += state is not None
-        where = "none" if state is None else state.steps
+        where = "none" if state is None else state["steps"]
         print(f"  kill {hit} while writing: usable checkpoint at step {where}, {len(damaged)} damaged", flush=True)
     return Told(usable == kills, f"{usable} of {kills} kills while writing leave a usable checkpoint")
 

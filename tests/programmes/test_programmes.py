@@ -46,7 +46,7 @@ def test_runner__says_how_the_cases_ended_and_exits_by_it(words, status, end, mo
 
 
 def test_runner__lists_every_programme_and_knows_no_other(capsys):
-    assert runner.main([]) == 0 and {"physics", "shield", "wheel"} <= runner.programmes().keys()
+    assert runner.main([]) == 0 and {"motion", "shields", "wheel"} <= runner.programmes().keys()
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [*runner.programmes()]
     assert runner.main(["nobody"]) == 2
 
@@ -114,22 +114,7 @@ def test_judge__tells_what_breaks_a_rule(fault, command, tmp_path):
 def test_proofs__every_statement_and_every_planted_bug():
     pytest.importorskip("z3")
     done = run("proofs", NUMBA_DISABLE_JIT="1")
-    assert done.stdout.splitlines()[-1] == "PASS: 27 of 27 good, 0 failed, 0 without a verdict", done.stdout
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "cases"),
-    [
-        ("physics --small-step-worlds 64 --only|brakes that", 16),
-        ("shield --build-up-worlds 2000 --only|build-up: in pieces, N = 3, first", 10),
-        ("shield --joint-worlds 400 --only|joint: in pieces", 24),
-    ],
-)
-def test_attacks__a_sample_of_what_only_programmes_run(words, cases):
-    options, only = words.split("|")
-    done = run(*options.split(), only)
-    assert done.stdout.splitlines()[-1] == f"PASS: {cases} of {cases} good, 0 failed, 0 without a verdict", done.stdout
+    assert done.stdout.splitlines()[-1] == "PASS: 15 of 15 good, 0 failed, 0 without a verdict", done.stdout
 
 
 # ---------------------------------------------------------------- planted bugs
@@ -137,20 +122,20 @@ def test_attacks__a_sample_of_what_only_programmes_run(words, cases):
 
 def test_bugs__each_patch_stands_in_the_code_exactly_once() -> None:
     bugs, misfits = faults.planted()
-    assert misfits == [] and len(bugs) > 100
+    assert misfits == [] and len(bugs) >= 25
 
 
 def test_tests_of_a_function__are_those_that_call_it_near_ones_first():
-    summing = ["first_edition/physics/state.py:sum_rows"]
+    summing = ["motion/contact.py:gap_after"]
     tests = faults.Callers(
         {
-            "tests/test_a.py::test_one": (0.1, ["first_edition/physics/advance.py:advance"]),
+            "tests/test_a.py::test_one": (0.1, ["motion/drive.py:drive"]),
             "tests/test_b.py::test_two": (0.2, summing),
-            "tests/first_edition/physics/test_c.py::test_three": (9.0, summing),
+            "tests/motion/test_c.py::test_three": (9.0, summing),
         }
     )
-    file = faults.PACKAGE / "first_edition/physics/state.py"
-    first = file.read_text("utf-8").splitlines().index("def sum_rows(values: Floats) -> Floats:") + 1
-    near_ones_first = ["tests/first_edition/physics/test_c.py::test_three", "tests/test_b.py::test_two"]
+    file = faults.PACKAGE / "motion/contact.py"
+    first = file.read_text("utf-8").splitlines().index("def gap_after(gap, closing, pressing, jerk, time):") + 1
+    near_ones_first = ["tests/motion/test_c.py::test_three", "tests/test_b.py::test_two"]
     assert tests.ordered(tests.at(file, first + 2), "", 10.0, 9) == near_ones_first
     assert tests.ordered(tests.at(file, first + 2), "", 5.0, 9) == near_ones_first[1:]

@@ -1,4 +1,4 @@
-"""Description of this machine, printed with every measured time."""
+"""Processor, load and versions of software, printed with every measured time."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from ethbrake_marl import __version__
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Processor, load and software versions of this machine."""
+    """Processor, load and software versions."""
 
-    processor: str  # model of the processor
-    cores_usable: int  # number of cores that this process may use
-    cores: int  # number of cores of the machine
+    processor: str  # model
+    cores_usable: int  # that this process may use
+    cores: int  # of the machine
     load: float  # mean number of running processes over the last minute
-    python: str  # version of Python
-    numpy: str  # version of numpy
-    numba: str  # version of numba
-    ethbrake_marl: str  # version of this package
+    python: str
+    numpy: str
+    numba: str
+    ethbrake_marl: str
 
     def __str__(self) -> str:
         """Return one line, for captions."""
@@ -33,17 +33,11 @@ class Machine:
 
 
 def this_machine() -> Machine:
-    information = Path("/proc/cpuinfo")
+    """Return what this machine is now."""
+    information, cores = Path("/proc/cpuinfo"), os.cpu_count() or 1
     lines = information.read_text("utf-8").splitlines() if information.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Machine(
-        models[0] if models else platform.processor() or platform.machine(),
-        usable,
-        os.cpu_count() or 1,
-        os.getloadavg()[0],
-        platform.python_version(),
-        version("numpy"),
-        version("numba"),
-        __version__,
-    )
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else cores
+    processor, (load, *_) = [*models, platform.processor() or platform.machine()][0], os.getloadavg()
+    versions = platform.python_version(), version("numpy"), version("numba"), __version__
+    return Machine(processor, usable, cores, load, *versions)

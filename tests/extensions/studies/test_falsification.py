@@ -1,141 +1,165 @@
-"""Planted weaknesses are found, and sooner than at random."""
+"""Planted weaknesses are found, and sooner than at random; the file of worlds is read back."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-import ethbrake_marl.first_edition as eb
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.studies.falsification import APART, Scored, far_apart, search
-from ethbrake_marl.extensions.studies.weakness import Measure, MeasureName
-from ethbrake_marl.first_edition.game.harm import HARM_COUNTS, HarmCount
-from ethbrake_marl.first_edition.physics.state import Bools, Floats, Worlds
-from ethbrake_marl.first_edition.scenario.ranges import ranges
+import ethbrake_marl as eb
+from ethbrake_marl.extensions.studies.cube import cube_of
+from ethbrake_marl.extensions.studies.falsification import APART, far_apart, search
+from ethbrake_marl.extensions.studies.weakness import Measure
+from ethbrake_marl.motion.layout import Bools, Floats
+from tests.fixtures.commands import Command, Refuse, told_json
+from tests.refused import refused
 
 SCENARIO = eb.load_scenario("paper-random")
 
 
-def measured(name: MeasureName, **agents: Any) -> Measure:
-    return Measure(name, {"holed": Holed(), "full_brake": eb.make_agent("full_brake")} | agents, SCENARIO, "first")
+def in_hole(worlds: eb.State) -> Bools:
+    """A thousandth of the worlds: both gaps above 9.5 m, and Vehicle 2 slower than 18.4 m/s."""
+    return (worlds.gaps_m > 9.5).all(axis=1) & (worlds.speeds_mps[:, 1] < 18.4)
 
 
-@pytest.mark.parametrize("name", ["regret", "difference"])
-def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds(name: MeasureName) -> None:
-    found = measured(name).falsify(4_000, 0)
-    assert in_hole(found.sample.worlds).all() and found.sample.worlds.n >= 3
-    scores = [world.score for world in found.worlds]
-    assert (np.diff(scores) <= 0.0).all() and scores[-1] > 0.0
-    at_random = measured(name).falsify(4_000, 0, adaptive=False)
-    assert found.share_above > 20.0 * at_random.share_above
-    assert scores[0] > 0.98 * at_random.worlds[0].score
+class Holed:
+    """Brakes fully, but coasts in the hole."""
+
+    name, knows = "holed", "sensors"
+
+    def begin(self, alert: eb.State, body: int) -> Bools:
+        return in_hole(alert)
+
+    def act(self, state: eb.State, memory: Any, body: int) -> tuple[Floats, Any]:
+        return np.where(memory, 0.0, -state.braking_capacity_mps2[:, body - 1]), memory
 
 
-@pytest.mark.parametrize("harm_count", HARM_COUNTS)
-def test_falsify__the_bound_of_the_shield_holds_where_it_is_tightest(harm_count: HarmCount) -> None:
-    measure = Measure.of("bound", "coast+step", None, SCENARIO, harm_count)
-    found = measure.falsify(256, 1)
-    assert max(world.score for world in found.worlds) <= 1e-9 and found.sample.worlds.n > 3
-    assert all(world.score == world.harm - (world.reference or 0.0) for world in found.worlds)
+def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds() -> None:
+    measure = Measure.of("regret", Holed(), "full_brake", SCENARIO)
+    worlds, measured, scores = measure.falsify(4_000, 0)
+    assert in_hole(worlds).all() and worlds.n >= 3
+    assert (np.diff(measured.score) <= 0.0).all() and measured.score[-1] > 0.0
+    assert (measured.score == measured.harm - measured.reference).all()
+    at_random = measure.falsify(4_000, 0, adaptive=False)
+    assert (scores > 0.0).mean() > 20.0 * (at_random[2] > 0.0).mean()
+    assert measured.score[0] > 0.98 * at_random[1].score[0]
+
+
+@pytest.mark.parametrize("count", ["first", "total"])
+def test_bound__of_the_shield_holds_where_it_is_tightest(count: str) -> None:
+    worlds, measured, _ = Measure.of("bound", "coast+step", None, SCENARIO, count).falsify(256, 1)
+    assert measured.score.max() <= 0.0 and worlds.n > 3
+    assert measured.harm.max() > 0.0 and measured.reference is not None
+
+
+def test_harm__is_the_score_that_an_evaluation_gives() -> None:
+    worlds, measured, _ = Measure.of("harm", "full_brake", None, SCENARIO, "total").falsify(64, 2, most=5)
+    assert measured.reference is None and (measured.score == measured.harm).all()
+    result = eb.evaluate(worlds, "full_brake", scenario=SCENARIO)
+    assert (result["full_brake"]["total_harm"] == measured.harm).all()
 
 
 @pytest.mark.parametrize(
-    "name", ["stress-wide", "realistic-mixed", "realistic-motorway", "cooperation-4-all", "cooperation-2-five"]
+    ("name", "coordinates"),
+    [("paper-random", 5), ("stress-wide", 18), ("realistic-mixed", 17), ("cooperation-2-five", 9)],
 )
-def test_ranges__points_are_as_likely_as_a_list(name: str) -> None:
-    """Worlds of even points have the means of a list, in every quantity."""
+def test_cube__points_are_as_likely_as_a_list(name: str, coordinates: int) -> None:
+    """Worlds of even points have the means and spreads of a list, in every quantity."""
     scenario = eb.load_scenario(name).replace(early_impacts="keep")
-    drawn = ranges(scenario)
-    points = np.random.default_rng(0).random((5_000, len(drawn.names)))
-    found, listed = drawn.sample(points)[0].worlds, scenario.sample(5_000, 7).worlds
-    for one, other in (
-        (found.gaps_m, listed.gaps_m),
-        (found.speeds_mps, listed.speeds_mps),
-        (found.vehicles.mass_t, listed.vehicles.mass_t),
-        (found.vehicles.latency_s, listed.vehicles.latency_s),
-        (found.vehicles.braking_capacity_mps2, listed.vehicles.braking_capacity_mps2),
+    cube = cube_of(scenario)
+    assert len(cube.places) == coordinates
+    points = np.random.default_rng(0).random((5_000, coordinates))
+    drawn, listed = cube.worlds(points), scenario.sample(5_000, 7)
+    assert cube.accepts(drawn).all()
+    for one, other in zip(
+        (drawn.line[:, :3, 1:-1], drawn.car[:, :5, 1:]), (listed.line[:, :3, 1:-1], listed.car[:, :5, 1:]), strict=True
     ):
         assert np.allclose(one.mean(axis=0), other.mean(axis=0), atol=0.1 * other.std() + 1e-12)
-        assert np.allclose(one.std(axis=0), other.std(axis=0), rtol=0.15, atol=1e-12)
+        assert np.allclose(one.std(axis=0), other.std(axis=0), rtol=0.15, atol=1e-9)
 
 
-def _peak(points: Floats) -> Floats:
+def test_cube__rejects_what_the_scenario_rejects() -> None:
+    cube = cube_of(eb.load_scenario("paper-delay-high").replace(gaps_m={"uniform": [0.5, 10]}))
+    worlds = cube.worlds(np.random.default_rng(1).random((300, len(cube.places))))
+    accepted = cube.accepts(worlds)
+    assert 0.1 < accepted.mean() < 0.95
+    early = eb.open_game(cube.scenario)[1].begin(worlds).collided
+    assert np.array_equal(accepted, ~early)
+
+
+def peak(points: Floats) -> Floats:
     return -np.abs(points - 0.7).sum(axis=1)
 
 
 def test_search__climbs_a_peak_that_random_points_stay_away_from() -> None:
-    adaptive, at_random = (search(_peak, 6, 2_000, 3, adaptive=how).scores.max() for how in (True, False))
+    adaptive, at_random = (search(peak, 6, 2_000, 3, adaptive=how)[1].max() for how in (True, False))
     assert adaptive > 0.6 * at_random
 
 
-def test_search__finds_several_peaks() -> None:
+def test_search__finds_several_peaks_that_are_apart_and_is_repeated_to_the_bit() -> None:
     centres = np.array([[0.2, 0.2, 0.8], [0.8, 0.3, 0.1], [0.5, 0.9, 0.5]])
 
-    def peaks(points: Floats) -> Floats:
-        return -np.linalg.norm(points[:, np.newaxis] - centres, axis=2).min(axis=1)
+    def hills(points: Floats) -> Floats:
+        return -np.abs(points[:, np.newaxis] - centres).max(axis=2).min(axis=1)
 
-    found = search(peaks, 3, 3_000, 0)
-    best = found.points[far_apart(found, 3)]
-    assert (np.linalg.norm(best[:, np.newaxis] - centres, axis=2).min(axis=0) < 0.1).all()
-
-
-class Holed:
-    """Brakes fully, but coasts in a corner of the ranges: 0.1 % of the worlds of ``paper-random``."""
-
-    name = "holed"
-
-    def begin(self, alert: Worlds, vehicle: int, scripts: object) -> Bools:
-        return in_hole(alert)
-
-    def act(self, worlds: Worlds, memory: Bools, vehicle: int) -> tuple[Floats, Bools]:
-        return np.where(memory, 0.0, -worlds.vehicles.braking_capacity_mps2[:, vehicle]), memory
+    points, scores = search(hills, 3, 1_500, 0)
+    rows = far_apart(points, scores, 3)
+    nearest = np.abs(points[rows][:, np.newaxis] - centres).max(axis=2)
+    assert sorted(nearest.argmin(axis=1)) == [0, 1, 2] and (nearest.min(axis=1) < 0.04).all()
+    chosen = points[far_apart(points, scores, 20)]
+    for k, point in enumerate(chosen):
+        assert (np.abs(np.delete(chosen, k, axis=0) - point).max(axis=1) >= APART).all()
+    again = search(hills, 3, 1_500, 0)
+    assert again[0].tobytes() == points.tobytes() and ((points >= 0.0) & (points < 1.0)).all()
 
 
-def in_hole(worlds: Worlds) -> Bools:
-    """Three conditions, each of which a tenth of the worlds meets."""
-    return np.asarray((worlds.gaps_m < 5.5).all(axis=1) & (worlds.speeds_mps[:, 1] > 21.6))
+def test_far_apart__never_takes_an_invalid_point() -> None:
+    points, scores = np.array([[0.1], [0.5], [0.9]]), np.array([-np.inf, 1.0, 2.0])
+    assert far_apart(points, scores, 9).tolist() == [2, 1]
 
 
-def test_far_apart__takes_the_best_first_without_what_does_not_count() -> None:
-    points = np.array([[0.1, 0.1], [0.1, 0.1 + 0.9 * APART], [0.9, 0.9], [0.5, 0.5]])
-    assert far_apart(Scored(points, np.array([1.0, 2.0, 0.5, -np.inf])), 9).tolist() == [1, 2]
+def test_file__has_the_worlds_bit_for_bit(ethbrake: Command, empty_folder: Path) -> None:
+    words = ("--agent", "coast", "--against", "full_brake", "--budget", "300", "--keep", "4", "--output", "worst.csv")
+    told = told_json(ethbrake("study", "falsify", *words, "--json"))
+    worlds = eb.read_worlds(SCENARIO, "worst.csv")
+    result = eb.evaluate(worlds, "coast,full_brake", scenario=SCENARIO)
+    harm, other = (result[name]["first_impact_harm"] for name in ("coast", "full_brake"))
+    assert [each["harm"] for each in told["worlds"]] == harm.tolist() and told["worst"] == told["worlds"][0]["score"]
+    assert [each["score"] for each in told["worlds"]] == (harm - other).tolist()
+    assert told["worlds"][0]["state"]["gap_1_m"] == worlds.gaps_m[0, 0] and told["tried"] == 300
+    shown = ethbrake("study", "falsify", *words[:4], "--budget", "64")
+    assert "paper-random: 64 worlds tried; regret in m2/s2, first count: worst" in shown.out
 
 
-def test_ranges__are_what_a_scenario_draws() -> None:
-    paper, wide = eb.load_scenario("paper-random"), ranges(eb.load_scenario("stress-wide"))
-    sample, accepted = ranges(paper).sample(np.full((1, 5), 0.5))
-    assert len(ranges(paper).names) == 5
-    assert accepted.tolist() == [True]
-    assert sample.worlds.gaps_m.tolist() == [[7.5, 7.5]]
-    assert sample.worlds.speeds_mps.tolist() == [[20.0, 20.0, 20.0]]
-    assert float(wide.sample(np.random.default_rng(0).random((2_000, len(wide.names))))[1].mean()) == 0.9625
+def test_no_bad_world__writes_no_file(ethbrake: Command, empty_folder: Path) -> None:
+    words = ("--agent", "full_brake", "--against", "constant:7", "--budget", "64", "--output", "none.csv")
+    answer = ethbrake("study", "falsify", *words)
+    assert answer.status == 0 and "no world has a score above 0, so none.csv was not written" in answer.err
+    assert not Path("none.csv").exists()
 
 
-def test_search__keeps_nothing_where_nothing_is_wrong() -> None:
-    paper = eb.load_scenario("paper-random")
-    braking = eb.make_agent("full_brake")
-    found = Measure("difference", {"mine": braking, "full_brake": braking}, paper, "first").falsify(300, 0)
-    assert found.sample.worlds.n == 0
-    assert len(found.worlds) == 0
-    assert found.first_above is None
-    assert found.share_above == 0.0
+@pytest.mark.parametrize(
+    ("options", "key"),
+    [
+        ("--budget 0", "--budget"),
+        ("--budget 10 --output worst.txt", "must end in .csv"),
+        ("--budget 10 --output there.csv", "there.csv: already exists"),
+        ("--budget 10 --measure bound", "is not behind a shield that promises a bound"),
+        ("--measure harm --against coast --budget 10", "only --measure regret compares two agents"),
+        ("--budget 10 --measure hram", "did you mean 'harm'?"),
+        ("--measure harm --agent ppo@nowhere --budget 10", "nowhere"),
+        ("--measure harm --budget 10 --scenario mixture-delays", "is a mixture"),
+        ("--measure harm --budget 10 --scenario cooperation-2-blocked", "has random delays or losses"),
+        ("--measure harm --budget 10 --scenario paper-scenario-1", "no quantity is random"),
+        ("--agent ladder --measure harm --budget 8", "a name means several agents"),
+    ],
+)
+def test_falsify__is_refused(options: str, key: str, refuse: Refuse, empty_folder: Path) -> None:
+    Path("there.csv").write_text("precious")
+    refuse(f"study falsify {'' if '--agent' in options.split() else '--agent coast '}{options}", key)
 
 
-def test_search__stays_in_the_cube_and_repeats_by_seed() -> None:
-    one, same, other = (search(_peak, 2, 700, seed) for seed in (1, 1, 2))
-    assert len(one.points) == len(one.scores) == 700
-    assert ((one.points >= 0.0) & (one.points < 1.0)).all()
-    assert np.array_equal(one.points, same.points)
-    assert not np.array_equal(one.points, other.points)
-
-
-def test_search__spreads_evenly_while_all_points_are_alike() -> None:
-    found = search(lambda points: np.zeros(len(points)), 3, 1_024, 0)
-    cells = np.unique((found.points * 8).astype(int), axis=0)
-    assert len(cells) == 512
-
-
-@pytest.mark.parametrize(("budget", "seed", "key"), [(0, 0, "budget"), (10, -1, "seed")])
-def test_search__numbers_that_are_too_small_are_refused(budget: int, seed: int, key: str) -> None:
-    with pytest.raises(InvalidInput, match=key):
-        search(_peak, 2, budget, seed)
+def test_scenario__whose_worlds_are_all_rejected_is_refused() -> None:
+    lost = eb.load_scenario("paper-random").replace(gaps_m={"uniform": [0.1, 0.2]}, speeds_mps=[10, 20, 30])
+    with refused("in all 10 tried worlds an impact happens before any agent may act"):
+        Measure.of("harm", "coast", None, lost).falsify(10, 0)

@@ -24,7 +24,7 @@ from ethbrake_marl.first_edition.physics.state import Floats, Worlds
 from ethbrake_marl.first_edition.policies.shipped import shipped_policies
 from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
 from ethbrake_marl.first_edition.shields.paper_hybrid import HybridAgent
-from tests.fixtures.asked import Asked
+from tests.first_edition.rest.fixture_asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
 PAIR = eb.load_scenario("cooperation-3-pair")

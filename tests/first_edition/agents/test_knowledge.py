@@ -25,9 +25,9 @@ from ethbrake_marl.first_edition.scenario.channel import PRESETS
 from ethbrake_marl.first_edition.shields.comparison import seen_columns
 from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
 from ethbrake_marl.first_edition.shields.rollouts import Proposer, proposed_action
-from tests.fixtures.asked import Acts
-from tests.fixtures.knowledge import alter_unreceived
-from tests.fixtures.policies import make_policy
+from tests.first_edition.rest.fixture_asked import Acts
+from tests.first_edition.rest.fixture_knowledge import alter_unreceived
+from tests.first_edition.rest.fixture_policies import make_policy
 
 
 def changed_decisions(

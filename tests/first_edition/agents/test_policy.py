@@ -13,7 +13,7 @@ from ethbrake_marl.first_edition.agents.learned import LearnedAgent
 from ethbrake_marl.first_edition.agents.protocol import Source, policy_sha256
 from ethbrake_marl.first_edition.game.actions import action_to_command
 from ethbrake_marl.first_edition.game.observations import ObservationSpec, observe
-from tests.fixtures.asked import Asked
+from tests.first_edition.rest.fixture_asked import Asked
 
 SCENARIO = eb.load_scenario("paper-random")
 WORLDS = SCENARIO.sample(12, 7).worlds

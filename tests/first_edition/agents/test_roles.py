@@ -9,7 +9,7 @@ from ethbrake_marl.first_edition.agents import registry
 from ethbrake_marl.first_edition.agents.driving import Episodes, script_agents
 from ethbrake_marl.first_edition.agents.protocol import Team
 from ethbrake_marl.first_edition.agents.registry import agent_names
-from tests.fixtures.policies import make_policy
+from tests.first_edition.rest.fixture_policies import make_policy
 
 SCENARIOS = (
     "paper-random", "paper-random-buildup", "paper-random-obstacle", "paper-delay-high", "mixture-trucks",

@@ -33,7 +33,7 @@ from ethbrake_marl.first_edition.physics.state import Bools, Floats, Ints, World
 from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 from ethbrake_marl.first_edition.scenario.schema import Scenario
 from ethbrake_marl.first_edition.scenario.task import Task
-from tests.failing_worlds import planted_list, without
+from tests.first_edition.rest.failing_worlds import planted_list, without
 
 BRAKE = {"full_brake": eb.make_agent("full_brake")}
 PAPER = load_scenario("paper-random")

@@ -19,7 +19,7 @@ from ethbrake_marl.first_edition.training.settings import read_settings
 from ethbrake_marl.first_edition.training.team import load_team
 from ethbrake_marl.first_edition.training.training import Training, check_same_training
 from tests.first_edition.learning.tiny import TINY_PPO
-from tests.fixtures.policies import make_policy
+from tests.first_edition.rest.fixture_policies import make_policy
 from tests.refused import refused
 
 PAPER, PAIR = eb.load_scenario("paper-random"), eb.load_scenario("cooperation-3-pair")

@@ -13,7 +13,7 @@ from ethbrake_marl.first_edition.agents.protocol import fixed_commands
 from ethbrake_marl.first_edition.engine.profiles import Profiles, profile_problem
 from ethbrake_marl.first_edition.physics.episode import Decisions
 from ethbrake_marl.first_edition.physics.motion import contact, drift, force_range, settle, solo_motion, speed_event
-from tests.fixtures.asked import Acts
+from tests.first_edition.rest.fixture_asked import Acts
 
 NEVER = (math.inf, 0.0)
 CHANGES = math.nan  # an acceleration that is not constant all along

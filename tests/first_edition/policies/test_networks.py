@@ -34,7 +34,7 @@ from ethbrake_marl.first_edition.policies.network_spec import NetworkSpec
 from ethbrake_marl.first_edition.policies.policy import Policy
 from ethbrake_marl.first_edition.policies.shipped import load_named_policy, shipped_policies
 from tests.docs.site import DOCS
-from tests.fixtures.policies import make_policy
+from tests.first_edition.rest.fixture_policies import make_policy
 
 RandomTensors = Callable[[NetworkSpec], dict[str, np.ndarray]]
 

@@ -11,7 +11,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.first_edition.agents.driving import script_agents
 from ethbrake_marl.first_edition.game.observations import choose_observation, observe
 from ethbrake_marl.first_edition.physics.messages import PIECES, USUAL_PIECES
-from tests.fixtures.knowledge import alter_unreceived
+from tests.first_edition.rest.fixture_knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
 LINE = eb.Scenario(

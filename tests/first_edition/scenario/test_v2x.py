@@ -22,7 +22,7 @@ from ethbrake_marl.first_edition.scenario.channel import (
     Equipped,
     burst_periods,
 )
-from tests.fixtures.knowledge import alter_unreceived
+from tests.first_edition.rest.fixture_knowledge import alter_unreceived
 
 PAPER = eb.load_scenario("paper-random")
 

@@ -33,7 +33,7 @@ from tests.first_edition.shield.attacks import (
     search,
 )
 from tests.first_edition.shield.plays import reported
-from tests.fixtures.asked import Acts
+from tests.first_edition.rest.fixture_asked import Acts
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
