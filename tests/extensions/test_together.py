@@ -3,13 +3,13 @@
 from typing import Any
 
 import pytest
-
 from ethbrake_marl.first_edition.agents.registry import agent_names
+from tests.first_edition.agents import test_knowledge as core, test_roles as roles
+
 from tests.extensions.certified import test_knowledge as certified, test_roles as certified_roles
 from tests.extensions.field import test_knowledge as field, test_roles as field_roles
 from tests.extensions.learners import test_branches, test_knowledge as learners, test_roles as learners_roles
 from tests.extensions.search import test_knowledge as search, test_roles as search_roles
-from tests.first_edition.agents import test_knowledge as core, test_roles as roles
 
 
 def test_knowledge__every_agent_of_the_registry_stands_in_a_table():

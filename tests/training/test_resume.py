@@ -291,7 +291,7 @@ def test_resume__an_edited_configuration_is_another_training(run: Path) -> None:
         go_on(run)
 
 
-def test_resume__checkpoints_of_the_first_edition_are_refused(run: Path) -> None:
+def test_resume__checkpoints_of_version_0_5_are_refused(run: Path) -> None:
     for path in checkpoint.files_in(run / "checkpoints"):
         path.unlink()
     (run / "checkpoints" / "step_000000000512").mkdir()

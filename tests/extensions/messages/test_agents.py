@@ -42,7 +42,11 @@ def driven(scenario: eb.Scenario, agent: Any, n: int = 6) -> list[State]:
 def test_a_policy__observes_as_in_its_environment(scenario: eb.Scenario, shielded: bool, kind: str) -> None:
     """Its actions are those for what the environment observes, which differs from the true state."""
     policy = eb.load_shipped("ppo")
-    model = eb.LearnedAgent(policy) if kind == "ours" else eb.policy_agent(lambda seen: policy(seen), scenario="paper-random")
+    model = (
+        eb.LearnedAgent(policy)
+        if kind == "ours"
+        else eb.policy_agent(lambda seen: policy(seen), scenario="paper-random")
+    )
     loaded, game = eb.open_game(scenario)
     team = eb.Team("one", {2: model})
     if shielded:

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 import yaml
+from tests.first_edition.learning.tiny import TINY_PPO
 
 from ethbrake_marl.cli.app import run_command
-from tests.first_edition.learning.tiny import TINY_PPO
 from tests.fixtures.pictures import draw_nothing
 
 RECIPE = {

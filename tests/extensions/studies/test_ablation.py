@@ -7,12 +7,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import ethbrake_marl.first_edition as eb
 import numpy as np
 import pytest
-
-import ethbrake_marl.first_edition as eb
-from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.joint_optimum import (
     Goal,
     Harms,
@@ -23,10 +20,6 @@ from ethbrake_marl.extensions.cooperation.joint_optimum import (
     questions,
     search_all,
 )
-from ethbrake_marl.extensions.cooperation.levels import STANDARD, Level, Plan, common_worlds, read_levels, with_scheme
-from ethbrake_marl.extensions.cooperation.results import levels_csv, tables
-from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
-from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from ethbrake_marl.first_edition.evaluation.seeds import mean_over_seeds
 from ethbrake_marl.first_edition.game.harm import HarmCount
 from ethbrake_marl.first_edition.scenario.catalogue import load_scenario, scenario_path
@@ -35,9 +28,16 @@ from ethbrake_marl.first_edition.shields.episodes import Shielded
 from ethbrake_marl.first_edition.training.callback import RunCallback
 from ethbrake_marl.first_edition.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.first_edition.training.training import Training
+from tests.first_edition.learning.tiny import TINY_PPO
+
+from ethbrake_marl.cli.app import run_command
+from ethbrake_marl.extensions.cooperation.comparison import compare
+from ethbrake_marl.extensions.cooperation.levels import STANDARD, Level, Plan, common_worlds, read_levels, with_scheme
+from ethbrake_marl.extensions.cooperation.results import levels_csv, tables
+from ethbrake_marl.extensions.search.best_harm import best_harm, chunks_left
+from ethbrake_marl.extensions.studies.trainings import TrainingJob
 from tests.extensions.studies.conftest import ABLATE, LEVELS, study
 from tests.extensions.studies.killing import PROGRAM, end_when
-from tests.first_edition.learning.tiny import TINY_PPO
 from tests.fixtures.snapshots import check_snapshot
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-import pytest
-
 import ethbrake_marl.first_edition as eb
-from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds, with_scheme
+import pytest
 from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
+
+from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds, with_scheme
 from tests.refused import refused
 
 LEVEL_2 = load_scenario("cooperation-2-paper")

@@ -1,1 +1,0 @@
-"""Agents that drive a vehicle (scripts, E-V2X-BM, trained policies) and the registry of their names."""

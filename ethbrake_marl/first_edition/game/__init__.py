@@ -1,1 +1,0 @@
-"""The definition of the game: harm, objectives, actions, observations and rewards."""

@@ -1,1 +1,0 @@
-"""Policies, stored as JSON and safetensors files (never a pickle) and run without torch."""
