@@ -75,6 +75,8 @@ def test_trainings__are_done_once_and_give_curves(tiny: Settings) -> None:
     final = [learning.column(run, learning.HARM)[4096] for run in runs]
     assert last.value == pytest.approx(np.mean(final)) and kept.value <= last.value
     assert final[0] != final[1]  # other seeds
+    (runs[1] / "run.json").unlink()
+    assert trainings.trained(tiny.folder, HIGH) == {}  # one seed of two is missing
     nothing = reproduce_curves(HIGH, replace(tiny, full=False))
     assert nothing.verdict.outcome == "not run" and not nothing.figures
 
