@@ -30,6 +30,16 @@ class BestKnown(NamedTuple):
             return None
         return cls({count: columns[name] for count, name in BEST.items()}, columns.get(AVOIDABLE))
 
+    @property
+    def in_words(self) -> str:
+        """What is known of the worlds as a whole."""
+        first, total = (float(self.harm[count].mean()) for count in HARM)
+        words = f"Mean best known harm of these worlds: {first:.2f} first-impact, {total:.2f} total."
+        if self.avoidable is None:
+            return words
+        never = 100.0 * (1.0 - float(self.avoidable.mean()))
+        return f"In {never:.1f} % of the worlds, no command avoids contact (proven). {words}"
+
     def regret(self, result: Result, agent: str, count: str) -> Floats:
         """Return an agent's harm minus the best known harm, [n] m2/s2."""
         return np.asarray(result[agent][HARM[count]] - self.harm[count])

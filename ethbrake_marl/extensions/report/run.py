@@ -67,7 +67,7 @@ class RunReport:
         page.write(folder / PAGE, force=True)
         begin("")
         more = " and the paper's rows" if is_papers else ""
-        tables = [brief(compared, others), *compared.table.tables()[1:], *learners]
+        tables = [brief(compared, others), *learners]
         return tables, f"report with all measures{more}: {folder / PAGE}"
 
 

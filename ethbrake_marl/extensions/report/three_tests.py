@@ -8,6 +8,7 @@ from dataclasses import replace
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.extensions.report.best_known import BestKnown
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.mixture import WORDS
@@ -48,7 +49,8 @@ def brief(compared: Compared, others: Mapping[str, Compared]) -> Sheet:
     short = whole.only(k for k, name in enumerate(whole.names) if k == 0 or name in KEPT)
     columns, rows = list(short.columns), [list(row) for row in short.rows]
     line = f"{caption(table.parameters)}. Harm: mean over the worlds in m²/s², with the 95 % interval below."
-    notes = [line, *table.notes()]
+    known = BestKnown.of(compared.result)
+    notes = [line, *table.notes(), *([] if known is None else [known.in_words])]
     for test, other in others.items():
         by_agent = {row.agent: row for row in other.table}
         columns.append(Column(f"{title_of(test).removesuffix(' test')}:\nfirst, total"))

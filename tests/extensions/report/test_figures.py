@@ -180,7 +180,7 @@ def test_trajectories__lines_and_impacts_are_those_of_the_record() -> None:
     assert crosses[0].get_offsets()[:, 0].tolist() == record.impacts.time_s[first].tolist()
     rows = zip(record.impacts.time_s[first], record.impacts.pair[first], strict=True)
     front = [np.interp(t, record.time_s, record.positions_m[:, pair - 1]) for t, pair in rows]
-    assert crosses[0].get_offsets()[:, 1] == pytest.approx(front)
+    assert np.asarray(crosses[0].get_offsets())[:, 1].tolist() == pytest.approx(front)
     words = [text.get_text() for text in above.texts]
     assert words == [f"{speed:.1f}" for speed in record.impacts.closing_speed_mps[first]]
     assert above.get_title(loc="left") == "Full braking\nharm 33.79 first-impact, 33.79 total"
