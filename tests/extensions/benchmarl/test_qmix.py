@@ -35,7 +35,7 @@ def test_line_env__takes_an_index_of_each_learner(shield: str | None) -> None:
         assert (one["learners", "reward"] == two["learners", "reward"]).all()
         assert (one["learners", "observation"] == two["learners", "observation"]).all()
     one["learners", "action"] = torch.full((4, 2), 9)
-    with pytest.raises(InvalidInput, match="action of the learners = 9: with actions=9, an action must be an index"):
+    with pytest.raises(InvalidInput, match=r"action of the learners = .*9.*: with actions=9, an action must be an index"):
         by_index._step(one)
 
 
@@ -46,7 +46,7 @@ def test_task__with_actions_is_discrete_and_else_continuous() -> None:
         task = LineTask("pair", {**CONFIG, "actions": actions})
         assert task.supports_discrete_actions() == (actions is not None) != task.supports_continuous_actions()
         assert task.get_env_fun(2, actions is None, 0, "cpu")().actions == actions
-        with pytest.raises(InvalidInput, match=f"task pair: continuous_actions = .*, actions = {actions}: a whole"):
+        with pytest.raises(InvalidInput, match=f"task pair: continuous_actions = .* contradicts actions = {actions}"):
             task.get_env_fun(2, actions is not None, 0, "cpu")
     with pytest.raises(InvalidInput, match="actions = 1: must be a whole number, at least 2"):
         LineTask("pair", {**CONFIG, "actions": 1}).get_env_fun(2, False, 0, "cpu")()
