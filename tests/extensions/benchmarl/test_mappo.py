@@ -117,7 +117,7 @@ def test_line_env__behind_a_shield_keeps_the_bound_of_every_alert() -> None:
     for shield in (None, "step"):
         env = LineTask("pair", {**config, "shield": shield}).get_env_fun(64, True, 5, "cpu")()
         seen = env.reset()
-        bound = env.game.own_infos(env.episode)["shield_bound"] if shield else np.inf
+        bound = env.game.own_infos(env.episode)["shield_bound_harm"] if shield else np.inf
         returned = torch.zeros(64)
         for _ in range(90):
             seen["learners", "action"] = torch.ones((64, 2, 1))

@@ -35,7 +35,9 @@ def test_line_env__takes_an_index_of_each_learner(shield: str | None) -> None:
         assert (one["learners", "reward"] == two["learners", "reward"]).all()
         assert (one["learners", "observation"] == two["learners", "observation"]).all()
     one["learners", "action"] = torch.full((4, 2), 9)
-    with pytest.raises(InvalidInput, match=r"action of the learners = .*9.*: with actions=9, an action must be an index"):
+    with pytest.raises(
+        InvalidInput, match=r"action of the learners = .*9.*: with actions=9, an action must be an index"
+    ):
         by_index._step(one)
 
 
