@@ -9,8 +9,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.learners.algorithms import RandomStart
-from ethbrake_marl.extensions.learners.start import shipped_for
+from ethbrake_marl.extensions.learners.start import members_of, shipped_for, widened
 from ethbrake_marl.extensions.learners.vine import Tried, trusted_targets
+from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.train import train
 from tests.extensions.learners.tiny import PAIR, VINE, new_model
@@ -66,6 +67,14 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
     assert (policy.manifest.algorithm, len(policy.manifest.observation.features)) == ("vine", 57)
     assert eb.make_agent(f"vine@{tmp_path / 'run'}").name == f"vine@{tmp_path / 'run'}"
     assert shipped_for("ppo", "paper-random-obstacle") == "ppo-obstacle"
+
+
+def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -> None:
+    (member,) = members_of(load_shipped("ppo"))
+    turned = ["contact.brake_total_harm", *reversed(member.features)]
+    first = widened(member, turned, "mine", "start")["policy.0.weight"]
+    assert not first[:, 0].any()
+    np.testing.assert_array_equal(first[:, 1:], member.tensors["policy.0.weight"][:, ::-1])
 
 
 def test_training__starts_at_random_where_no_policy_ships_and_says_so(tmp_path: Path) -> None:

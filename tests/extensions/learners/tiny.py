@@ -20,7 +20,7 @@ OWN = {"harm": 1.0, "harm_count": "total", "objective": "own", "terminal": 0.5}
 SHORT = {
     "observation": None, "n_envs": 8, "n_steps": 4, "tried": 16, "batch_size": 8, "total_steps": 256,
     "averaging": 0.9, "learning_rate": {"start": 1e-2, "end": 1e-3},
-    "evaluation": {"every_updates": 4, "worlds": 10, "seed": 7}, "checkpoint_every_updates": 3,
+    "evaluation": {"every_updates": 4, "worlds": 10, "seed": 7}, "checkpoint_every_updates": 1,
 }  # fmt: skip
 VINE = load_recipe("vine").replace(start=None, network={"policy": [8]}, **SHORT)
 ROLLOUTS = load_recipe("rollout-classification").replace(
