@@ -7,6 +7,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.search.agents import BestHarm, Searched
+from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.extensions.search.tables import best_known
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
@@ -143,6 +145,10 @@ def test_searching__is_refused(message: str) -> None:
 
 
 def test_best_harm__looks_no_world_up_for_another_objective() -> None:
-    own = BestHarm(PAPER.replace(objective="own"), budget=50)
-    memory = own.begin(PAPER.sample(2, seed=7), 2)
-    assert memory.predicted_harm.shape == (2,) and memory.commands_mps2.shape[1] == own.decisions
+    worlds, own = PAPER.sample(6, seed=7), BestHarm(PAPER.replace(objective="own"), budget=300)
+    memory, line = own.begin(worlds, 2), BestHarm(PAPER, budget=300).begin(worlds, 2)
+    assert memory.commands_mps2.shape == (6, own.decisions)
+    assert (memory.predicted_harm < line.predicted_harm - 1.0).any()
+    problem = problem_of(own.game, worlds, objective="own")
+    shipped = problem.value(problem.follow(best_known(problem, "first")[1]))
+    assert memory.predicted_harm.tolist() != shipped.tolist()
