@@ -177,3 +177,8 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
 def test_file_of_the_user__is_refused_with_its_line(code: str, line: str, message: str, refuse: Refuse) -> None:
     Path("bad.py").write_text(code)
     refuse(f"evaluate {line}", message)
+
+
+def test_export__replaces_a_file_only_by_force(refuse: Refuse) -> None:
+    Path("mine.onnx").write_bytes(b"mine")
+    refuse("agent export ppo --onnx mine.onnx", "mine.onnx: already exists")

@@ -15,7 +15,7 @@ from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
-from ethbrake_marl.evaluation import evaluate as evaluating
+from ethbrake_marl.evaluation import door, evaluate as evaluating
 from ethbrake_marl.evaluation.evaluate import evaluate
 from ethbrake_marl.evaluation.measures import DEFAULT, Statistic
 from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, register_measure
@@ -25,6 +25,7 @@ from ethbrake_marl.motion.layout import GAP
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
+from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import game_of
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, recorded, teams
 from tests.refused import refused
@@ -339,3 +340,17 @@ def test_failed_physics__raises_with_the_number_of_the_world() -> None:
     line[2, GAP, 1] = np.nan
     with refused("world 102: a check of the physics failed", PhysicsError):
         evaluate(worlds._replace(line=line), teams(FULL_BRAKE), game)
+
+
+@pytest.mark.parametrize(("gap_m", "gap_after_m", "harm"), [(1.0, 0.25, 9.0), (5.0, 4.25, 0.0)])
+def test_sampled_harm__needs_an_overlap_and_a_closing_speed(gap_m: float, gap_after_m: float, harm: float) -> None:
+    """From 0.5 s on both brake alike and close with 3 m/s, until the front one rests 2.83 s later, 8.2 m ahead."""
+    far = {**PAIR, "gaps_m": gap_m, "horizon_s": 0.5 + (0.9 * gap_after_m / 3.0 if harm == 0.0 else 1.0)}
+    assert evaluated(far, 1, [FULL_BRAKE], ["sampled_harm"])["full_brake"]["sampled_harm"].tolist() == [harm]
+
+
+def test_seed__is_recorded_of_drawn_worlds_and_not_of_given_ones() -> None:
+    worlds = load_scenario("paper-random").sample(3, 7)
+    given = door.evaluate(worlds, "full_brake", scenario="paper-random")
+    drawn = door.evaluate("paper-random", "full_brake", episodes=3, seed=9)
+    assert (given.about["seed"], drawn.about["seed"]) == (None, 9)
