@@ -20,9 +20,7 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 }  # fmt: skip
 
 # `installed` comes first: what it finds is what the others, and all processes that they start, find.
-pytest_plugins = [
-    f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "registered")
-]
+pytest_plugins = [f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "registered")]
 if (Path(__file__).parent / "first_edition").exists():
     pytest_plugins += [f"tests.first_edition.rest.fixture_{name}" for name in ("evaluation", "policies")]
 

@@ -17,8 +17,8 @@ from ethbrake_marl.first_edition.shields.drivers import ShieldedDriver
 from ethbrake_marl.first_edition.shields.guard import MovingAtHorizon
 from ethbrake_marl.first_edition.shields.paper_hybrid import HybridAgent
 from ethbrake_marl.first_edition.shields.wrappers import HybridShield, ShieldedEnv, ShieldedVectorEnv
-from tests.first_edition.shield.plays import reported
 from tests.first_edition.rest.fixture_asked import Acts, Asked
+from tests.first_edition.shield.plays import reported
 
 PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(300, 3).worlds

@@ -21,6 +21,7 @@ from ethbrake_marl.first_edition.shields.reasons import ShieldReason
 from ethbrake_marl.first_edition.shields.rollouts import Proposer, certify_rollouts
 from ethbrake_marl.first_edition.shields.running import begin_running
 from ethbrake_marl.first_edition.shields.step import StepShield
+from tests.first_edition.rest.fixture_asked import Acts
 from tests.first_edition.shield.attacks import (
     ADVERSARIES,
     LEAKS,
@@ -33,7 +34,6 @@ from tests.first_edition.shield.attacks import (
     search,
 )
 from tests.first_edition.shield.plays import reported
-from tests.first_edition.rest.fixture_asked import Acts
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore::RuntimeWarning",  # uncompiled, a division by 0 warns
