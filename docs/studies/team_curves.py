@@ -47,13 +47,9 @@ from ethbrake_marl.extensions.report.style import (
 )
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.studies.machine import this_machine
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.first_edition.agents.protocol import Team
-from ethbrake_marl.first_edition.evaluation.seeds import interquartile_mean
-from ethbrake_marl.first_edition.game.harm import HARM_COUNTS
-from ethbrake_marl.first_edition.training.fixed_list import drive_list
-from ethbrake_marl.first_edition.training.random_state import own_random_state
-from ethbrake_marl.first_edition.training.team import load_team
+from ethbrake_marl.names import team_of
 
 ALGORITHMS = {  # name -> label, and estimated decisions per processor second for the first short training
     "ippo": ("IPPO (`train/ippo.py`)", 16_000),
@@ -70,6 +66,7 @@ SHORT = 8  # the first short training takes this fraction of the time: 1 / SHORT
 DOCS = Path(__file__).resolve().parents[1]
 NUMBERS = DOCS / "studies" / "team_curves.json"
 PICTURE = DOCS / "figures" / "team-curves.png"
+COUNTS = {"first": "first_impact_harm", "total": "total_harm"}
 HEAD = ["scenario", "who drives the learners", "decisions", "processor time", "first-impact harm", "total harm"]
 Results = dict[str, Any]  # content of a folder of results, from ``gather``
 
@@ -79,6 +76,23 @@ def level_of(name: str) -> eb.Scenario:
     return eb.load_scenario(name).replace(observation=SEEN)
 
 
+def load_team(folder: Path | str, scenario: eb.Scenario) -> eb.Team:
+    """Return the team of a training run."""
+    return team_of(eb.make_agent(f"team@{folder}", scenario=scenario), scenario)
+
+
+def interquartile_mean(values: np.ndarray) -> Estimate:
+    """Return the mean without the lowest and the highest quarter, with a bootstrap interval over the seeds."""
+    from scipy.stats import bootstrap, trim_mean
+
+    def middle(*drawn: np.ndarray, axis: int) -> np.ndarray:
+        return trim_mean(drawn[0], 0.25, axis=axis)
+
+    again = bootstrap([values], middle, n_resamples=2000, method="percentile", rng=0, vectorized=True)
+    ends = again.confidence_interval
+    return Estimate(float(middle(values, axis=0)), (float(ends.low), float(ends.high)))
+
+
 # 1. A training with evaluations
 
 
@@ -86,16 +100,16 @@ class Clock:
     """Evaluates a team at about equal intervals of a training, and records the processor time of learning."""
 
     def __init__(self, scenario: eb.Scenario, steps: int, worlds: int) -> None:
-        self.scenario, self.steps, self.worlds = scenario, steps, scenario.sample(worlds, SEED).worlds
+        self.scenario, self.steps, self.worlds = scenario, steps, scenario.sample(worlds, SEED)
         self.points: list[list[float]] = []  # decisions, processor seconds, first-impact harm, total harm
         self.begun = 0.0
 
-    def look(self, decisions: int, make_team: Callable[[], Team]) -> None:
+    def look(self, decisions: int, make_team: Callable[[], eb.Team]) -> None:
         """Evaluate the team if an evaluation is due. The first call comes before the first decision."""
         spent = time.process_time() - self.begun if self.points else 0.0
         if decisions >= len(self.points) * self.steps / POINTS:
-            ledgers = [part.ledger for part in drive_list(self.worlds, make_team(), self.scenario)]
-            harms = [np.concatenate([each.world_harm(count) for each in ledgers]).mean() for count in HARM_COUNTS]
+            last = eb.drive(eb.open_game(self.scenario)[1], self.worlds, make_team())
+            harms = [last.harm(count).mean() for count in COUNTS]
             self.points.append([decisions, spent, *map(float, harms)])
         self.begun = time.process_time() - spent
 
@@ -125,7 +139,7 @@ def run_script(name: str, clock: Clock, seed: int, folder: Path) -> None:
             self.updates += 1
             return super().collect(actors, *more)
 
-        def team(self, actors: Mapping[str, Any]) -> Team:
+        def team(self, actors: Mapping[str, Any]) -> eb.Team:
             with TemporaryDirectory() as place:
                 module.save_team(Path(place), actors, self.envs[0], seed=seed, steps=self.updates * decisions)
                 return load_team(place, scenario)
@@ -144,14 +158,15 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
     A callback applies the recipe's schedule of the learning rate, because BenchMARL has no schedule.
     """
     from benchmarl.experiment import Callback
+    from torch.random import fork_rng
 
     module, scenario = script("benchmarl_mappo"), clock.scenario
     recipe = eb.load_recipe("cooperation-ppo").replace(scheme="centralised", total_steps=clock.steps, seed=seed)
     decisions = recipe.n_envs * recipe.rounds * len(scenario.learners)
 
-    def team() -> Team:
+    def team() -> eb.Team:
         agent = eb.LearnedAgent(module.policy_of(experiment, recipe, scenario))
-        return Team(dict.fromkeys(scenario.learners, agent), "team")
+        return eb.Team("team", dict.fromkeys(scenario.learners, agent))
 
     class Watch(Callback):  # type: ignore[misc]
         def on_batch_collected(self, batch: Any) -> None:
@@ -161,7 +176,7 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
                 for optimiser in optimisers.values():
                     optimiser.param_groups[0]["lr"] = recipe.learning_rate.at(1.0 - done / clock.steps)
 
-    with own_random_state():
+    with fork_rng():
         experiment = module.make_experiment(recipe, scenario, str(folder), "mappo")
         watch = Watch()
         watch.experiment = experiment
@@ -179,9 +194,10 @@ def run_recipe(name: str, clock: Clock, seed: int, folder: Path) -> None:
     recipe = recipe.replace(observation=SEEN, total_steps=clock.steps, seed=seed, scheme="shared", evaluation=measured)
     places = clock.scenario.vehicle_names
 
-    def look(trained: Any) -> dict[str, float]:
-        agents = {places.index(each): eb.LearnedAgent(policy) for each, policy in trained.drivers.items()}
-        clock.look(trained.steps, lambda: Team(agents, "team"))
+    def look(policies: Mapping[str, eb.Policy]) -> dict[str, float]:
+        agents = {1 + places.index(each): eb.LearnedAgent(policy) for each, policy in policies.items()}
+        steps = next(iter(policies.values())).manifest.steps
+        clock.look(steps, lambda: eb.Team("team", agents))
         return dict(zip(("first_impact_harm", "total_harm"), clock.points[-1][2:], strict=True))
 
     eb.train(recipe, clock.scenario, folder, measure=lambda training: look, on_progress=None)
@@ -238,14 +254,13 @@ def train(file: Path, algorithm: str, level: str, steps: int, seed: int) -> str:
 
 def refer(file: Path, level: str) -> str:
     """Write the harm of full braking, of E-V2X-BM and of the joint optimum of a search, on the list of a level."""
-    scenario = level_of(level)
-    sample = scenario.sample(WORLDS, SEED)
-    table = search_list(scenario, sample, budget=BUDGET, threads=1, chunks=file.with_suffix(".search"))
-    harms = {"joint optimum": [float(table.best[count].harm.mean()) for count in HARM_COUNTS]}
-    agents = {name: eb.make_agent(name) for name in ("full_brake", "e_v2x_bm")}
-    result = eb.evaluate(sample, agents, scenario=scenario, aftermath=False)
-    for name in agents:
-        harms[name] = [float(result.outcome(name).ledger.world_harm(count).mean()) for count in HARM_COUNTS]
+    scenario, game = eb.open_game(level_of(level))
+    worlds = scenario.sample(WORLDS, SEED)
+    table = search_list(game, worlds, budget=BUDGET, threads=1, chunks=file.with_suffix(".search"))
+    harms = {"joint optimum": [float(table.harm[count].mean()) for count in COUNTS]}
+    result = eb.evaluate(worlds, "full_brake,e_v2x_bm", scenario=scenario)
+    for name in ("full_brake", "e_v2x_bm"):
+        harms[name] = [float(result[name][column].mean()) for column in COUNTS.values()]
     return write(file, {"level": level, "harms": harms})
 
 
@@ -351,7 +366,7 @@ def table(found: Results) -> list[list[str]]:
             curves = curves_of(found, level, algorithm)
             if len(curves):
                 decisions, spent = curves[:, -1, :2].mean(axis=0)
-                reached = [interquartile_mean([last]).in_words() for last in curves[:, -1, 2:].T]
+                reached = [interquartile_mean(last).in_words() for last in curves[:, -1, 2:].T]
                 rows.append([f"`{level}`", label, f"{decisions:,.0f}", f"{spent:.0f} s", *reached])
         if harms:
             least = [f"{harm:.2f}" for harm in harms["joint optimum"]]
@@ -368,7 +383,7 @@ def draw(found: Results) -> Figure:
             curves = curves_of(found, level, algorithm)
             if len(curves):
                 style, spent = series_style(number + 1), curves[:, :, 1].mean(axis=0)
-                middles = [interquartile_mean([harm], resamples=2000) for harm in curves[:, :, 2].T]
+                middles = [interquartile_mean(harm) for harm in curves[:, :, 2].T]
                 axes.plot(spent, [each.value for each in middles], label=label.replace("`", ""), **style)
                 low, high = np.transpose([each.interval or (each.value, each.value) for each in middles])
                 band(axes, spent, low, high, style)

@@ -102,7 +102,9 @@ def attacked(game: Game, truth: State, shield: Any, count: str, way: str, seed: 
         memory = state.memories["shield"]
         rises, bound = rises + int((memory.price > bound)[memory.members.trusted].sum()), memory.price.copy()
     memory = state.memories["shield"]
-    return Episodes(state.harm(count), first, memory.price, memory.members.trusted, memory.replaced, rises, decisions)
+    return Episodes(
+        state.harm(count), first, memory.price, memory.members.trusted, memory.replaced, rises, decisions
+    )
 
 
 def robust(intervals: str, count: str, way: str, n: int, seed: int) -> Episodes:

@@ -124,9 +124,7 @@ def test_nobody_is_ahead_until_news_of_it_have_come() -> None:
     late = TWO.replace(v2x={"link_latency_s": 0.6, "senses": "none"}, latency_s=[0, 0.6], gaps_m=10)
     assert driven("idm", late, 1)[0] < -3.0
     worlds = late.sample(1, 7)
-    assert (
-        np.isinf(Seen.of(worlds, 2, 0.1).gap_m) and Seen.of(worlds._replace(know=0 * worlds.know), 2, 0.1).gap_m == 10
-    )
+    assert np.isinf(Seen.of(worlds, 2, 0.1).gap_m) and Seen.of(worlds._replace(know=0 * worlds.know), 2, 0.1).gap_m == 10
 
 
 @pytest.mark.parametrize("periodic", [False, True])
