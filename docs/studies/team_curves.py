@@ -81,14 +81,14 @@ def load_team(folder: Path | str, scenario: eb.Scenario) -> eb.Team:
     return team_of(eb.make_agent(f"team@{folder}", scenario=scenario), scenario)
 
 
-def interquartile_mean(values: np.ndarray) -> Estimate:
+def interquartile_mean(values: np.ndarray, resamples: int = 10_000) -> Estimate:
     """Return the mean without the lowest and the highest quarter, with a bootstrap interval over the seeds."""
     from scipy.stats import bootstrap, trim_mean
 
     def middle(*drawn: np.ndarray, axis: int) -> np.ndarray:
         return trim_mean(drawn[0], 0.25, axis=axis)
 
-    again = bootstrap([values], middle, n_resamples=2000, method="percentile", rng=0, vectorized=True)
+    again = bootstrap([values], middle, n_resamples=resamples, method="percentile", rng=0, vectorized=True)
     ends = again.confidence_interval
     return Estimate(float(middle(values, axis=0)), (float(ends.low), float(ends.high)))
 
@@ -383,7 +383,7 @@ def draw(found: Results) -> Figure:
             curves = curves_of(found, level, algorithm)
             if len(curves):
                 style, spent = series_style(number + 1), curves[:, :, 1].mean(axis=0)
-                middles = [interquartile_mean(harm) for harm in curves[:, :, 2].T]
+                middles = [interquartile_mean(harm, resamples=2000) for harm in curves[:, :, 2].T]
                 axes.plot(spent, [each.value for each in middles], label=label.replace("`", ""), **style)
                 low, high = np.transpose([each.interval or (each.value, each.value) for each in middles])
                 band(axes, spent, low, high, style)
