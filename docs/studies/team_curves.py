@@ -22,7 +22,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import redirect_stderr, redirect_stdout
-from functools import cache, partial
+from functools import cache
 from itertools import product
 from os import devnull
 from pathlib import Path
@@ -32,7 +32,6 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
-from scipy.stats import bootstrap, trim_mean
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import count_of
@@ -50,8 +49,7 @@ from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.training.training import Training
+from ethbrake_marl.names import team_of
 
 ALGORITHMS = {  # name -> label, and estimated decisions per processor second for the first short training
     "ippo": ("IPPO (`train/ippo.py`)", 16_000),
@@ -68,6 +66,7 @@ SHORT = 8  # the first short training takes this fraction of the time: 1 / SHORT
 DOCS = Path(__file__).resolve().parents[1]
 NUMBERS = DOCS / "studies" / "team_curves.json"
 PICTURE = DOCS / "figures" / "team-curves.png"
+COUNTS = {"first": "first_impact_harm", "total": "total_harm"}
 HEAD = ["scenario", "who drives the learners", "decisions", "processor time", "first-impact harm", "total harm"]
 Results = dict[str, Any]  # content of a folder of results, from ``gather``
 
@@ -77,14 +76,21 @@ def level_of(name: str) -> eb.Scenario:
     return eb.load_scenario(name).replace(observation=SEEN)
 
 
-def interquartile_mean(seeds: Floats, resamples: int = 10_000) -> Estimate:
-    """Return the mean of one number per seed without the best and the worst quarter, with a bootstrap interval."""
-    value = float(trim_mean(seeds, 0.25))
-    if len(seeds) < 2:
-        return Estimate(value, None)
-    middle = partial(trim_mean, proportiontocut=0.25)
-    drawn = bootstrap([seeds], middle, n_resamples=resamples, method="percentile", rng=0, vectorized=True)
-    return Estimate(value, (float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)))
+def load_team(folder: Path | str, scenario: eb.Scenario) -> eb.Team:
+    """Return the team of a training run."""
+    return team_of(eb.make_agent(f"team@{folder}", scenario=scenario), scenario)
+
+
+def interquartile_mean(values: np.ndarray, resamples: int = 10_000) -> Estimate:
+    """Return the mean without the lowest and the highest quarter, with a bootstrap interval over the seeds."""
+    from scipy.stats import bootstrap, trim_mean
+
+    def middle(*drawn: np.ndarray, axis: int) -> np.ndarray:
+        return trim_mean(drawn[0], 0.25, axis=axis)
+
+    again = bootstrap([values], middle, n_resamples=resamples, method="percentile", rng=0, vectorized=True)
+    ends = again.confidence_interval
+    return Estimate(float(middle(values, axis=0)), (float(ends.low), float(ends.high)))
 
 
 # 1. A training with evaluations
@@ -94,8 +100,7 @@ class Clock:
     """Evaluates a team at about equal intervals of a training, and records the processor time of learning."""
 
     def __init__(self, scenario: eb.Scenario, steps: int, worlds: int) -> None:
-        self.scenario, self.game = eb.open_game(scenario)
-        self.steps, self.worlds = steps, scenario.sample(worlds, SEED)
+        self.scenario, self.steps, self.worlds = scenario, steps, scenario.sample(worlds, SEED)
         self.points: list[list[float]] = []  # decisions, processor seconds, first-impact harm, total harm
         self.begun = 0.0
 
@@ -103,8 +108,9 @@ class Clock:
         """Evaluate the team if an evaluation is due. The first call comes before the first decision."""
         spent = time.process_time() - self.begun if self.points else 0.0
         if decisions >= len(self.points) * self.steps / POINTS:
-            last = eb.drive(self.game, self.worlds, make_team())
-            self.points.append([decisions, spent, *(float(last.harm(count).mean()) for count in TITLES)])
+            last = eb.drive(eb.open_game(self.scenario)[1], self.worlds, make_team())
+            harms = [last.harm(count).mean() for count in COUNTS]
+            self.points.append([decisions, spent, *map(float, harms)])
         self.begun = time.process_time() - spent
 
 
@@ -136,20 +142,14 @@ def run_script(name: str, clock: Clock, seed: int, folder: Path) -> None:
         def team(self, actors: Mapping[str, Any]) -> eb.Team:
             with TemporaryDirectory() as place:
                 module.save_team(Path(place), actors, self.envs[0], seed=seed, steps=self.updates * decisions)
-                return team_of_run(place, scenario)
+                return load_team(place, scenario)
 
     plain, module.Copies = module.Copies, Watched
     try:
         module.train(settings, folder)
     finally:
         module.Copies = plain
-    clock.look(-(-clock.steps // decisions) * decisions, lambda: team_of_run(folder, scenario))
-
-
-def team_of_run(folder: str | Path, scenario: eb.Scenario) -> eb.Team:
-    """Return the team of a run."""
-    driver = eb.make_agent(f"team@{folder}", scenario=scenario)
-    return driver if isinstance(driver, eb.Team) else eb.Team("team", dict.fromkeys(scenario.learners, driver))
+    clock.look(-(-clock.steps // decisions) * decisions, lambda: load_team(folder, scenario))
 
 
 def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
@@ -158,14 +158,14 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
     A callback applies the recipe's schedule of the learning rate, because BenchMARL has no schedule.
     """
     from benchmarl.experiment import Callback
+    from torch.random import fork_rng
 
     module, scenario = script("benchmarl_mappo"), clock.scenario
-    training = Training.of("cooperation-ppo", scenario, scheme="centralised", total_steps=clock.steps, seed=seed)
-    recipe = training.recipe
+    recipe = eb.load_recipe("cooperation-ppo").replace(scheme="centralised", total_steps=clock.steps, seed=seed)
     decisions = recipe.n_envs * recipe.rounds * len(scenario.learners)
 
     def team() -> eb.Team:
-        agent = eb.LearnedAgent(module.policy_of(experiment, training))
+        agent = eb.LearnedAgent(module.policy_of(experiment, recipe, scenario))
         return eb.Team("team", dict.fromkeys(scenario.learners, agent))
 
     class Watch(Callback):  # type: ignore[misc]
@@ -176,13 +176,14 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
                 for optimiser in optimisers.values():
                     optimiser.param_groups[0]["lr"] = recipe.learning_rate.at(1.0 - done / clock.steps)
 
-    experiment = module.make_experiment(training, str(folder), "mappo")
-    watch = Watch()
-    watch.experiment = experiment
-    experiment.callbacks.append(watch)
-    clock.look(0, team)
-    experiment.run()
-    clock.look(-(-clock.steps // decisions) * decisions, team)
+    with fork_rng():
+        experiment = module.make_experiment(recipe, scenario, str(folder), "mappo")
+        watch = Watch()
+        watch.experiment = experiment
+        experiment.callbacks.append(watch)
+        clock.look(0, team)
+        experiment.run()
+        clock.look(-(-clock.steps // decisions) * decisions, team)
 
 
 def run_recipe(name: str, clock: Clock, seed: int, folder: Path) -> None:
@@ -191,11 +192,12 @@ def run_recipe(name: str, clock: Clock, seed: int, folder: Path) -> None:
     often = max(clock.steps // (recipe.n_envs * recipe.rounds) // 100, 1)
     measured = {**recipe.evaluation.model_dump(), "every_updates": often}
     recipe = recipe.replace(observation=SEEN, total_steps=clock.steps, seed=seed, scheme="shared", evaluation=measured)
+    places = clock.scenario.vehicle_names
 
     def look(policies: Mapping[str, eb.Policy]) -> dict[str, float]:
-        agents = {vehicle: eb.LearnedAgent(policy) for vehicle, policy in policies.items()}
-        (steps,) = {policy.manifest.steps for policy in policies.values()}
-        clock.look(steps, lambda: eb.Team.of(agents, "team"))
+        agents = {1 + places.index(each): eb.LearnedAgent(policy) for each, policy in policies.items()}
+        steps = next(iter(policies.values())).manifest.steps
+        clock.look(steps, lambda: eb.Team("team", agents))
         return dict(zip(("first_impact_harm", "total_harm"), clock.points[-1][2:], strict=True))
 
     eb.train(recipe, clock.scenario, folder, measure=lambda training: look, on_progress=None)
@@ -252,13 +254,13 @@ def train(file: Path, algorithm: str, level: str, steps: int, seed: int) -> str:
 
 def refer(file: Path, level: str) -> str:
     """Write the harm of full braking, of E-V2X-BM and of the joint optimum of a search, on the list of a level."""
-    scenario = level_of(level)
-    worlds, game = scenario.sample(WORLDS, SEED), eb.open_game(scenario)[1]
+    scenario, game = eb.open_game(level_of(level))
+    worlds = scenario.sample(WORLDS, SEED)
     table = search_list(game, worlds, budget=BUDGET, threads=1, chunks=file.with_suffix(".search"))
-    harms = {"joint optimum": [float(table.harm[count].mean()) for count in TITLES]}
-    result = eb.evaluate(scenario, "full_brake,e_v2x_bm", episodes=WORLDS, seed=SEED)
-    for name, own in result.columns.items():
-        harms[name] = [float(own[column].mean()) for column in ("first_impact_harm", "total_harm")]
+    harms = {"joint optimum": [float(table.harm[count].mean()) for count in COUNTS]}
+    result = eb.evaluate(worlds, "full_brake,e_v2x_bm", scenario=scenario)
+    for name in ("full_brake", "e_v2x_bm"):
+        harms[name] = [float(result[name][column].mean()) for column in COUNTS.values()]
     return write(file, {"level": level, "harms": harms})
 
 
