@@ -1,5 +1,6 @@
 """Agents, too, see what their vehicles believe; and evaluations say when a channel hides something."""
 
+import itertools
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ def test_a_policy__observes_as_in_its_environment(scenario: eb.Scenario, shielde
         team = eb.shield(team)
     states = [state for _, state in eb.play(game, loaded.sample(6, 7), team)]
     wrong = 0
-    for before, after in zip(states, states[1:], strict=False):
+    for before, after in itertools.pairwise(states):
         running = ~before.ended
         proposed = policy(game.observe(before, np.array([2]))[0])[:, 0]
         command = np.where(proposed < 0, before.car[:, 3, 2], before.car[:, 4, 2]) * proposed

@@ -2,14 +2,13 @@
 
 from collections.abc import Callable
 
-import ethbrake_marl.first_edition as eb
 import pytest
-from ethbrake_marl.first_edition.scenario.catalogue import load_scenario
 
+import ethbrake_marl as eb
 from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds, with_scheme
 from tests.refused import refused
 
-LEVEL_2 = load_scenario("cooperation-2-paper")
+LEVEL_2 = eb.load_scenario("cooperation-2-paper")
 
 
 def compare(**changes: object) -> None:
