@@ -5,8 +5,13 @@ from collections.abc import Callable
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds, with_scheme
+from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds
 from tests.refused import refused
+
+
+def level(scenario: eb.Scenario) -> Level:
+    return Level(scenario.name, scenario)
+
 
 LEVEL_2 = eb.load_scenario("cooperation-2-paper")
 
@@ -14,7 +19,7 @@ LEVEL_2 = eb.load_scenario("cooperation-2-paper")
 def compare(**changes: object) -> None:
     """Level 2 of cooperation beside one that differs from it in the vehicle that learns, and in this."""
     mine = LEVEL_2.replace(name="mine", roles={"vehicle_3": "learner"}, **changes)
-    common_worlds([Level(LEVEL_2), Level(mine)], 5, 7)
+    common_worlds([level(LEVEL_2), level(mine)], 5, 7)
 
 
 LEVELS: dict[str, Callable[[], object]] = {
@@ -22,9 +27,6 @@ LEVELS: dict[str, Callable[[], object]] = {
     "level 'mine': restitution is 0.2, but 0.1 at level 'cooperation-2-paper'": lambda: compare(restitution=0.2),
     "level 'mine': latency_s is 0, 0.5, 0.9, but 0, 0.5, 0.8": lambda: compare(latency_s=[0, 0.5, 0.9]),
     "level 'mine': its observation differs from the observation of level": lambda: compare(observation=["own"]),
-    "recipe 'cooperation-ppo': turns = 5: is allowed with scheme: independent only": lambda: with_scheme(
-        eb.load_recipe("cooperation-ppo").replace(scheme="independent", turns=5), "shared"
-    ),
 }
 
 
@@ -38,6 +40,6 @@ def test_levels__may_differ_in_roles_objective_obstacle_and_channel_alone() -> N
     roles = {"vehicle_1": "learner", "vehicle_3": "coast"}
     free = LEVEL_2.replace(name="mine", roles=roles, objective="own", obstacle_gap_m=42, v2x="blocked")
     late = LEVEL_2.replace(name="late", v2x="blocked")
-    assert len(common_worlds([Level(LEVEL_2), Level(free), Level(late)], 5, 7)) == 3
+    assert len(common_worlds([level(LEVEL_2), level(free), level(late)], 5, 7)) == 3
     with refused("level 'late': latency_s is 0, 0.5, 0.9, but 0, 0.5, 0.8 at level 'mine'"):
-        common_worlds([Level(LEVEL_2), Level(free), Level(late.replace(latency_s=[0, 0.5, 0.9]))], 5, 7)
+        common_worlds([level(LEVEL_2), level(free), level(late.replace(latency_s=[0, 0.5, 0.9]))], 5, 7)

@@ -11,7 +11,6 @@ from PIL import Image, ImageSequence
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.rendering.film import film, film_scenes
 from ethbrake_marl.names import teams_of
-from tests.files.test_files import check_target
 from tests.fixtures.commands import Command, Refuse, check_refused
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
@@ -96,10 +95,11 @@ def test_watch__of_an_extra_that_is_missing_says_the_line_that_installs_it(
     assert list(Path().iterdir()) == []
 
 
-def test_watch__target_that_cannot_be_replaced_is_refused_before_any_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    check_target("watch --agents coast --output", tmp_path / "mine.png", monkeypatch, capsys)
+def test_watch__target_that_cannot_be_replaced_is_refused(ethbrake: Command, empty_folder: Path) -> None:
+    link = empty_folder / "mine.png"
+    link.symlink_to("nowhere")
+    check_refused(ethbrake("watch", "--agents", "coast", "--output", link, "--force"), "is a symbolic link")
+    assert not (empty_folder / "nowhere").exists()
 
 
 def test_film_scenes__needs_one_world() -> None:
