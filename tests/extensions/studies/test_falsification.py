@@ -47,9 +47,13 @@ def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds() -> None:
 
 @pytest.mark.parametrize("count", ["first", "total"])
 def test_bound__of_the_shield_holds_where_it_is_tightest(count: str) -> None:
-    worlds, measured, _ = Measure.of("bound", "coast+step", None, SCENARIO, count).falsify(256, 1)
-    assert measured.score.max() <= 0.0 and worlds.n > 3
-    assert measured.harm.max() > 0.0 and measured.reference is not None
+    measure = Measure.of("bound", "coast+step", None, SCENARIO, count)
+    worlds, measured, _ = measure.falsify(256, 1)
+    assert measured.score.max() <= 0.0 and worlds.n > 3 and measured.harm.max() > 0.0
+    listed = SCENARIO.sample(200, 3)
+    promised = measure.teams[0].game(measure.game).begin(listed).memories["shield"].price  # at the alert
+    everywhere = measure(listed)
+    assert (everywhere.reference == promised).all() and (everywhere.harm < promised).any()
 
 
 def test_harm__is_the_score_that_an_evaluation_gives() -> None:
