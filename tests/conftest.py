@@ -20,9 +20,7 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 }  # fmt: skip
 
 # `installed` comes first: what it finds is what the others, and all processes that they start, find.
-pytest_plugins = [
-    f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "evaluation", "policies", "registered")
-]
+pytest_plugins = [f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "registered")]
 if (Path(__file__).parent / "extensions" / "proofs").exists():
     pytest_plugins.append("tests.extensions.proofs.remembered")
 
