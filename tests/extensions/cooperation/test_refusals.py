@@ -26,7 +26,6 @@ LEVELS: dict[str, Callable[[], object]] = {
     "level 'mine': mass_t is 4.5, 5.5, 6, but 4.5, 5.5": lambda: compare(mass_t=[4.5, 5.5, 6]),
     "level 'mine': restitution is 0.2, but 0.1 at level 'cooperation-2-paper'": lambda: compare(restitution=0.2),
     "level 'mine': latency_s is 0, 0.5, 0.9, but 0, 0.5, 0.8": lambda: compare(latency_s=[0, 0.5, 0.9]),
-    "level 'mine': its observation differs from the observation of level": lambda: compare(observation=["own"]),
 }
 
 
