@@ -29,6 +29,10 @@ def gives(value: Any) -> Callable[..., Any]:
 PARTS: dict[str, Callable[[], object]] = {
     "feature 'front_1.gap': the name must be": lambda: eb.register_feature("front_1.gap", gives(0.0), **SCALED),
     "feature 'own': this is the name of a group": lambda: eb.register_feature("own", gives(0.0), **SCALED),
+    "feature 'contact': this is the name of a group": lambda: eb.register_feature("contact", gives(0.0), **SCALED),
+    "feature 'gap': the group obstacle has a feature of this name": lambda: eb.register_feature(
+        "gap", gives(0.0), of="neighbour", **SCALED
+    ),
     "feature 'mine': must be a function with a docstring": lambda: eb.register_feature("mine", 3, **SCALED),
     "feature 'mine': scale = 0": lambda: eb.register_feature("mine", gives(0.0), **SCALED | {"scale": 0.0}),
     "low = 1, high = 1: scale must be above 0": lambda: eb.register_feature("mine", gives(0.0), **SCALED | {"low": 1}),

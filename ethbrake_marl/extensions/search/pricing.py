@@ -112,7 +112,7 @@ class Problem(NamedTuple):
     >>> scenario, game = eb.open_game("paper-random")
     >>> problem = problem_of(game, scenario.sample(2, seed=7))
     >>> problem.follow(problem.constant(problem.even_grid(3)[:, 1:2])).harm()
-    array([ 66.70178872, 170.53289437])
+    array([80.51086128, 64.27142879])
 
     """
 

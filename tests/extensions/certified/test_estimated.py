@@ -156,6 +156,19 @@ def test_news_remove_corners__and_the_bound_falls() -> None:
     assert fell > 3 and heard.any()
 
 
+def test_news__never_make_the_shield_drop_a_better_plan() -> None:
+    """The policy's own play is its plan; best constant actions cost more in the lines that are left."""
+    loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
+    drivers = {2: eb.make_agent("ppo")}
+    game = game._replace(shield=EstimatedShield(drivers, scenario=loaded, corners=True))
+    state = game.begin(loaded.sample(20, 7))
+    bound = state.memories["shield"].price
+    for _ in range(20):
+        state, _ = game.step(state, None)
+        assert (state.memories["shield"].price <= bound).all()
+        bound = state.memories["shield"].price
+
+
 def test_between_the_corners__some_worlds_are_above_their_bound() -> None:
     loaded, game = eb.open_game("cooperation-1-front")
     found = attacked(game, loaded.sample(80, 7), EstimatedShield(scenario=loaded, corners=True), "first", "coast", 0)

@@ -1,6 +1,6 @@
 """Agents, too, see what their vehicles believe; and evaluations say when a channel hides something."""
 
-import itertools
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -43,18 +43,15 @@ def driven(scenario: eb.Scenario, agent: Any, n: int = 6) -> list[State]:
 def test_a_policy__observes_as_in_its_environment(scenario: eb.Scenario, shielded: bool, kind: str) -> None:
     """Its actions are those for what the environment observes, which differs from the true state."""
     policy = eb.load_shipped("ppo")
-    model = (
-        eb.LearnedAgent(policy)
-        if kind == "ours"
-        else eb.policy_agent(lambda seen: policy(seen), scenario="paper-random")
-    )
+    other = eb.policy_agent(lambda seen: policy(seen), scenario="paper-random")
+    model = eb.LearnedAgent(policy) if kind == "ours" else other
     loaded, game = eb.open_game(scenario)
     team = eb.Team("one", {2: model})
     if shielded:
         team = eb.shield(team)
     states = [state for _, state in eb.play(game, loaded.sample(6, 7), team)]
     wrong = 0
-    for before, after in itertools.pairwise(states):
+    for before, after in pairwise(states):
         running = ~before.ended
         proposed = policy(game.observe(before, np.array([2]))[0])[:, 0]
         command = np.where(proposed < 0, before.car[:, 3, 2], before.car[:, 4, 2]) * proposed

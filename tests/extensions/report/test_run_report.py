@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, is_papers_tes
 from ethbrake_marl.extensions.report.run import telling_row
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, is_as_shipped, other_tests
 from ethbrake_marl.training.experiment import run_experiment
-from tests.cli.test_train import ctrl_c_when, status_of
+from tests.cli.test_run import ctrl_c_when, status_of
 from tests.extensions.report.conftest import compared_by
 from tests.fixtures.commands import Command, check_refused, told_json
 from tests.fixtures.page import Page
