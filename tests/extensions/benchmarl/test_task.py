@@ -125,12 +125,13 @@ def test_env__needs_learners_who_observe_the_same() -> None:
 
 
 def test_task__with_actions_is_discrete_and_else_continuous() -> None:
-    from ethbrake_marl.extensions.benchmarl.task import LineTask
+    from ethbrake_marl.extensions.benchmarl.task import LineEnv, LineTask
 
     for actions in (None, 9):
         task = LineTask("pair", {"scenario": "cooperation-3-pair", "actions": actions})
         assert task.supports_discrete_actions() == (actions is not None) != task.supports_continuous_actions()
-        assert task.get_env_fun(2, actions is None, 0, "cpu")().actions == actions
+        env = task.get_env_fun(2, actions is None, 5, "cpu")()
+        assert env.actions == actions and torch.equal(env.reset()["state"], LineEnv(PAIR, 2, 5).reset()["state"])
         assert task.group_map(None) == {"learners": ["vehicle_2", "vehicle_3"]} and task.max_steps(None) == 81
         with pytest.raises(InvalidInput, match=f"task pair: continuous_actions = .* contradicts actions = {actions};"):
             task.get_env_fun(2, actions is not None, 0, "cpu")

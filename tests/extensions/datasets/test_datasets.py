@@ -57,6 +57,13 @@ def test_file__has_the_episodes_of_an_evaluation(tmp_path: Path, monkeypatch: py
         assert own["world"].to_pylist() == sorted(own["world"].to_pylist())
 
 
+def test_actions__are_commands_not_what_slow_brakes_do(tmp_path: Path) -> None:
+    to_parquet(tmp_path / "a.parquet", "full_brake", scenario="realistic-truck-buildup", episodes=2)
+    table = parquet.read_table(tmp_path / "a.parquet")
+    (column,) = [name for name in table.column_names if name.startswith("action_")]
+    assert set(table[column].to_pylist()) == {-1.0}
+
+
 def test_metadata__say_where_the_rows_come_from(tmp_path: Path) -> None:
     scenario = eb.load_scenario(PAPER).replace(observation={"vehicle_2": ["own.speed"], "vehicle_3": ["own.mass"]})
     to_parquet(tmp_path / "a.parquet", {"mine": "coast"}, scenario=scenario, episodes=1, seed=3)
