@@ -36,6 +36,22 @@ A module imports only from its own folder or from folders that this page lists b
 | What can a scenario file say? | `worlds/`: `scenario.py`, `rules.py`; [scenarios](../scenarios.md) |
 | How does a training run? | `training/train.py`, `train`; algorithms in `ppo.py` and `sac.py` |
 | How do I add a column to an evaluation? | [a measure](../extend.md#a-measure) |
+
+From a name to a number, as in `ethbrake evaluate --agents universal`:
+
+```text
+cli/evaluate.py         evaluate_command
+names.py                teams_of, make_agent; pyproject.toml says: agents/trained.py, make_trained
+policies/bundle.py      load_shipped
+evaluation/door.py      evaluate; worlds/sampling.py, draw: the fixed list of worlds
+evaluation/evaluate.py  evaluate, _driven
+agents/drive.py         play, and in each step:
+episode/game.py           Game.step
+episode/step.py           step; asked: agents/policy_agent.py, policies/actor.py
+motion/drive.py           drive; motion/impact.py, resolve_impacts: the harm
+evaluation/measures.py  harm: episode/state.py, State.harm
+evaluation/summary.py   summarise; statistics.py, mean
+```
 """
 END = """
 The folder `scenarios/` contains one YAML file for each scenario, and the folder `train/` one YAML
