@@ -98,11 +98,11 @@ class SummaryTable(list[SummaryRow]):
     def measures(self) -> Sheet | None:
         """Return the table of what was asked for and has no column of its own; None without any."""
         asked = {
-            key: measure for key, (measure, each) in self.shown.items() if not each.heading and measure not in DEFAULT
+            key: _in_words(key, measure, "" if each.kind == "decrease" else measure.unit)
+            for key, (measure, each) in self.shown.items()
+            if not each.heading and measure not in DEFAULT
         }
-        rows = [
-            (row.agent, _in_words(key, measure), row.estimates[key]) for row in self for key, measure in asked.items()
-        ]
+        rows = [(row.agent, words, row.estimates[key]) for row in self for key, words in asked.items()]
         columns = [Column("Agent", text=True, whole=True), Column("Measure", text=True), Column("Mean or rate")]
         return Sheet("Measures", columns, rows, gap=1) if rows else None
 
@@ -162,10 +162,10 @@ _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 
 
-def _in_words(key: str, measure: Measure) -> str:
+def _in_words(key: str, measure: Measure, unit: str) -> str:
     stem, _, number = key.rpartition("_")
     name = f"{stem}, vehicle {number}" if number.isdecimal() and key != measure.name else key
-    return f"{name} ({measure.unit})" if measure.unit else name
+    return f"{name} ({unit})" if unit else name
 
 
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
