@@ -39,13 +39,12 @@ def make_follower(argument: str | None, settings: Any) -> Follower:
     return Follower()
 
 
-register_agent("following", make_follower, form="following")
-
 RATES = {"brake_rate_mps3": {"uniform": [5, 40]}, "release_rate_mps3": {"uniform": [5, 60]}}
 
 
 def line(name: str, **roles: str) -> Scenario:
-    """Return a shipped scenario; with ``-buildup`` behind its name, brakes build up; ``roles`` change vehicles."""
+    """Return a shipped scenario; with ``-rates`` behind its name, brakes build up; ``roles`` change vehicles."""
+    register_agent("following", make_follower, form="following")
     scenario = load_scenario(name.removesuffix("-rates"))
     scenario = scenario.replace(**RATES) if name.endswith("-rates") else scenario
     return scenario.replace(roles={**scenario.roles, **roles}, early_impacts="keep") if roles else scenario
