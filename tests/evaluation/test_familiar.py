@@ -19,7 +19,7 @@ def told(scenario: Any, agents: str = "ppo") -> str:
 
 
 def test_nothing_is_said_where_it_was_trained() -> None:
-    assert told(PAPER, "ppo,universal,full_brake") == told(PAPER.replace(harm_weight=[1, 4, 1])) == ""
+    assert told(PAPER, "ppo,full_brake") == told(PAPER.replace(harm_weight=[1, 4, 1])) == ""
     assert told("cooperation-3-pair", "vine-pair") == ""
 
 

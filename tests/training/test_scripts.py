@@ -148,11 +148,3 @@ def agent_of(actor: OwnActor) -> eb.Agent:
 def test_save_team__names_what_an_actor_must_be(actors: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=message):
         save_team(tmp_path, actors, eb.parallel_env("paper-random"), seed=0, steps=0)
-
-
-def test_recurrent__leaves_a_network_that_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    script, folder = load("../../train/recurrent"), tmp_path / "gru"
-    monkeypatch.setattr(sys, "argv", ["recurrent.py", "--output", str(folder), "--updates", "2", "--worlds", "8"])
-    script.main()
-    result = eb.evaluate("cooperation-3-congested", f"{script.__file__}:make_agent:{folder}", episodes=5)
-    assert result.n == 5
