@@ -186,6 +186,10 @@ def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> d
         )
     teams = {}
     for name, given in agents.items():
+        if not isinstance(name, str) or not name or not name.isprintable():
+            raise InvalidInput(
+                f"agents: the name {name!r:.60} must be a text without line breaks and control characters"
+            )
         if isinstance(given, Mapping):
             drivers = {vehicle: _driver(each, scenario, harm_count) for vehicle, each in given.items()}
             teams[name] = Team.of(drivers, name)

@@ -191,6 +191,6 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
 def tell_end(out: Out, status: str, steps: int, directory: Path) -> None:
     """Print how the training ended, and the folder of the run; if it was interrupted, exit with status 130."""
     if status == "interrupted":
-        left = f"the policy so far is saved; continue with: ethbrake train --resume {directory}"
+        left = f"the policy so far is saved; continue with: ethbrake train --resume {shlex.quote(str(directory))}"
         out.interrupted(f"interrupted after {steps:,} training steps; {left}")
     out.note(f"{status} after {steps:,} training steps: {directory}")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State
+from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State, mapped
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, PhysicsError, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, MET, drive
@@ -255,7 +255,7 @@ def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
 
 def begun(script: Any, alert: State, body: int) -> Any:
     """Return the memory of a script for new episodes. Raises ``AgentFailed`` if the script raises something."""
-    return _called(script, "begin", alert, body)
+    return _remembered(script, _called(script, "begin", alert, body), alert.n, body)
 
 
 def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
@@ -268,7 +268,7 @@ def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, An
     answer = _called(script, "act", state, memory, body)
     if not isinstance(answer, tuple) or len(answer) != 2:
         raise AgentFailed(name, None, f"vehicle_{body}: act returned {answer!r:.60}; must return commands and memory")
-    given, memory = answer
+    given, memory = answer[0], _remembered(script, answer[1], state.n, body)
     commands = np.asarray(given)
     if commands.shape != (state.n,) or commands.dtype.kind not in "fiu":
         raise AgentFailed(
@@ -286,6 +286,26 @@ def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, An
             f" [{low[k]:g}, {high[k]:g}] m/s2",
         )
     return commands, memory
+
+
+def _remembered(script: Any, memory: Any, n: int, body: int) -> Any:
+    """Return a memory; somebody else's is checked, and cannot be changed in place, because plays share it."""
+    if type(script).__module__.startswith("ethbrake_marl."):
+        return memory
+
+    def frozen(array: Any) -> Any:
+        if not isinstance(array, np.ndarray) or array.shape[:1] != (n,):
+            raise AgentFailed(
+                getattr(script, "name", type(script).__name__),
+                None,
+                f"vehicle_{body}: its memory is {array!r:.60}; must be None, an array with one row for each of the {n}"
+                " worlds, or a tuple or mapping of these",
+            )
+        view = array.view()
+        view.setflags(write=False)
+        return view
+
+    return mapped(frozen, memory)
 
 
 def _called(script: Any, method: str, state: State, *given: Any) -> Any:

@@ -7,7 +7,7 @@ many short ones are crashes.
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from ethbrake_marl.agents.drive import MESSAGES, MODEL, SENSORS, STATE as TRUE_STATE, Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
-from ethbrake_marl.errors import AgentFailed, InvalidInput, count_of, naming_extras, unknown_name
+from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
 from ethbrake_marl.evaluation.familiar import warn_unfamiliar
 from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
-from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, measured
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, look, measured
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
@@ -76,10 +76,19 @@ class Result:
         mine = [each for each in self.measures if column == each.name or column.startswith(f"{each.name}_")]
         return max(mine, key=lambda measure: len(measure.name))
 
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names of the teams."""
+        return iter(self.columns)
+
+    def __contains__(self, team: object) -> bool:
+        return team in self.columns
+
     def take(self, rows: Any) -> Result:
-        """Return the result in some of its worlds: row numbers, or a mask [n]."""
+        """Return the result in some of its worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
         columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
         worlds = {name: each[rows] for name, each in self.worlds.items()}
+        if not len(worlds["world"]):
+            raise InvalidInput("take: there is no world among these rows; choose at least one")
         about = {key: value for key, value in self.about.items() if key != "worlds_sha256"}
         about |= {"count": len(worlds["world"]), "rejected_draws": 0}
         return replace(self, columns=columns, worlds=worlds, about=about)
@@ -131,11 +140,16 @@ def evaluate(
     physics fails.
 
     """
+    if jobs is not None:
+        check_whole_number("jobs", jobs, 1)
     drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
     _check(drawn.worlds, agents, game)
     warn_unfamiliar(agents, drawn.worlds)
     chosen = (*DEFAULT, *measures)
-    alert, n = drawn.worlds, drawn.worlds.n
+    alert, n, of_worlds = drawn.worlds, drawn.worlds.n, columns_of(drawn)
+    for measure in chosen:
+        if measure.name in of_worlds:
+            raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")
     calls: Any = (
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
@@ -148,7 +162,7 @@ def evaluate(
         if on_done is not None:
             on_done(min(len(parts) * CHUNK, n))
     learners = game.rules.learners.tolist()
-    columns: Columns = {**columns_of(drawn)}
+    columns: Columns = {**of_worlds}
     if (columns["world"] < 0).all():  # the user has made these worlds
         columns["world"] = np.arange(n)
     return Result(
@@ -182,13 +196,13 @@ def drive_chunk(
 
 def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Columns:
     whole = team.game(game)
-    watches = {each.name: each.watch(whole, alert) for each in measures if each.watch is not None}
-    seen = [watch for watch in watches.values() if watch is not None]
+    watches = {each.name: each.watch(whole, alert.read_only()) for each in measures if each.watch is not None}
+    seen = {each: watch for each, watch in watches.items() if watch is not None}
     before = alert
     with AgentFailed.naming(name, [script.name for script in game.scripts.values() if hasattr(script, "name")]):
         for step, state in play(game, alert, team, donate=not seen):
-            for watch in seen:
-                watch.see(before, step, state)
+            for each, watch in seen.items():
+                look(each, watch, before.read_only(), step, state.read_only())
             before = state
     columns: Columns = {}
     for measure in measures:

@@ -192,13 +192,23 @@ DEFAULT = (
 )  # fmt: skip
 
 
+def look(name: str, watch: Watch, before: State, step: Step | None, after: State) -> None:
+    """Let a watch see a step. Raises ``InvalidInput``, which names the measure, if its function fails."""
+    try:
+        watch.see(before, step, after)
+    except EthBrakeError:
+        raise
+    except Exception as error:
+        raise InvalidInput(f"measure {name!r}: its function fails: {describe_error(error)}") from error
+
+
 def measured(measure: Measure, watch: Watch | None, game: Game, alert: State, last: State) -> dict[str, Values]:
     """Return the columns of one measure. Raises ``InvalidInput``, which names the measure, if its function fails."""
     try:
         if measure.of is not None:
-            given = measure.of(game, alert, last)
+            given = measure.of(game, alert.read_only(), last.read_only())
         else:
-            given = None if watch is None else watch.result(last)
+            given = None if watch is None else watch.result(last.read_only())
     except EthBrakeError:
         raise
     except Exception as error:

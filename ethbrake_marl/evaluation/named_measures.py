@@ -66,12 +66,13 @@ def register_measure(
             " describes the measure"
         )
     measure = Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
-    if name in USUAL or name in TERMS:
+    if name in (*USUAL, *TAKEN) or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
     MEASURES.add(name, measure, lambda other: other == measure)
 
 
 USUAL = tuple(measure.name for measure in DEFAULT)
+TAKEN = ("agent", "knows", "kind", "world", "scenario", "recording", "hidden", "exploits", "results_sha256")
 
 MEASURES: Registry[Measure] = Registry(
     "measure", "measures", register_measure, {measure.name: measure for measure in DEFAULT}

@@ -171,8 +171,11 @@ def _in_words(key: str, measure: Measure, unit: str) -> str:
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
     """Return the table of a result, one row per team.
 
-    ``baseline``: team that the others are compared with, paired by world; without it there are no comparisons.
+    ``baseline``: team that the others are compared with, paired by world. Without full braking, the default, there are
+    no comparisons; any other team must be in the result (``UnknownName``).
     """
+    if baseline != BASELINE and baseline not in result:
+        raise unknown_name("baseline", baseline, result)
     names = dict.fromkeys(name for own in result.columns.values() for name in own)
     shown: dict[str, tuple[Measure, Statistic]] = {}
     column_of: dict[str, str] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from inspect import signature
+from inspect import Parameter, signature
 from typing import Any
 
 from ethbrake_marl.agents.drive import Agent, Team
@@ -67,6 +67,9 @@ def shield(
         raise unknown_name("shield mode", mode, MODES)
     wanted = signature(MODES[mode]).parameters
     known = [name for name in wanted if name not in ("drivers", "scenario")]
+    for name in known:
+        if wanted[name].default is Parameter.empty and name not in options:
+            raise InvalidInput(f"shield: mode {mode!r} needs the option {name}")
     for name in options:
         if name not in known:
             raise unknown_name(f"option of a shield in mode {mode}", name, known)
@@ -78,6 +81,8 @@ def shield(
             raise InvalidInput(f"shield: mode {mode!r} needs a scenario, which a team has not; shield an environment")
         return MODES[mode](drivers, **options, scenario=worlds)
 
+    if isinstance(env, str):
+        raise InvalidInput(f"shield: {env!r:.60}: is a name; pass make_agent({env!r:.60}), or add +{mode} to the name")
     if not isinstance(env, Team) and not hasattr(env, "act"):
         if scenario is not None:
             raise InvalidInput("shield: scenario: an environment has its own; leave it out")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.policy_agent import LearnedAgent
@@ -17,7 +18,7 @@ from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
 from ethbrake_marl.evaluation import door, evaluate as evaluating
 from ethbrake_marl.evaluation.evaluate import evaluate
-from ethbrake_marl.evaluation.measures import DEFAULT, Statistic
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Statistic
 from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, register_measure
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import summarise
@@ -354,3 +355,70 @@ def test_seed__is_recorded_of_drawn_worlds_and_not_of_given_ones() -> None:
     given = door.evaluate(worlds, "full_brake", scenario="paper-random")
     drawn = door.evaluate("paper-random", "full_brake", episodes=3, seed=9)
     assert (given.about["seed"], drawn.about["seed"]) == (None, 9)
+
+
+class Touching:
+    """Adds 1 to its memory, in place or not."""
+
+    name, knows = "touching", "own sensors"
+
+    def __init__(self, in_place: bool) -> None:
+        self.in_place = in_place
+
+    def begin(self, alert: State, body: int) -> Any:
+        return np.zeros(alert.n)
+
+    def act(self, state: State, memory: Any, body: int) -> Any:
+        if self.in_place:
+            memory += 1.0
+        return np.minimum(memory - 6.0, 0.0), memory + 1.0
+
+
+def test_what_others_bring__cannot_change_what_happens() -> None:
+    """Measures, watches and agents see the arrays of a running episode, and cannot write to them."""
+    scenario, game = game_of("paper-random")
+    worlds = scenario.draw(3, 7)
+    with refused("agent 'touching', vehicle_2: act fails: ValueError"):
+        evaluate(worlds, teams(Touching(in_place=True)), game)
+    evaluate(worlds, teams(Touching(in_place=False)), game)
+
+    def heavier(game: Any, alert: State, last: State) -> Any:
+        """Mass."""
+        mass = alert.mass_t
+        mass *= 2.0
+        return mass
+
+    class Slowing:
+        def __init__(self, game: Any, alert: State) -> None:
+            pass
+
+        def see(self, before: State, step: Any, after: State) -> None:
+            speeds = after.speeds_mps
+            speeds *= 0.9
+
+        def result(self, last: State) -> Any:
+            return last.time_s
+
+    for measure in (Measure("heavier", heavier), Measure("slowing", watch=Slowing)):
+        with pytest.raises(InvalidInput, match=r"its function fails: ValueError: .*read-only"):
+            evaluate(worlds, teams(GENTLE), game, [measure])
+    for name in ("world", "gap_1_m"):
+        with refused(f"measure '{name}': is the name of a column of the worlds"):
+            evaluate(worlds, teams(GENTLE), game, [Measure(name, lambda game, alert, last: last.time_s)])
+
+
+@pytest.mark.parametrize("name", ["", "a\nb", "a\x00b", "\u2028", 5])
+def test_name_of_an_agent__is_a_printable_text(name: Any) -> None:
+    with refused("the name"):
+        eb.evaluate("paper-random", {name: "coast"}, episodes=2)
+
+
+def test_result__has_teams_and_worlds() -> None:
+    result = eb.evaluate("paper-random", "coast,full_brake", episodes=3)
+    assert "coast" in result and "ppo" not in result and list(result) == ["coast", "full_brake"]
+    with refused("there is no world among these rows"):
+        result.take([])
+    with refused("jobs = 0"):
+        eb.evaluate("paper-random", "coast", episodes=2, jobs=0)
+    with refused("'coast': is a name; pass make_agent('coast')"):
+        eb.shield("coast", scenario="paper-random")

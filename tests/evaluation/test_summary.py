@@ -61,7 +61,9 @@ def test_baseline__can_be_another_or_missing(result: Result) -> None:
         True,
         False,
     ]
-    nobody = summarise(result, baseline="nobody")
+    with refused("unknown baseline 'nobody'; known: ", UnknownName):
+        summarise(result, baseline="nobody")
+    nobody = summarise(evaluated(PAIR, 2, [COAST, GENTLE]))  # without full braking
     assert {row["harm_decrease_first"] for row in nobody} == {None} and "–" in str(nobody)
     one = summarise(evaluated(PAIR, 1, [COAST]))[0]
     assert one["total_harm"].interval is None and one["collision_rate"].interval is not None  # type: ignore[union-attr]

@@ -25,8 +25,8 @@ def least(game: Game, alert: State) -> dict[str, Floats]:
         missing = int(np.isnan(list(known.values())).any(axis=0).sum())
         if missing:
             raise InvalidInput(
-                f"limits: no shipped table holds {count_of(missing, 'world')} of {alert.n}; use the evaluation list"
-                " (seed 7) of a scenario with a table, or compare with the agent best_harm"
+                f"no shipped table holds {count_of(missing, 'world')} of {alert.n}; the measures limits need the first"
+                " worlds of seed 7 of a scenario with a table; elsewhere compare with the agent best_harm"
             )
         _asked.clear()
         _asked[key] = known

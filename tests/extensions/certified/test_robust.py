@@ -270,3 +270,8 @@ def test_capacity__is_that_on_the_road() -> None:
     assert members("braking_capacity_mps2.vehicle_2=10%", wet).car[:, BRAKING, 2] == pytest.approx(
         3.924 * np.array([1.0, 0.9, 1.1])
     )
+
+
+def test_mode__says_which_option_it_needs() -> None:
+    with refused("shield: mode 'robust' needs the option uncertainty"):
+        eb.shield(eb.parallel_env("paper-random"), mode="robust")

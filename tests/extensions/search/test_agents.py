@@ -132,7 +132,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "search: candidates = 0: must be a whole number": lambda: Searched(eb.make_agent("coast"), PAPER, candidates=0),
     "'full_brake+step+search': a search around a shield; write +search first": drive(PAPER, "full_brake+step+search"),
     "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": drive(PLANS, "full_brake+search"),
-    "limits: no shipped table holds 3 worlds of 3": lambda: eb.evaluate(
+    "no shipped table holds 3 worlds of 3; the measures limits need": lambda: eb.evaluate(
         PAPER, "coast", episodes=3, seed=8, measures="limits"
     ),
 }  # fmt: skip
