@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.evaluation import trial
 from ethbrake_marl.training.recipe import load_recipe, shipped_recipes
 from ethbrake_marl.training.recipe_file import new_recipe_text
 from ethbrake_marl.worlds.catalogue import shipped_folder
@@ -98,7 +99,10 @@ def test_set__is_noted_in_a_training(ethbrake: Command, tiny_recipe: Path, tmp_p
     assert told == (["seed=5", "restitution=0.2"], 5, 0.2)
 
 
-def test_new__on_a_table_has_its_rows_beside_it(ethbrake: Command, tmp_path: Path) -> None:
+def test_new__on_a_table_has_its_rows_beside_it(
+    ethbrake: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trial, "WORLDS", 10)
     weighed = "{columns: [gap_1_m, gap_2_m, recording], rows: [[9, 8, a], [7, 6, 'b, c']], weights: [1, 3]}"
     base = tmp_path / "base.yaml"
     base.write_text(f"name: base\ntable: {weighed}\nspeeds_mps: 20\nbraking_capacity_mps2: 6\n"
