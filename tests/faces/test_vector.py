@@ -1,4 +1,4 @@
-"""The vector environment of the second edition: ends at a limit of steps, descriptions of its worlds."""
+"""The vector environment: ends at a limit of steps, descriptions of its worlds."""
 
 import numpy as np
 import pytest

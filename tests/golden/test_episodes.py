@@ -1,4 +1,4 @@
-"""Episodes of the shipped scenarios, which must stay when the first edition is gone (tests/second compares both).
+"""Episodes of the shipped scenarios, recorded from version 0.5: they must stay as they are.
 
 ``episodes.json`` has digests of every bit, ``episodes.npz`` numbers: where only a digest differs, rounding has changed.
 ``python -m tests.golden.test_episodes`` records them anew.

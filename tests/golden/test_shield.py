@@ -1,4 +1,4 @@
-"""The step shield is as good as the first edition's was: recorded sums of harm, bounds and decisions of 300 worlds."""
+"""The step shield is as good as version 0.5's was: recorded sums of harm, bounds and decisions of 300 worlds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The motion of the second edition on many worlds: rational numbers, small steps, and every bit of a batch.
+"""The motion of this package on many worlds: rational numbers, small steps, and every bit of a batch.
 
 With ``--worlds 10000`` (the default) each of twenty kinds of worlds has 500: 2 to 6 vehicles, with an obstacle or not,
 with brakes that act at once or build up.

@@ -1,4 +1,4 @@
-"""Means over seeds and worlds; figures recorded from the first edition."""
+"""Means over seeds and worlds; figures recorded from version 0.5."""
 
 import numpy as np
 import pytest

@@ -166,14 +166,14 @@ def test_agent__whose_messages_lack_a_piece_is_refused_unless_it_sees_the_vehicl
     assert harms[0] == harms[1] and harms[0][0] > 0.0
 
 
-GOLDEN = {  # mean first-impact harm of 50 worlds, seed 7, recorded from the first edition
+GOLDEN = {  # mean first-impact harm of 50 worlds, seed 7, recorded from version 0.5
     "paper-random": [16.1551, 42.095, 16.8336, 40.1944, 61.0173, 42.2942, 13.8795],
     "cooperation-2-blocked": [27.7127, 45.6304, 28.4767, 45.7241, 66.1125, 45.5764, 21.8598],
 }
 
 
 @pytest.mark.parametrize("scenario", GOLDEN)
-def test_field__has_the_harm_of_the_first_edition(scenario: str) -> None:
+def test_field__has_the_harm_of_version_0_5(scenario: str) -> None:
     result = eb.evaluate(scenario, "field", episodes=50)
     assert [*result.columns] == group("field") == [*LAWS]
     assert [round(float(each["first_impact_harm"].mean()), 4) for each in result.columns.values()] == GOLDEN[scenario]

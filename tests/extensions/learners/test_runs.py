@@ -1,4 +1,4 @@
-"""Whole trainings: the weights of the first edition, going on after a kill, shipped recipes, and what is refused."""
+"""Whole trainings: the weights of version 0.5, going on after a kill, shipped recipes, and what is refused."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def begin(name: str, run: Path, **settings: Any) -> Any:
     return train(*TRAININGS[name], run, **{"on_progress": None, **settings})
 
 
-# recorded from the first edition, but for `experts`, whose templates come from another stream of random numbers
+# recorded from version 0.5, but for `experts`, whose templates come from another stream of random numbers
 GOLDEN = {
     "vine": ([0.0992646, 46.9787, 0.022246, 0.156827], 144.39235738133806),
     "rollouts": ([0.879668, 20.5613, 0.141928, 0.430946], 49.66282439932783),

@@ -1,4 +1,4 @@
-"""Observations of random worlds, by their digests, which the first edition's observations confirmed to six digits."""
+"""Observations of random worlds, by their digests, which version 0.5's observations confirmed to six digits."""
 
 import hashlib
 

@@ -75,7 +75,7 @@ def test_witness__is_the_largest_trajectory_behind_the_front_vehicle(gap, speeds
     assert not play(state, 2, verdict.switch_s, verdict.command_mps2).collided.any()
 
 
-# Recorded from the first edition, to the last bit: reasons and margins of the first worlds of seed 7.
+# Recorded from version 0.5, to the last bit: reasons and margins of the first worlds of seed 7.
 RECORDED = {
     "paper-random": (
         [2, 2, 0, 0, 0, 3],

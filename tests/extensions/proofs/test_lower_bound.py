@@ -85,7 +85,7 @@ def test_early__impacts_before_the_latency_are_certain():
     assert lower_bound(state, count="total").early[0] == pytest.approx(4)
 
 
-# Recorded from the first edition: the first worlds of seed 7, for commands at any time and at decisions.
+# Recorded from version 0.5: the first worlds of seed 7, for commands at any time and at decisions.
 RECORDED = {
     "paper-random": (
         8.0,

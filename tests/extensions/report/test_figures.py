@@ -196,7 +196,7 @@ def test_trajectories__of_a_team_show_the_commands_of_each_learner_and_the_obsta
 
 
 def test_deceleration_figure__marks_what_e_v2x_bm_predicts_and_does() -> None:
-    """World 5 of seed 7: golden values of the first edition."""
+    """World 5 of seed 7: golden values of version 0.5."""
     scenario = eb.load_scenario("paper-random")
     figure = deceleration_figure(scenario.sample(1, 7, first=5), scenario, known={"first": 14.41, "total": 14.84})
     words = legend(figure)

@@ -1,4 +1,4 @@
-"""The paper's fixed-step map: an impact by hand, a separately written reference, figures of the first edition."""
+"""The paper's fixed-step map: an impact by hand, a separately written reference, figures of version 0.5."""
 
 import numpy as np
 import pytest
@@ -96,7 +96,7 @@ def test_map__is_that_of_a_reference(step_s: float) -> None:
     [(0.1, -7.0, 23.479299909088144), (0.2, -7.0, 29.585014941952608), (0.25, -7.0, 36.812182133604814),
      (0.5, -7.0, 35.79459513033634), (0.1, -5.0, 27.97726529370422)],
 )  # fmt: skip
-def test_map__has_the_figures_of_the_first_edition(step_s: float, vehicle_2: float, harm: float) -> None:
+def test_map__has_the_figures_of_version_0_5(step_s: float, vehicle_2: float, harm: float) -> None:
     assert advance_sampled(worlds(2_000, vehicle_2), 8.0, step_s).harm("first").mean() == harm
 
 

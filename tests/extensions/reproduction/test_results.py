@@ -1,4 +1,4 @@
-"""Tables and curves: numbers recorded from the first edition, groups and verdicts by hand."""
+"""Tables and curves: numbers recorded from version 0.5, groups and verdicts by hand."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +33,7 @@ from ethbrake_marl.files.sheet import Estimate
 
 SETTINGS = Settings(Path("unused"), episodes=100)
 
-# collisions, first-impact harm, total harm, predicted harm in the first 100 worlds, by the first edition
+# collisions, first-impact harm, total harm, predicted harm in the first 100 worlds, by version 0.5
 GOLDEN = {
     (RANDOM, STATED): {
         "full_brake": (80, 21.01116356815893, 22.464131799726196, None),
@@ -58,7 +58,7 @@ GOLDEN = {
 
 
 @pytest.mark.parametrize("where", GOLDEN, ids=lambda where: f"{where[0]}, {where[1].name}")
-def test_numbers__are_those_of_the_first_edition(where) -> None:
+def test_numbers__are_those_of_version_0_5(where) -> None:
     name, reading = where
     scenario, agents = reading.scenario(name), {spec: spec for spec in GOLDEN[where]}
     numbers = tables.numbers_of(drive(scenario, agents, 100), least_harm(scenario, 100))

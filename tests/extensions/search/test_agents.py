@@ -21,7 +21,7 @@ def harms(result: eb.Result, agent: str) -> tuple[list[float], list[float]]:
 
 @pytest.mark.parametrize(
     ("name", "count", "first", "total"),
-    [  # means of README and findings are of these agents: here 400 and 200 worlds, recorded from the first edition
+    [  # means of README and findings are of these agents: here 400 and 200 worlds, recorded from version 0.5
         ("paper-random", "first", 5.5924, 5.6690),
         ("paper-random-obstacle", "total", 26.9106, 33.0489),
     ],
@@ -55,7 +55,7 @@ def test_searched__is_never_worse_and_as_predicted(inside: str, count: str) -> N
 
 
 def test_searched__golden() -> None:
-    """The mean is that of the first edition, to the last bit in every one of 400 worlds."""
+    """The mean is that of version 0.5, to the last bit in every one of 400 worlds."""
     result = eb.evaluate("paper-random", "full_brake+search", episodes=400)
     assert result["full_brake+search"]["first_impact_harm"].mean() == pytest.approx(8.0650, abs=5e-5)
 

@@ -96,7 +96,7 @@ def test_stepwise__and_back() -> None:
     assert Profiles.of_steps(profiles.stepwise(4), np.array([3])).ends.tolist() == [[1, 2, 3, 3]]
 
 
-# recorded from the first edition: the shipped tables hold these hashes
+# recorded from version 0.5: the shipped tables hold these hashes
 IDENTITIES = {
     "paper-random": 0xEA8CDDCC0206331A,
     "paper-random-obstacle": 0xA13E65B184B72DDA,

@@ -1,4 +1,4 @@
-"""Searches: golden values of the first edition, an optimum by hand, never worse than what they begin with."""
+"""Searches: golden values of version 0.5, an optimum by hand, never worse than what they begin with."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ WORLDS = SCENARIO.sample(6, seed=7)
 PROBLEM = problem_of(GAME, WORLDS)
 STEPS = int(PROBLEM.last_step.max())
 
-# harms in m2/s2, to the last bit those of the first edition: scenario, objective, count, the first six worlds of seed 7
+# harms in m2/s2, to the last bit those of version 0.5: scenario, objective, count, the first six worlds of seed 7
 GOLDEN = [
     ("paper-random", "total", "first", [5.600547589835766, 21.26316012252266, 0.0, 0.0, 0.0, 22.016897120852203]),
     ("paper-random-obstacle", "total", "total", [33.6502448813353, 209.19734531264413, 0, 0, 0, 21.22328931851079]),
