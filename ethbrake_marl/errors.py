@@ -10,11 +10,6 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
 from numbers import Integral
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 _NAMED = 5  # largest number of failed worlds that a message lists one by one
 
@@ -198,10 +193,6 @@ class PhysicsError(EthBrakeError, ArithmeticError):
         more = len(self.worlds) - len(named)
         return one_line("; ".join([*named, f"and {count_of(more, 'more world')}"] if more else named))
 
-    def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> PhysicsError:
-        """Return this error with other row numbers: row k of this batch becomes row ``rows[k]`` of a larger batch."""
-        return PhysicsError({int(rows[row]): reason for row, reason in self.worlds.items()})
-
 
 class AgentFailed(InvalidInput):
     """An agent of the user raised an exception or returned no valid actions; the message names agent, world and step.
@@ -217,10 +208,6 @@ class AgentFailed(InvalidInput):
     def __str__(self) -> str:
         where = "" if self.row is None else f", world {self.row}"
         return one_line(f"agent {self.agent!r}{where}, {self.reason}")
-
-    def renumbered(self, rows: Sequence[int] | NDArray[np.int64]) -> AgentFailed:
-        """Return this error with another row number: row k of this batch becomes row ``rows[k]`` of a larger batch."""
-        return AgentFailed(self.agent, None if self.row is None else int(rows[self.row]), self.reason)
 
     @staticmethod
     @contextmanager
@@ -239,22 +226,6 @@ class AgentFailed(InvalidInput):
 
 class Unfamiliar(UserWarning):
     """Warning: a trained policy is used in worlds that differ from the worlds of its training."""
-
-
-@contextmanager
-def renumbered(rows: Sequence[int] | NDArray[np.int64]) -> Iterator[None]:
-    """Context manager: change the row numbers in a ``PhysicsError`` or ``AgentFailed`` that is raised in the block.
-
-    The block works on a part of a batch: world k of the part is row ``rows[k]`` of the whole batch.
-    """
-    try:
-        yield
-    except (PhysicsError, AgentFailed) as error:
-        raise error.renumbered(rows) from error
-
-
-class UncertifiedStep(EthBrakeError):
-    """The engine's time step differs from the step that the shield certified, so the engine's step is undone."""
 
 
 def new_name(name: object, known: Collection[str]) -> str | None:

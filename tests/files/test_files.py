@@ -1,18 +1,14 @@
 """Plain files that are read and replaced, and YAML; refusals: ``test_refusals``."""
 
-import io
 import math
 import os
-import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
-from ethbrake_marl.files.arrays import ArrayArchive
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.files.store import check_folder, write_output
@@ -80,15 +76,6 @@ def test_folder__takes_files_that_are_new_or_replaced_by_force(tmp_path: Path) -
         check_folder(tmp_path, ("new.csv", "old.csv"))
     with pytest.raises(InvalidInput, match=r"old\.csv is not a folder; give a new folder"):
         check_folder(tmp_path / "old.csv" / "new")
-
-
-def test_arrays__may_have_as_many_bytes_as_are_allowed() -> None:
-    stream = io.BytesIO()
-    np.savez(stream, a=np.arange(4.0), b=np.zeros(3, np.float32))
-    size = sum(member.file_size for member in zipfile.ZipFile(stream).infolist())
-    assert [*ArrayArchive(stream.getvalue(), size).headers] == ["a", "b"]
-    with pytest.raises(ValueError, match=f"would have {size:,} bytes when unpacked; at most {size - 1:,} are allowed"):
-        ArrayArchive(stream.getvalue(), size - 1)
 
 
 # ---------------------------------------------------------------- YAML

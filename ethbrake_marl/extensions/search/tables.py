@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, describe_error
 from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, UInt64s
-from ethbrake_marl.files.arrays import ArrayArchive, ArrayRow
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.motion.layout import Bools, Floats
@@ -40,15 +41,15 @@ class BestHarmTable:
     def load(cls, path: Path) -> BestHarmTable:
         """Read a table. Raises ``InvalidInput`` if there is no such file, ``CorruptBundle`` if it is not a table.
 
-        Names, types, shapes and sizes of the arrays are checked before the file is unpacked.
+        The size is checked before the file is unpacked, and no pickle is read.
         """
         if not path.exists():
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
         try:
-            archive = ArrayArchive(data, UNPACKED_LIMIT_BYTES)
-            counts = [count for count in COUNTS if f"{count}_harm" in archive.headers] or [*COUNTS]
-            arrays = archive.unpack([row for count in counts for row in _rows(count)])
+            arrays = _unpacked(data)
+            counts = [count for count in COUNTS if f"{count}_harm" in arrays] or [*COUNTS]
+            _check_arrays(arrays, counts)
             header = parse_strict_json(arrays["header"].tobytes())
             if not isinstance(header, dict) or header.pop("format", None) is not FORMAT:
                 raise ValueError(f"header: must be an object with the entry format: {FORMAT}")
@@ -131,16 +132,36 @@ def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
     return least, profiles
 
 
-def _rows(count: str) -> list[ArrayRow]:
-    """Return name, type and shape of the arrays of one count: n worlds, m phases in all, B controlled vehicles."""
-    return [
-        ArrayRow("header", "|u1", ("bytes",)),
-        ArrayRow("identity", "<u8", ("n",)),
-        ArrayRow(f"{count}_harm", "<f8", ("n",)),
-        ArrayRow(f"{count}_phases", "<u2", ("n",)),
-        ArrayRow(f"{count}_ends", "<u2", (f"m of {count}",)),
-        ArrayRow(f"{count}_commands", "|u1", (8, f"m of {count}", "B")),
-    ]
+def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a .npz file. Raises ``ValueError`` for a damaged or too large one."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > UNPACKED_LIMIT_BYTES:
+            raise ValueError(f"its arrays have {size:,} bytes; must have at most {UNPACKED_LIMIT_BYTES:,}")
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            return {name: np.asarray(arrays[name]) for name in arrays.files}
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, TypeError, MemoryError) as error:
+        raise ValueError(f"the archive is damaged ({describe_error(error)})") from None
+
+
+def _check_arrays(arrays: Mapping[str, NDArray[Any]], counts: Sequence[str]) -> None:
+    """Check names, types and shapes: n worlds, m phases of one count in all, B controlled vehicles."""
+    wanted: dict[str, tuple[str, int]] = {"header": ("|u1", 1), "identity": ("<u8", 1)}  # type, number of axes
+    for count in counts:
+        wanted |= {f"{count}_harm": ("<f8", 1), f"{count}_phases": ("<u2", 1), f"{count}_ends": ("<u2", 1)}
+        wanted[f"{count}_commands"] = ("|u1", 3)
+    for name in sorted(wanted.keys() ^ arrays.keys()):
+        raise ValueError(f"array {name!r}: {'is missing' if name in wanted else 'must not be in this file'}")
+    for name, (kind, axes) in wanted.items():
+        if arrays[name].dtype != np.dtype(kind) or arrays[name].ndim != axes:
+            raise ValueError(f"array {name!r}: has type {arrays[name].dtype} and {arrays[name].ndim} axes")
+    n = len(arrays["identity"])
+    for count in counts:
+        m = len(arrays[f"{count}_ends"])
+        shapes = [arrays[f"{count}_{name}"].shape for name in ("harm", "phases")]
+        if shapes != [(n,), (n,)] or arrays[f"{count}_commands"].shape[:2] != (8, m):
+            raise ValueError(f"arrays of {count}: do not have {n} worlds and {m} phases")
 
 
 def _profiles(arrays: Mapping[str, NDArray[Any]], count: str) -> Profiles:

@@ -122,7 +122,7 @@ DAMAGED: dict[str, Callable[[BestHarmTable], bytes]] = {
     "first_ends: must not decrease within a world": changed(
         lambda arrays: arrays.update(first_ends=arrays["first_ends"][::-1])
     ),
-    "array 'total_commands' must not be in this file": changed(lambda arrays: arrays.pop("total_harm")),
+    "array 'total_commands': must not be in this file": changed(lambda arrays: arrays.pop("total_harm")),
     "identity": changed(lambda arrays: arrays.update(identity=arrays["identity"].astype(np.int32))),
     "is not a table of best known harm": lambda table: table.content()[:-40],
 }  # fmt: skip
