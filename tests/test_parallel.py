@@ -1,11 +1,10 @@
-"""Independent calls, one at a time in this process; the slow tests of evaluation have several."""
+"""Independent calls: one at a time, in processes, and where joblib's configuration says."""
 
-import subprocess
-import sys
+import os
 
 import pytest
 
-from ethbrake_marl.parallel import run_each
+from ethbrake_marl.parallel import WorkerLost, run_each
 
 
 def test_calls__are_taken_shortly_before_their_turn_and_answered_in_order() -> None:
@@ -15,25 +14,15 @@ def test_calls__are_taken_shortly_before_their_turn_and_answered_in_order() -> N
     assert ([*answers], taken) == ([1, 4], [3, 1, 2])
 
 
-AFTER_RAY = """
-import signal, sys
-from ethbrake_marl.parallel import run_each
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, lambda number, frame: print("own handler", flush=True))
-    print(list(run_each([(pow, 3, k) for k in range(3)], 1, "local")), flush=True)
-    signal.raise_signal(signal.SIGTERM)
-    try:
-        signal.raise_signal(signal.SIGINT)
-    except KeyboardInterrupt:
-        print("interrupted", flush=True)
-"""
+def test_calls__run_where_joblib_is_told_to_run_them() -> None:
+    joblib = pytest.importorskip("joblib")
+    with joblib.parallel_config(backend="threading"):
+        assert [*run_each(((os.getpid,) for _ in range(3)), 2)] == [os.getpid()] * 3
 
 
 @pytest.mark.slow
-def test_on_ray__the_callers_signal_handlers_are_in_force_afterwards() -> None:
-    """Ray sets a handler in C, which Python's ``signal.getsignal`` does not show; so signals are sent."""
-    pytest.importorskip("ray")
-    ended = subprocess.run([sys.executable, "-c", AFTER_RAY], capture_output=True, text=True, check=False)
-    told = [line for line in ended.stdout.splitlines() if "raylet" not in line]
-    assert (ended.returncode, told) == (0, ["[1, 3, 9]", "own handler", "interrupted"]), ended.stderr
+def test_process__that_is_killed_is_an_error_and_each_has_one_thread() -> None:
+    pytest.importorskip("joblib")
+    assert [*run_each(((os.getenv, "OMP_NUM_THREADS") for _ in range(3)), 2)] == ["1"] * 3
+    with pytest.raises(WorkerLost, match="use fewer processes"):
+        list(run_each([(os._exit, 3)], 2))

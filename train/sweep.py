@@ -1,7 +1,7 @@
 """A sweep: train every recipe in every scenario with every seed, and write one table. Read it from top to bottom.
 
     python train/sweep.py --scenarios paper-random --recipes ppo sac --jobs 4 --output runs/sweep
-    python train/sweep.py --scenarios paper-random --recipes ppo sac --ray 10.0.0.1:6379 --output /shared/sweep
+    python train/sweep.py --scenarios paper-random --recipes ppo --jobs 64 --ray 10.0.0.1:6379 --output /shared/sweep
 
 Each training run has a folder of its own in ``--output``; ``results.csv`` has a row for each of them. After an
 interruption, start the same command again: finished training runs are skipped, and unfinished ones go on from their
@@ -12,6 +12,7 @@ can reach the ports of the cluster can run code on it with your rights, so open 
 """
 
 import argparse
+from contextlib import contextmanager, nullcontext
 from itertools import product
 from pathlib import Path
 
@@ -52,15 +53,30 @@ def sweep(args: argparse.Namespace) -> int:
     jobs = read_jobs(args)
     rows, failed = [], 0
     with folder_of_many(args.output, "results.csv"):
-        reasons = run_each(((job.attempt,) for job in jobs), args.jobs, args.ray)
-        for job, reason in zip(jobs, reasons, strict=True):
-            failed += bool(reason)
-            recipe, scenario = job.training.recipe, job.training.scenario
-            about = {"run": job.folder.name, "scenario": scenario.name, "recipe": recipe.name, "seed": recipe.seed}
-            rows.append({**about, "reason": reason, **({} if reason else job.result())})
-            print(f"{len(rows)} of {len(jobs)}: {job.folder.name}: {reason or 'finished'}", flush=True)
+        with on_ray(args.ray) if args.ray else nullcontext():
+            reasons = run_each(((job.attempt,) for job in jobs), args.jobs)
+            for job, reason in zip(jobs, reasons, strict=True):
+                failed += bool(reason)
+                recipe, scenario = job.training.recipe, job.training.scenario
+                about = {"run": job.folder.name, "scenario": scenario.name, "recipe": recipe.name, "seed": recipe.seed}
+                rows.append({**about, "reason": reason, **({} if reason else job.result())})
+                print(f"{len(rows)} of {len(jobs)}: {job.folder.name}: {reason or 'finished'}", flush=True)
         write_file(args.output / "results.csv", csv_text(rows).encode())
     return failed
+
+
+@contextmanager
+def on_ray(address):
+    """Context manager: joblib sends its work to a running Ray cluster, or to Ray on this machine (``local``)."""
+    import ray
+    from joblib import parallel_config
+    from ray.util.joblib import register_ray
+
+    ray.init(address=address, runtime_env={"env_vars": {"OMP_NUM_THREADS": "1"}})
+    register_ray()
+    with parallel_config(backend="ray"):
+        yield
+    ray.shutdown()
 
 
 if __name__ == "__main__":
@@ -69,7 +85,7 @@ if __name__ == "__main__":
     parser.add_argument("--recipes", nargs="+", required=True, metavar="NAME", help="names or paths of recipes")
     parser.add_argument("--seeds", type=int, default=5, metavar="N", help="seeds 0 to N - 1 (default: 5)")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings of every run")
-    parser.add_argument("--jobs", type=int, metavar="N", help="runs at the same time (default: 1; with Ray all cores)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="runs at the same time (default: 1)")
     parser.add_argument("--ray", metavar="ADDRESS", help="a running Ray cluster, or `local` for Ray on this machine")
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="folder of all results")
     try:

@@ -52,11 +52,6 @@ JobsOption = Annotated[
     int | None, typer.Option(help="Number of parallel processes; does not change results.", min=1, max=64)
 ]
 
-RayOption = Annotated[
-    str | None,
-    typer.Option(metavar="local|ADDRESS", help="Compute with Ray: on this machine, or on the cluster at ADDRESS."),
-]
-
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on stdout as JSON.")]

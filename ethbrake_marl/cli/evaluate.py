@@ -14,7 +14,6 @@ from ethbrake_marl.cli.command import (
     JobsOption,
     JsonOption,
     Out,
-    RayOption,
     ScenarioOption,
     SettingsOption,
 )
@@ -53,7 +52,6 @@ def evaluate_command(
         ),
     ] = False,
     jobs: JobsOption = None,
-    ray: RayOption = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -77,7 +75,7 @@ def evaluate_command(
                     f"{option}: cannot be used with {scenario}, a group of {len(names)} scenarios; name one scenario"
                 )
         count = (GROUP_EPISODES if names else 10_000) if episodes is None else episodes
-        every = {name: _compared(out, name, chosen, agents, count, seed, jobs, ray) for name in names or [scenario]}
+        every = {name: _compared(out, name, chosen, agents, count, seed, jobs) for name in names or [scenario]}
         if report and output is not None:
             write = page_of("evaluation", "--report")
             output.mkdir(parents=True, exist_ok=True)
@@ -87,7 +85,7 @@ def evaluate_command(
 
 
 def _compared(
-    out: Out, scenario: str, chosen: Settings, agents: str, episodes: int, seed: int, jobs: int | None, ray: str | None
+    out: Out, scenario: str, chosen: Settings, agents: str, episodes: int, seed: int, jobs: int | None
 ) -> Compared:
     """Return what the agents do in one scenario."""
     from ethbrake_marl.evaluation.compared import Compared
@@ -99,7 +97,7 @@ def _compared(
     loaded = chosen.change_scenario(scenario)
     return Compared.of(
         loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
-        measures=measures, jobs=jobs or 1, ray=ray, on_done=lambda done: out.progress("worlds", done, episodes),
+        measures=measures, jobs=jobs or 1, on_done=lambda done: out.progress("worlds", done, episodes),
     )  # fmt: skip
 
 

@@ -36,12 +36,11 @@ class Compared(NamedTuple):
         harm_count: str = "first",
         measures: Iterable[str] | str = (),
         jobs: int = 1,
-        ray: str | None = None,
         on_done: Callable[[int], None] | None = None,
     ) -> Compared:
         """Let the teams drive the list; the arguments are those of ``evaluate``."""
         result = evaluate(
-            scenario, teams, episodes=episodes, seed=seed, harm_count=harm_count, measures=measures, jobs=jobs, ray=ray,
+            scenario, teams, episodes=episodes, seed=seed, harm_count=harm_count, measures=measures, jobs=jobs,
             on_done=on_done,
         )  # fmt: skip
         return cls(scenario, teams, result, summarise(result), harm_count)

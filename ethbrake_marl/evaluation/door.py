@@ -27,7 +27,6 @@ def evaluate(
     harm_count: str = "first",
     measures: Iterable[str] | str = (),
     jobs: int = 1,
-    ray: str | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> Result:
     """Let agents drive the same worlds, each once; return what they did.
@@ -46,7 +45,6 @@ def evaluate(
         harm_count: what optimising agents minimise, harm of the ``first`` impact of each pair or ``total``.
         measures: names of measures beside the usual ones (``evaluation.named_measures``).
         jobs: number of processes.
-        ray: ``local``, or address of a Ray cluster.
         on_done: called with the number of worlds that have been driven so far.
 
     Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for anything else that is wrong.
@@ -76,6 +74,4 @@ def evaluate(
         given = loaded.draw(int(episodes), seed)
     teams = teams_of(agents, loaded, harm_count=harm_count)
     about["agent_settings"] = {"harm_count": harm_count}
-    return evaluate_teams(
-        given, teams, game, measures_called(measures or ()), jobs, ray=ray, about=about, on_done=on_done
-    )
+    return evaluate_teams(given, teams, game, measures_called(measures or ()), jobs, about=about, on_done=on_done)

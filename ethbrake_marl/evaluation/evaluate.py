@@ -119,7 +119,6 @@ def evaluate(
     measures: Iterable[Measure] = (),
     jobs: int | None = 1,
     *,
-    ray: str | None = None,
     about: Mapping[str, Any] | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> Result:
@@ -131,7 +130,6 @@ def evaluate(
         game: game of the worlds' scenario.
         measures: measures beside the usual ones, for instance ``measures_called("sampled_harm,injury")``.
         jobs: number of processes.
-        ray: ``local``, or address of a Ray cluster; None: processes of joblib.
         about: what else tables and files should say (``identity.about_scenario``).
         on_done: called with the number of worlds that all teams have driven so far.
 
@@ -154,10 +152,10 @@ def evaluate(
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
     )
-    if jobs not in (None, 1) or ray is not None:
+    if jobs not in (None, 1):
         _check_can_be_sent(agents, chosen)
     parts: list[dict[str, Columns]] = []
-    for part in run_each(calls, jobs, ray):
+    for part in run_each(calls, jobs):
         parts.append(part)
         if on_done is not None:
             on_done(min(len(parts) * CHUNK, n))

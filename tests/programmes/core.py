@@ -3,7 +3,8 @@
 The copy has neither ``ethbrake_marl/extensions`` nor ``tests/extensions``, and no entry points to them in
 ``pyproject.toml``. ``make core`` runs this programme in about 100 s of processor time: the first case of each
 parametrised test, in one process, without the tests of the installation. ``--whole`` runs all tests of the core with
-all cases. ``--each`` instead deletes one extension at a time, with the extensions that use it.
+all cases. ``--each`` instead deletes one extension at a time, with the extensions that use it, and runs the tests that
+remain, the first case of each.
 """
 
 import os
@@ -36,14 +37,6 @@ COMMANDS = {
     "evaluates behind the shield": ("evaluate", "--agents", f"ppo@{RUN}+step,ppo@{RUN}+episode", "--episodes", "200"),
     "lists the agents": ("agent", "list"),
 }
-IMPORTED = "import ethbrake_marl as eb; [getattr(eb, name) for name in eb.__all__]"
-SMALL = (
-    ("-c", IMPORTED),
-    ("-m", "ethbrake_marl", "--help"),
-    ("-m", "ethbrake_marl", "agent", "list"),
-    ("-m", "ethbrake_marl", "scenario", "parts"),
-    ("-m", "ethbrake_marl", "evaluate", "--agents", "ladder", "--episodes", "20"),
-)
 
 
 def cases(given: Given) -> Cases:
@@ -52,19 +45,27 @@ def cases(given: Given) -> Cases:
             extensions = [name for layer in layers("ethbrake_marl.extensions") for name in layer]
             for name in extensions:
                 gone = users_of(name)
-                copy = copy_without(gone, Path(folder) / name)
-                for words in SMALL:
-                    yield f"without {', '.join(sorted(gone))}: {' '.join(words)[:60]}", partial(ended, copy, words)
+                yield f"without {', '.join(sorted(gone))}", partial(passes_without, gone, Path(folder) / "copy")
         else:
             copy = copy_without(None, Path(folder) / "core")
             yield "no module names an extension", partial(names_none, copy)
             for name, words in COMMANDS.items():
                 yield name, partial(ended, copy, ["-m", "ethbrake_marl", *words])
-            apart = APART if given.whole else (*APART, *INSTALLATION)
-            how = ["-n", "2", "--dist", "worksteal"] if given.whole else ["--first-case"]
-            tests = ["-m", "pytest", "-q", *how, *(f"--ignore=tests/{each}" for each in apart), "tests"]
-            yield "the core's tests", partial(ended, copy, tests)
+            yield "the core's tests", partial(passes, copy, whole=given.whole)
         yield "processor time", used
+
+
+def passes(copy: Path, *, whole: bool) -> Told:
+    """Run the tests of a copy: all cases, or the first case of each test."""
+    apart = APART if whole else (*APART, *INSTALLATION)
+    how = ["-n", "2", "--dist", "worksteal"] if whole else ["--first-case"]
+    return ended(copy, ["-m", "pytest", "-q", *how, *(f"--ignore=tests/{each}" for each in apart), "tests"])
+
+
+def passes_without(gone: set[str], folder: Path) -> Told:
+    """Run the tests in a copy without some extensions. All copies stand in one place, and share machine code."""
+    shutil.rmtree(folder, ignore_errors=True)
+    return passes(copy_without(gone, folder), whole=False)
 
 
 def users_of(extension: str) -> set[str]:

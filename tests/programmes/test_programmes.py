@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.docs.printed import rows
-from tests.programmes import ROOT, Told, __main__ as runner, faults, hostile, libraries
+from tests.programmes import ROOT, Told, __main__ as runner, bugs, hostile, libraries
 
 
 def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -121,21 +121,27 @@ def test_proofs__every_statement_and_every_planted_bug():
 
 
 def test_bugs__each_patch_stands_in_the_code_exactly_once() -> None:
-    bugs, misfits = faults.planted()
-    assert misfits == [] and len(bugs) >= 25
+    assert bugs.misfits() == [] and len(bugs.planted()) >= 100
 
 
-def test_tests_of_a_function__are_those_that_call_it_near_ones_first():
-    summing = ["motion/contact.py:gap_after"]
-    tests = faults.Callers(
-        {
-            "tests/test_a.py::test_one": (0.1, ["motion/drive.py:drive"]),
-            "tests/test_b.py::test_two": (0.2, summing),
-            "tests/motion/test_c.py::test_three": (9.0, summing),
-        }
-    )
-    file = faults.PACKAGE / "motion/contact.py"
-    first = file.read_text("utf-8").splitlines().index("def gap_after(gap, closing, pressing, jerk, time):") + 1
-    near_ones_first = ["tests/motion/test_c.py::test_three", "tests/test_b.py::test_two"]
-    assert tests.ordered(tests.at(file, first + 2), "", 10.0, 9) == near_ones_first
-    assert tests.ordered(tests.at(file, first + 2), "", 5.0, 9) == near_ones_first[1:]
+def test_bug__is_planted_in_the_copy_and_taken_out_again(tmp_path, monkeypatch) -> None:
+    copy = bugs.copy_of_the_repository(tmp_path / "copy")
+    bug = bugs.planted()[0]
+    file, old, new = bug.patches[0]
+    asked: list[tuple[bool, list[str]]] = []
+
+    def failing(copy: Path, tests: list[str]) -> str:
+        asked.append((new in (copy / bugs.PACKAGE / file).read_text("utf-8"), tests))
+        return ""
+
+    monkeypatch.setattr(bugs, "failing", failing)
+    copies = bugs.SimpleQueue[Path]()
+    copies.put(copy)
+    assert bugs.finder(bug, copies) == ""
+    assert asked == [(True, ["tests/motion"]), (True, ["tests", "--ignore=tests/motion"])]
+    assert old in (copy / bugs.PACKAGE / file).read_text("utf-8")
+
+
+def test_tests_near_a_file__are_those_of_its_folder() -> None:
+    assert bugs.near("extensions/search/search.py") == ["tests/extensions/search"]
+    assert "tests/test_names.py" in bugs.near("names.py")
