@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Literal
+
+from ethbrake_marl.errors import one_line
+
+EVERY_S = 10.0  # time between two lines of progress (s) if stderr is not a terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,28 +63,47 @@ Told = OnProgress | Literal["show"] | None
 
 
 class ShownProgress:
-    """Prints progress on stderr.
-
-    On a terminal, one line of text is updated in place. Otherwise, a new line is printed for each tenth of the work and
-    for each evaluation.
-    """
+    """Prints progress on stderr: on a terminal a line that is updated in place, otherwise a line every ten seconds."""
 
     def __init__(self) -> None:
         self._terminal = False
         with suppress(AttributeError, ValueError):  # no terminal either: a stream that is closed or has no ``isatty``
             self._terminal = sys.stderr.isatty()
-        self._last: tuple[str, int] | None = None  # harm and tenth of the last line
+        self._begun: dict[str, tuple[float, int]] = {}  # name -> time and ``done`` of its first report
+        self._told_s = -EVERY_S  # time of the last line that was printed without a terminal
+        self._open = ""  # name of the task in the terminal's last line; empty if this line has ended
 
     def __call__(self, progress: Progress) -> None:
-        """Print the progress if it changed."""
-        ended, harm = progress.done >= progress.total, progress.harm
-        news = (harm, 10 * progress.done // max(progress.total, 1))
-        if not (self._terminal or progress.note or news != self._last):
-            return
-        self._last = news
+        """Print the progress if it is time."""
+        now, task = time.monotonic(), progress.name.partition(": ")[0]
+        if self._open not in ("", task) or progress.note:
+            self.end()
+        if progress.note:
+            self._print(f"{one_line(progress.note)}\n")
+        begun_s, first = self._begun.setdefault(progress.name, (now, progress.done))
         text = f"{progress.name}: {progress.done:,} of {progress.total:,}"
-        text += f", {harm}" if harm else ""
-        text += f"; {progress.note}" if progress.note else ""
-        line = f"\r{text}\x1b[K{chr(10) if ended else ''}" if self._terminal else f"{text}\n"
+        text += f", {progress.harm}" if progress.harm else ""
+        if progress.done > first:
+            left_s = (now - begun_s) * (progress.total - progress.done) / (progress.done - first)
+            text += f", about {left_s:.0f} s left" if left_s >= 1.0 else ""
+        if self._terminal:
+            tenths = min(10 * progress.done // max(progress.total, 1), 10)
+            width = shutil.get_terminal_size().columns
+            line = f"[{'#' * tenths:10}] {one_line(text)}"
+            self._print(f"\r{line[: width - 1]}\x1b[K")
+            self._open = task
+            if progress.done >= progress.total:
+                self.end()
+        elif now - self._told_s >= EVERY_S:
+            self._print(f"{one_line(text)}\n")
+            self._told_s = now
+
+    def end(self) -> None:
+        """End the line that is updated in place: what follows is printed below it."""
+        if self._open:
+            self._print("\n")
+            self._open = ""
+
+    def _print(self, text: str) -> None:
         with suppress(AttributeError, OSError, ValueError):  # nobody listens to a stream that is closed or cannot flush
-            print(line, end="", file=sys.stderr, flush=True)  # noqa: T201
+            print(text, end="", file=sys.stderr, flush=True)  # noqa: T201

@@ -7,11 +7,9 @@ import io
 import os
 import re
 import sys
-import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from threading import Thread
 from typing import Annotated, Any
 
 import typer
@@ -21,7 +19,7 @@ from typer.main import get_command
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
-from ethbrake_marl.cli.command import EVERY_S, Out, example
+from ethbrake_marl.cli.command import Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
 from ethbrake_marl.registry import OURS, Registry, giver, points
@@ -154,39 +152,19 @@ def prepare_streams() -> None:
 
 
 def tell_compilation(folder: Path, empty: bool) -> None:
-    """Announce that kernels are being compiled, and print every ten seconds how many are done.
+    """Announce that kernels are being compiled.
 
-    A background thread prints this number, because compiling a single kernel may take a minute. ``empty`` says
-    that this process has not loaded any kernel from ``folder``, in which compiled kernels are stored.
+    ``empty`` says that this process has not loaded any kernel from ``folder``, in which compiled kernels are stored.
     """
-    once = "the physics for the first time, which takes minutes" if empty else "parts of the physics for the first time"
-    always = (
-        "the physics; no folder for compiled kernels is writable, so every command compiles it again (for help:"
-        " ethbrake doctor)"
-    )
-    Out().note(f"compiling {always if is_temporary(folder) else f'{once}; later commands use the stored result'}")
-    from numba.core import event  # imported here because commands that compile nothing do not need numba
-
-    events: Any = event  # numba has no types for it
-    begun, done, running = time.monotonic(), 0, 0
-
-    class Count(event.Listener):  # type: ignore[misc]  # numba has no types
-        def on_start(self, event_: event.Event) -> None:
-            nonlocal running
-            running += 1
-
-        def on_end(self, event_: event.Event) -> None:
-            nonlocal done, running
-            done, running = done + 1, running - 1
-
-    def tell() -> None:
-        while True:
-            time.sleep(EVERY_S)
-            if running:
-                Out().note(f"still compiling: {done} kernels are done after {time.monotonic() - begun:.0f} s")
-
-    events.register("numba:compile", Count())
-    Thread(target=tell, daemon=True).start()
+    if is_temporary(folder):
+        what = (
+            "the physics; no folder for compiled kernels is writable, so every command compiles it again (for help:"
+            " ethbrake doctor)"
+        )
+    else:
+        part = "the physics for the first time, which takes a minute" if empty else "parts of the physics"
+        what = f"{part}; later commands use the stored result"
+    Out().note(f"compiling {what}")
 
 
 def abandon_output() -> None:

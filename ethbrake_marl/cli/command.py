@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import redirect_stdout
 from importlib import import_module
@@ -14,17 +13,14 @@ from typing import Annotated, Any, NoReturn, Self, TextIO
 
 import typer
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.segment import Segment
 
 from ethbrake_marl.errors import InvalidInput, one_line, plain_text
 from ethbrake_marl.faces.registration import register_environments
-from ethbrake_marl.progress import Progress as PartProgress
+from ethbrake_marl.progress import Progress, ShownProgress
 
 # special characters allowed in results; the no-break space is used between a number and its unit
 _KEPT = "\n\t\N{NO-BREAK SPACE}"
-
-EVERY_S = 10.0  # time between two lines of progress (s) if stderr is not a terminal
 
 ScenarioOption = Annotated[
     str, typer.Option(metavar="NAME|PATH", help="Name of a shipped or registered scenario, or path of a YAML file.")
@@ -94,11 +90,7 @@ class Out:
     def __init__(self, *, as_json: bool = False, force: bool = False, remains: str = "nothing was written") -> None:
         self.as_json, self.force, self.remains = as_json, force, remains
         self._stdout = sys.stdout
-        self._stderr: Console = _PlainConsole(sys.stderr)
-        self._bars: Progress | None = None
-        self._tasks: dict[str, TaskID] = {}
-        self._said_s = -EVERY_S  # time of the last line of progress (s), if stderr is not a terminal
-        self._begun: dict[str, tuple[float, int]] = {}  # time and progress at the first report of each task
+        self.show_progress = ShownProgress()  # receives the progress that a function of the package reports
         self._turned = redirect_stdout(sys.stderr)
 
     def __enter__(self) -> Self:
@@ -112,7 +104,7 @@ class Out:
     ) -> None:
         """Stop redirecting stdout; if the block was ended by Ctrl-C, print a message and exit with status 130."""
         self._turned.__exit__(kind, error, trace)
-        self.end_progress()
+        self.show_progress.end()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.remains}")
 
@@ -125,7 +117,7 @@ class Out:
 
     def print_json(self, content: Any) -> None:
         """Print ``content`` (plain data) as JSON on stdout, even without ``--json``."""
-        self.end_progress()
+        self.show_progress.end()
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
     def show(self, *shown: RenderableType, end: str = "\n") -> None:
@@ -133,7 +125,7 @@ class Out:
 
         Control characters in texts are escaped, except line ends and tabs.
         """
-        self.end_progress()
+        self.show_progress.end()
         for each in shown:
             if isinstance(each, str):
                 typer.echo(plain_text(each, keep=_KEPT) + end, self._stdout, nl=False)
@@ -142,7 +134,7 @@ class Out:
 
     def note(self, text: str) -> None:
         """Print a text as one line on stderr, below the progress bars."""
-        self.end_progress()
+        self.show_progress.end()
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
@@ -172,47 +164,9 @@ class Out:
         self.note(text)
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
-    def progress(self, name: str, done: int, total: int, harm: str = "", note: str = "") -> None:
-        """Show the progress of the task ``name``: ``done`` of ``total`` units of work are done.
-
-        A terminal shows one progress bar per task; a task ``TASK: STAGE`` has the same bar as ``TASK``. If stderr is
-        not a terminal, a line is printed at the beginning and every ten seconds. ``harm`` is a text that is shown after
-        the name, ``note`` is a message that is printed above the progress bars.
-        """
-        label = one_line(f"{name}, {harm}" if harm else name)
-        if not self._stderr.is_terminal:
-            if note:
-                say(note)
-            self._say_progress(name, label, done, total)
-            return
-        if note:
-            self._stderr.print(one_line(note), highlight=False)
-        if self._bars is None:
-            text = TextColumn("{task.description}", markup=False)
-            self._bars = Progress(text, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), console=self._stderr)
-            self._bars.start()
-        part = name.partition(": ")[0]
-        if part not in self._tasks:
-            self._tasks[part] = self._bars.add_task(label, total=total)
-        self._bars.update(self._tasks[part], completed=min(done, total), total=total, description=label)
-
-    def _say_progress(self, name: str, label: str, done: int, total: int) -> None:
-        now = time.monotonic()
-        begun_s, first = self._begun.setdefault(name, (now, done))
-        if now - self._said_s >= EVERY_S:
-            left_s = (now - begun_s) * (total - done) / (done - first) if done > first else 0.0
-            say(f"{label}: {done:,} of {total:,}{f', about {left_s:.0f} s left' if left_s >= 1.0 else ''}")
-            self._said_s = now
-
-    def show_progress(self, progress: PartProgress) -> None:
-        """Show the progress that a function of the package reports to ``on_progress``."""
-        self.progress(progress.name, progress.done, progress.total, progress.harm, progress.note)
-
-    def end_progress(self) -> None:
-        """Stop updating the progress bars. The bars stay on the screen, and later output is printed below them."""
-        if self._bars is not None:
-            self._bars.stop()
-            self._bars, self._tasks = None, {}
+    def progress(self, name: str, done: int, total: int) -> None:
+        """Show the progress of the task ``name``: ``done`` of ``total`` units of work are done."""
+        self.show_progress(Progress(name, done, total))
 
 
 class _PlainConsole(Console):

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import os
 import platform
-import re
 import subprocess
 import sys
 import tempfile
-import tomllib
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from ethbrake_marl import __version__
-from ethbrake_marl.cli.command import EVERY_S, JsonOption, Out
+from ethbrake_marl.cli.command import JsonOption, Out
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
-
-if TYPE_CHECKING:
-    from packaging.requirements import Requirement
 
 EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "notebook")
 
@@ -56,8 +50,6 @@ for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PP
 """
 
 _PACKAGE = Path(__file__).resolve().parents[1]
-
-_CHECKOUT = _PACKAGE.parent  # if the package is installed, this is the folder of packages, without a pyproject.toml
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,46 +93,20 @@ def _dependencies() -> Iterator[Check]:
 
     If a missing package is needed only by an extra, its check does not fail.
     """
-    from packaging.version import Version
-
-    pinned = _pinned_versions(_CHECKOUT / "constraints.txt")
-    for extra, requirement in _requirements():
-        name = requirement.name
-        wanted = f"needs {requirement.specifier}"
-        try:
-            installed = version(name)
-        except PackageNotFoundError:
-            what = f"is not installed; the extra {extra} installs it" if extra else f"is not installed; {wanted}"
-            yield Check(name, bool(extra), what)
-            continue
-        tested = pinned.get(name.lower())
-        note = f" (tested with {tested})" if tested and Version(installed).public != Version(tested).public else ""
-        fits = requirement.specifier.contains(installed, prereleases=True)
-        yield Check(name, fits, f"{installed}{note}" if fits else f"{installed}; {wanted}{note}")
-
-
-def _requirements() -> list[tuple[str, Requirement]]:
-    """Return the dependencies of the package as pairs (extra, requirement); the extra is "" for a core dependency.
-
-    They are read from ``pyproject.toml`` in a source checkout, or else from the metadata of the installed package.
-    """
     from packaging.requirements import Requirement
 
-    project = _CHECKOUT / "pyproject.toml"
-    if not project.is_file():
-        lines = [Requirement(line) for line in requires("ethbrake-marl") or []]
-        plain = [("", r) for r in lines if r.marker is None or r.marker.evaluate({"extra": ""})]
-        extra = [(e, r) for e in EXTRAS for r in lines if r.marker is not None and r.marker.evaluate({"extra": e})]
-        return plain + [(e, r) for e, r in extra if ("", r) not in plain]
-    table = tomllib.loads(project.read_text("utf-8"))["project"]
-    groups = {"": table["dependencies"], **{extra: table["optional-dependencies"][extra] for extra in EXTRAS}}
-    return [(extra, Requirement(line)) for extra, lines in groups.items() for line in lines]
-
-
-def _pinned_versions(constraints: Path) -> dict[str, str]:
-    """Return the versions in a pip constraints file by lower-case package name; empty if the file does not exist."""
-    text = constraints.read_text("utf-8") if constraints.is_file() else ""
-    return {name.lower(): pin for name, pin in re.findall(r"^([^\s#=]+)==([^\s#]+)", text, re.MULTILINE)}
+    wanted = [Requirement(line) for line in requires("ethbrake-marl") or []]
+    of = {extra: [r for r in wanted if r.marker and r.marker.evaluate({"extra": extra})] for extra in EXTRAS}
+    for extra, needed in {"": [r for r in wanted if r.marker is None], **of}.items():
+        for requirement in needed:
+            try:
+                installed = version(requirement.name)
+            except PackageNotFoundError:
+                why = f"the extra {extra} installs it" if extra else f"needs {requirement.specifier}"
+                yield Check(requirement.name, bool(extra), f"is not installed; {why}")
+                continue
+            fits = requirement.specifier.contains(installed, prereleases=True)
+            yield Check(requirement.name, fits, installed if fits else f"{installed}; needs {requirement.specifier}")
 
 
 def _processor() -> tuple[bool, str]:
@@ -202,28 +168,16 @@ def _golden_baseline() -> tuple[bool, str]:
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
     """Compile and store the kernels that the usual commands use, by calling these commands on a few worlds.
 
-    The commands run in parallel on all cores, and the progress is printed. With ``training``, also call ``ethbrake
-    run``, which needs torch. With ``run_alone``, call only the single command that compiles nearly all kernels of
-    ``ethbrake run``. Returns whether all commands succeeded, and a message.
+    With ``training``, also call ``ethbrake run``, which needs torch. With ``run_alone``, call only the single command
+    that compiles nearly all kernels of ``ethbrake run``. Returns whether all commands succeeded, and a message.
     """
     if is_temporary(cache_folder()):
         return False, "no folder for compiled kernels is writable; set NUMBA_CACHE_DIR to a writable folder"
-    begun, failed = perf_counter(), []
+    begun = perf_counter()
     doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] != "run"]
-    doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _IN_PYTHON, "in Python")]
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        called = {pool.submit(_call, door, folder): door[2] for door in doors}
-        waiting = set(called)
-        while waiting:
-            done, waiting = wait(waiting, EVERY_S, FIRST_COMPLETED)
-            failed += [f"{called[future]} failed: {future.result()}" for future in done if future.result()]
-            files = sum(1 for _ in cache_folder().iterdir())
-            Out().note(
-                f"compile: {len(called) - len(waiting)} of {len(called)} commands done, {files} files in the kernel"
-                " cache"
-            )
-    for failure in failed:
-        Out().note(f"compile: {failure}")
+    doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _IN_PYTHON)]
+    with tempfile.TemporaryDirectory() as folder:
+        failed = [reason for door in doors if (reason := _call(door, folder))]
     return not failed, "; ".join(failed) or f"all kernels compiled in {perf_counter() - begun:.0f} s"
 
 

@@ -1,6 +1,5 @@
 """``ethbrake run``, on trainings of a few small updates."""
 
-import inspect
 import json
 import signal
 from collections.abc import Callable
@@ -10,8 +9,8 @@ from typing import Any
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.cli.command import Out
 from ethbrake_marl.cli.run import quickest
+from ethbrake_marl.progress import Progress, ShownProgress
 from tests.fixtures.commands import Command, Refuse, told_json
 
 AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
@@ -23,18 +22,17 @@ def status_of(folder: Path, *names: str) -> tuple[Any, ...]:
     return tuple(content[name] for name in names)
 
 
-def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[dict[str, Any]], bool]) -> None:
+def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, *moments: Callable[[Progress], bool]) -> None:
     """Press Ctrl-C when what is shown first fits the first moment, then when it first fits the second, ..."""
-    waiting, progress = list(moments), Out.progress
+    waiting, show = list(moments), ShownProgress.__call__
 
-    def press(*args: Any, **kwargs: Any) -> None:
-        progress(*args, **kwargs)
-        shown = inspect.signature(progress).bind(*args, **kwargs).arguments
+    def press(self: ShownProgress, shown: Progress) -> None:
+        show(self, shown)
         if waiting and waiting[0](shown):
             waiting.pop(0)
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Out, "progress", press)
+    monkeypatch.setattr(ShownProgress, "__call__", press)
 
 
 def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake: Command, finished_run: Path) -> None:
@@ -50,7 +48,7 @@ def test_run__its_policy_evaluates_to_the_same_figures_afterwards(ethbrake: Comm
 
 
 def test_run__interrupted_twice_stops_at_once_and_keeps_the_policy(ethbrake, tiny_recipe, tmp_path, monkeypatch):
-    ctrl_c_when(monkeypatch, lambda shown: shown["done"] == 128, lambda shown: shown["name"] == "evaluation")
+    ctrl_c_when(monkeypatch, lambda shown: shown.done == 128, lambda shown: shown.name == "evaluation")
     folder = tmp_path / "stopped"
     answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "40", "--output", folder)
     assert (answer.status, answer.out) == (130, "") and answer.err.splitlines()[-1].startswith("interrupted; ")
@@ -88,7 +86,7 @@ def test_run__is_refused(refuse: Refuse) -> None:
 
 
 def test_evaluate__interrupted_writes_nothing(ethbrake: Command, tmp_path: Path, monkeypatch) -> None:
-    ctrl_c_when(monkeypatch, lambda shown: shown["name"] == "worlds")
+    ctrl_c_when(monkeypatch, lambda shown: shown.name == "worlds")
     answer = ethbrake("evaluate", "--episodes", "5", "--agents", "coast", "--output", tmp_path / "new")
     assert (answer.status, answer.out) == (130, "")
     assert answer.err.splitlines()[-1] == "interrupted; nothing was written" and list(tmp_path.iterdir()) == []
@@ -100,7 +98,7 @@ def test_resume__deletes_the_results_of_the_policy_before_and_nothing_else(
 ) -> None:
     folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:
-        ctrl_c_when(patch, lambda shown: shown["done"] == 128)
+        ctrl_c_when(patch, lambda shown: shown.done == 128)
         assert ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder).status == 130
     written = {"results.json", "worlds.csv"}
     assert {*status_of(folder, "written")[0]} == written and all((folder / name).exists() for name in written)

@@ -78,7 +78,7 @@ def test_resume__goes_on_and_says_what_is_next(
     ethbrake: Command, tiny_recipe: Path, empty_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        ctrl_c_when(patch, lambda shown: bool(shown["done"] == 128))
+        ctrl_c_when(patch, lambda shown: bool(shown.done == 128))
         answer = ethbrake("train", "--recipe", tiny_recipe, "--seed", "5", "--output", "stopped")
     assert answer.status == 130 and (Path("stopped") / "policy").is_dir()
     assert status_of(Path("stopped"))["status"] == "interrupted"

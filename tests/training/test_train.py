@@ -147,9 +147,8 @@ def test_train__needs_no_stream_for_its_progress(broken: str, tmp_path: Path, mo
 
 def test_train__shows_its_progress(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = begin("ppo", tmp_path / "run", steps=2 * UPDATE, on_progress="show")
-    harm = [f"first-impact harm {each['first_impact_harm']:.2f}" for each in result.evaluations]
-    lines = [f"training: 0 of 256, {harm[0]}", f"training: 128 of 256, {harm[0]}", f"training: 256 of 256, {harm[1]}"]
-    assert capsys.readouterr().err.splitlines() == lines
+    harm = f"first-impact harm {result.evaluations[0]['first_impact_harm']:.2f}"
+    assert capsys.readouterr().err == f"training: 0 of 256, {harm}\n"  # the next line would come after ten seconds
 
 
 def test_train__in_two_threads_is_refused_and_the_first_one_is_as_alone(tmp_path: Path) -> None:

@@ -76,7 +76,7 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
 ) -> None:
     folder = tmp_path / "stopped"
     with monkeypatch.context() as patch:
-        ctrl_c_when(patch, lambda shown: shown["done"] == 128)
+        ctrl_c_when(patch, lambda shown: shown.done == 128)
         answer = ethbrake("run", "--recipe", tiny_recipe, "--episodes", "20", "--output", folder, "--json")
     assert (answer.status, [row["agent"] for row in json.loads(answer.out)]) == (130, AGENTS)
     assert "interrupted after 128 steps; now evaluating the policy so far" in answer.err
