@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import shlex
-import signal
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ethbrake_marl.cli.command import Out
+from tests.cli.test_run import ctrl_c_when
 from tests.fixtures.commands import Command, check_refused, told_json
 
 
@@ -20,19 +17,6 @@ def status_of(folder: Path) -> dict[str, Any]:
     """The content of run.json."""
     content: dict[str, Any] = json.loads((folder / "run.json").read_text())
     return content
-
-
-def ctrl_c_when(monkeypatch: pytest.MonkeyPatch, moment: Callable[[dict[str, Any]], bool]) -> None:
-    """Press Ctrl-C once, when the progress that is shown fits."""
-    progress, pressed = Out.progress, []
-
-    def press(*args: Any, **kwargs: Any) -> None:
-        progress(*args, **kwargs)
-        if not pressed and moment(inspect.signature(progress).bind(*args, **kwargs).arguments):
-            pressed.append(True)
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Out, "progress", press)
 
 
 def test_train__ends_with_harm_beside_full_braking_and_a_command_that_measures_the_same(

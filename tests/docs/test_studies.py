@@ -21,7 +21,7 @@ BASE = eb.load_scenario("cooperation-2-paper")
 
 
 def test_price__is_nothing_where_everything_is_known():
-    found = price.drive(BASE, 12, {"paper": {"preset": "paper"}})["paper"]
+    found = price.drive(BASE, 3, {"paper": {"preset": "paper"}})["paper"]
     for count in price.COUNTS:
         assert price.price(found, "e_v2x_bm:estimated", count).value == pytest.approx(0.0, abs=1e-4)
     assert price.above(found, "e_v2x_bm:estimated") is None

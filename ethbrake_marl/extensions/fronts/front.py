@@ -93,7 +93,7 @@ def search_front(
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
     >>> scenario = eb.load_scenario("paper-random")
-    >>> front = search_front(scenario, scenario.sample(3, 7), [[1, 1, 1], [1, 0, 0]], budget=300)
+    >>> front = search_front(scenario, scenario.sample(2, 7), [[1, 1, 1], [1, 0, 0]], budget=60)
     >>> bool((front.borne["first"][1, :, 0] <= front.borne["first"][0, :, 0]).all())
     True
 
