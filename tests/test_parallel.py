@@ -20,7 +20,6 @@ def test_calls__run_where_joblib_is_told_to_run_them() -> None:
         assert [*run_each(((os.getpid,) for _ in range(3)), 2)] == [os.getpid()] * 3
 
 
-@pytest.mark.slow
 def test_process__that_is_killed_is_an_error_and_each_has_one_thread() -> None:
     pytest.importorskip("joblib")
     assert [*run_each(((os.getenv, "OMP_NUM_THREADS") for _ in range(3)), 2)] == ["1"] * 3

@@ -24,18 +24,7 @@ from tests.programmes import ROOT, Cases, Given, Told
 
 PACKAGE = "ethbrake_marl"
 BUGS = Path(__file__).with_name("bugs.yaml")
-COPIED = (
-    ".ci",
-    "docs",
-    PACKAGE,
-    "scenarios",
-    "tests",
-    "train",
-    "CHANGELOG.md",
-    "Makefile",
-    "README.md",
-    "pyproject.toml",
-)
+NOT_COPIED = (".git", ".venv", ".venvs", "runs", "build", "dist", "_build", "__pycache__", ".*_cache", ".hypothesis")
 PYTEST = ("-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--tb=no")
 LIMIT_S = 1800.0  # a bug whose tests do not end is found
 SOUND = "without a bug, no test fails"
@@ -91,12 +80,7 @@ def told(test: str) -> Told:
 
 def copy_of_the_repository(folder: Path) -> Path:
     """Copy what the tests need, with the times of its files, which numba compares."""
-    folder.mkdir()
-    for name in COPIED:
-        if (ROOT / name).is_dir():
-            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "_build"))
-        else:
-            shutil.copy2(ROOT / name, folder / name)
+    shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*NOT_COPIED))
     return folder
 
 
