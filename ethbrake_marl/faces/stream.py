@@ -32,21 +32,16 @@ class Stream:
         self.next = 0  # number of the next world
         self.given: Drawn | None = None  # the worlds that the last reset asked for
 
-    def restart(self, n: int, seed: int | None, options: Any = None, known: tuple[str, ...] = OPTIONS) -> State:
+    def restart(self, n: int, seed: int | None, options: Any = None) -> State:
         """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
 
         What raises changes nothing. Raises ``InvalidInput`` for a bad seed or option; warns of unknown options.
         """
-        before = self.seed, self.next
-        if seed is not None or self.seed is None:
-            self.seed, self.next = chosen_seed(seed), 0
-        try:
-            given = self._asked_for(n, checked_options(options, known))
-            begun = self.draw(n) if given is None else self.game.begin(given.worlds)
-        except Exception:
-            self.seed, self.next = before
-            raise
-        self.given = given
+        first = self.next if seed is None else 0
+        seed = chosen_seed(self.seed if seed is None else seed)
+        given = self._asked_for(n, checked_options(options))
+        begun = self.game.start(n, seed, first) if given is None else self.game.begin(given.worlds)
+        self.seed, self.next, self.given = seed, first + (n if given is None else 0), given
         return begun
 
     def draw(self, n: int) -> State:
@@ -57,25 +52,15 @@ class Stream:
         return state
 
     def describe(self, state: State) -> dict[str, Any]:
-        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n].
-
-        A column that only some of the worlds have is NaN or an empty text for the others.
-        """
-        numbers, columns = state.clock[:, NUMBER].astype(np.int64), dict[str, Any]()
-        if (numbers < 0).any():
-            assert self.given is not None
-            columns = columns_of(self.given)
-        columns |= {"world_seed": np.full(state.n, self.seed), "world": numbers}
-        if (rows := numbers >= 0).any():
-            ordered, places = np.unique(numbers[rows], return_inverse=True)
-            seed = self.seed or 0
-            parts = [self.scenario.draw(1, seed, first=int(k), channel="training") for k in ordered]
-            drawn = merged(parts, np.arange(len(parts)))
-            for name, column in columns_of(drawn).items():
-                if name not in columns:
-                    columns[name] = np.full(state.n, "" if column.dtype.kind == "U" else np.nan, column.dtype)
-                columns[name][rows] = column[places]
-        return columns
+        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        numbers, seed = state.clock[:, NUMBER].astype(np.int64), self.seed or 0
+        place, parts = np.arange(state.n), [] if self.given is None else [self.given]
+        of_stream = np.flatnonzero(numbers >= 0)
+        place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
+        parts += [self.scenario.draw(1, seed, first=int(k), channel="training") for k in numbers[of_stream]]
+        drawn = merged(parts, np.arange(sum(part.worlds.n for part in parts)))
+        columns = {name: column[place] for name, column in columns_of(drawn).items()}
+        return {**columns, "world_seed": np.full(state.n, seed), "world": numbers}
 
     def _asked_for(self, n: int, options: Mapping[str, Any]) -> Drawn | None:
         if len(options.keys() & set(OPTIONS)) == 2:
@@ -107,20 +92,20 @@ def chosen_seed(seed: int | None) -> int:
     return int(seed)
 
 
-def checked_options(options: Any, known: tuple[str, ...]) -> Mapping[str, Any]:
-    """Return the options of a reset; warn of keys that are not ``known``."""
+def checked_options(options: Any) -> Mapping[str, Any]:
+    """Return the options of a reset; warn of unknown keys."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):
         raise InvalidInput(
-            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{known[0]}': ...}}"
+            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{OPTIONS[0]}': ...}}"
         )
-    unknown = sorted(str(name) for name in options if name not in known)
+    unknown = sorted(str(name) for name in options if name not in OPTIONS)
     if unknown:
         warnings.warn(
             f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys:"
-            f" {', '.join(known)}",
+            f" {', '.join(OPTIONS)}",
             UnknownResetOption,
-            stacklevel=4,
+            stacklevel=5,
         )
     return options
