@@ -48,7 +48,7 @@ class Face:
     def _advance(self, actions: Floats) -> tuple[State, Step]:
         """Advance all worlds by one time step with the learners' actions [n, L]."""
         before = self._begun("step")
-        if not self.begins_again and before.ended[0]:
+        if not self.begins_again and before.clock[0, ENDED] == 1.0:
             raise InvalidInput("step: no episode is running; call reset first")
         state, step = self.game.step(before, actions, donate=self.begins_again)
         if self._most_steps is not None:

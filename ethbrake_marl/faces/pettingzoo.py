@@ -11,7 +11,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import ENDED, State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
@@ -88,7 +88,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     @property
     def agents(self) -> list[str]:
         """Names of the agents whose episode is running."""
-        return [] if self.episode is None or self.episode.ended[0] else self.possible_agents[:]
+        running = self.episode is not None and self.episode.clock[0, ENDED] == 0.0
+        return self.possible_agents[:] if running else []
 
     def observation_space(self, agent: str) -> Any:
         """Return the space of an agent's observations."""

@@ -170,10 +170,11 @@ class EthBrakeVecEnv(Face, VecEnv):
         terms = {name: term[ended] for name, term in step.terms.items()}
         step = step._replace(reward=step.reward[ended], out=step.out[:, ended], terms=terms)
         cut = (step.truncated & (not self.horizon_is_end)).repeat(L).tolist()
-        final = zip(rows.tolist(), self._infos(last, step), cut, self._observe(last), strict=True)
-        for row, info, truncated, seen in final:
-            info["TimeLimit.truncated"], info["terminal_observation"] = truncated, seen.copy()
-            info["episode"] = {"r": self._return[row].item(), "l": self._steps[row].item(), "t": 0.0}
+        ends = rows.tolist(), self._infos(last, step), cut, self._observe(last)
+        sums = self._return[rows].tolist(), self._steps[rows].tolist()
+        for row, info, truncated, seen, gained, steps in zip(*ends, *sums, strict=True):
+            info["TimeLimit.truncated"], info["terminal_observation"] = truncated, seen
+            info["episode"] = {"r": gained, "l": steps, "t": 0.0}
             infos[row] = info
         self._return[rows], self._steps[rows] = 0.0, 0
         new = self.stream.draw(len(ended))

@@ -22,7 +22,8 @@ from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario
 
-MakeShield = Callable[..., Shield]  # (drivers, **options): body -> agent, perhaps empty; the options of the mode
+# (drivers, **options): body -> agent, perhaps empty; the options of the mode. One called ``scenario`` is the worlds'.
+MakeShield = Callable[..., Shield]
 Make = Callable[[Mapping[int, Agent] | None], Shield]
 
 
@@ -64,19 +65,18 @@ def shield(
     """
     if mode not in MODES:
         raise unknown_name("shield mode", mode, MODES)
-    make, wanted = partial(MODES[mode], **options), signature(MODES[mode])
-    try:
-        wanted.bind(None, **options)
-    except TypeError as error:
-        known = ", ".join([*wanted.parameters][1:])
-        raise InvalidInput(f"shield: mode {mode!r}: {error}; its options: {known}") from None
+    if isinstance(env, str):
+        raise InvalidInput(f"shield: {env!r:.60}: is a name; pass make_agent({env!r:.60}), or add +{mode} to the name")
     is_agent = hasattr(env, "act")
     if is_agent == (scenario is None):
         right = "pass scenario=..., in which it drives" if is_agent else "leave out scenario"
         raise InvalidInput(f"shield: {env!r:.80}: {right}")
+    base = getattr(env, "unwrapped", None)
+    worlds: Any = getattr(base, "scenario", None) if scenario is None else load_scenario(scenario)
+    make = maker(mode, options, worlds)
     if not is_agent and not isinstance(env, Team):
-        return shielded_environment(env, policy, make, options.get("harm_count", "first"))
-    team = env if scenario is None else team_of(env, load_scenario(scenario))
+        return shielded_environment(env, base, policy, make, options.get("harm_count", "first"))
+    team = team_of(env, worlds) if is_agent else env
     if policy is not None:
         raise InvalidInput(f"shield: {team.name!r} proposes by itself; leave out policy")
     if team.shield is not None:
@@ -84,9 +84,23 @@ def shield(
     return team._replace(shield=make(team.drivers), name=f"{team.name}+{mode}")
 
 
-def shielded_environment(env: Any, policy: Any, make: Make, harm_count: str) -> Any:
+def maker(mode: str, options: Mapping[str, Any], worlds: Any) -> Make:
+    """Return what makes the shield of a mode for its drivers. Raises ``InvalidInput`` for bad options."""
+    wanted = signature(MODES[mode])
+    if "scenario" in wanted.parameters:
+        if worlds is None:
+            raise InvalidInput(f"shield: mode {mode!r} needs a scenario, which a team has not; shield an environment")
+        options = {**options, "scenario": worlds}
+    try:
+        wanted.bind(None, **options)
+    except TypeError as error:
+        known = ", ".join([*wanted.parameters][1:])
+        raise InvalidInput(f"shield: mode {mode!r}: {error}; its options: {known}") from None
+    return partial(MODES[mode], **options)
+
+
+def shielded_environment(env: Any, base: Any, policy: Any, make: Make, harm_count: str) -> Any:
     """Return a copy of an environment with a shield. A policy that is a name minimises ``harm_count``."""
-    base: Any = getattr(env, "unwrapped", None)
     if isinstance(env, type) or not isinstance(base, Face):
         raise InvalidInput(
             f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"

@@ -15,7 +15,6 @@ from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.contract.interfaces import (
     BARE,
-    FIVE,
     INTERFACES,
     LEVELS,
     PAPER,
@@ -281,15 +280,6 @@ def test_options__a_listed_world_and_those_that_follow_serve_one_episode(name: s
     for k, row in enumerate(start):
         assert np.array_equal(alone.reset(options={"initial_state": initial_state(worlds, k)})[0], row)
     assert np.array_equal(interface.reset(), stream.reset(5))
-
-
-@each_bare
-@pytest.mark.parametrize("learner", ["vehicle_1", "vehicle_3", "vehicle_5"])
-def test_learners__any_vehicle_may_be_the_one(name: str, learner: str) -> None:
-    five = FIVE.replace(obstacle_gap_m=30) if learner == "vehicle_1" else FIVE
-    given = [learner], (learner,), ["vehicle_4"]
-    runs = [bits(play(make(name, five, learners=learners), 5, steps=30)) for learners in given]
-    assert runs[0] == runs[1] != runs[2]
 
 
 DRAWN = load_scenario(

@@ -8,7 +8,6 @@ import numpy as np
 import pettingzoo
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
@@ -62,11 +61,3 @@ def test_an_old_pettingzoo__is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(pettingzoo, "parallel_registry")
     with pytest.raises(MissingExtra, match=r"needs pettingzoo 1.27 or newer; 1\..* is installed"):
         register_environments()
-
-
-def test_gymnasium__counts_the_steps_of_episodes() -> None:
-    many = RecordEpisodeStatistics(EthBrakeVectorEnv(4))
-    many.reset(seed=1)
-    infos = [many.step(np.full((4, 1), -1.0, np.float32))[4] for _ in range(100)]
-    lengths = [info["episode"]["l"][info["_episode"]] for info in infos if "episode" in info]
-    assert 0 < np.concatenate(lengths).max() <= 76  # 7.6 s of decisions

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.full_state import full_state
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
+from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from tests.contract.interfaces import CRASH, PAPER, REST
 from tests.refused import refused
 
@@ -79,15 +78,6 @@ def test_indices__are_evenly_spaced_actions() -> None:
         assert infos["vehicle_3"]["chosen_action"] == pytest.approx(1 - index / 2)
 
 
-def test_in_turn__the_step_of_the_last_agent_moves_all() -> None:
-    env, parallel = raw_env("cooperation-3-pair"), began(scenario="cooperation-3-pair")
-    env.reset(seed=7)
-    for action in (None, [-1.0], [0.5]):
-        env.step(action)
-    _, rewards, _, _, infos = parallel.step({"vehicle_2": [-1.0], "vehicle_3": [0.5]})
-    assert env.infos == infos and env.rewards == rewards and env.agent_selection == "vehicle_1"
-
-
 REFUSED: dict[str, Callable[[], Any]] = {
     "step: the action of learner vehicle_2 is missing": lambda: began().step({"vehicle_1": [0.0]}),
     "unknown agent 'vehicle_9'": lambda: began().step({"vehicle_9": [0.0]}),
@@ -130,8 +120,3 @@ def test_a_line_without_learners__plays_by_itself() -> None:
     while env.agents:
         *_, infos = env.step({})
     assert infos["vehicle_1"]["time_s"] > 2.0
-
-
-def test_bad_role_of_an_agent__is_refused_with_its_vehicle() -> None:
-    with pytest.raises(InvalidInput, match=r"roles.vehicle_3 = nonsense: unknown agent 'nonsense'"):
-        EthBrakeParallelEnv(PAPER.replace(early_impacts="keep", roles={**PAPER.roles, "vehicle_3": "nonsense"}))

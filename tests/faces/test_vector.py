@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from gymnasium.vector import AutoresetMode
 
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
@@ -63,21 +62,6 @@ def test_infos__are_those_of_the_single_environment(scenario: Any) -> None:
     for columns, info in pairs:
         assert {name: columns[name][0] for name in info} == info
         assert columns.keys() == info.keys() | {f"_{name}" for name in info}
-
-
-@pytest.mark.parametrize("mode", ["NextStep", AutoresetMode.SAME_STEP])
-def test_limit_of_steps__truncates_also_an_episode_that_it_ends_with(mode: Any) -> None:
-    def ends(most: int | None) -> list[Any]:
-        env = EthBrakeVectorEnv(3, autoreset_mode=mode, max_episode_steps=most)
-        env.reset(seed=7)
-        return [each for each in (env.step(np.full((3, 1), -1.0))[2:4] for _ in range(last or 80)) if np.any(each)]
-
-    last = 0
-    free = EthBrakeVectorEnv(3, autoreset_mode=mode)
-    free.reset(seed=7)
-    last = next(k for k in range(1, 80) if free.step(np.full((3, 1), -1.0))[2].any())
-    (terminated, truncated), (same, cut) = ends(None)[0], ends(last)[0]
-    assert terminated.any() and not truncated.any() and np.array_equal(same, terminated) and cut.all()
 
 
 def test_description__has_columns_that_only_some_of_the_worlds_have() -> None:
