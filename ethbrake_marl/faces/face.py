@@ -19,7 +19,7 @@ class Face:
     """Base of all interfaces. ``bodies`` [B] are the vehicles that an interface shows."""
 
     bodies: Ints
-    episode: State | None = None
+    episode: State = None  # type: ignore[assignment]  # until the first reset
     begins_again = False  # whether an ended episode is followed by the next one, without a reset
 
     def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
