@@ -29,6 +29,7 @@ class Counting:
     name, knows = "counting", "nothing"
 
     def begin(self, alert: State, body: int) -> tuple[Floats, Floats]:
+        assert (alert.time_s == 0.0).all()
         return np.zeros(alert.n), np.full((alert.n, 100), np.nan)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:

@@ -50,13 +50,16 @@ def test_actions_of_ended_rows__are_ignored() -> None:
         env.step(np.zeros((2, 1)))
         assert env.step(np.zeros((2, 1)))[3].all()
     given = np.array([[np.nan], [7.0]])
-    other, one = envs[1].step(np.zeros((2, 1)))[0], envs[0].step(given)[0]
-    assert np.array_equal(one, other) and np.isnan(given[0, 0])
+    (one, _, _, cut, _), other = envs[0].step(given), envs[1].step(np.zeros((2, 1)))[0]
+    assert np.array_equal(one, other) and np.isnan(given[0, 0]) and not cut.any()
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=SCENARIOS)
 def test_infos__are_those_of_the_single_environment(scenario: Any) -> None:
     many, single = EthBrakeVectorEnv(2, scenario), EthBrakeEnv(scenario)
+    other = {"vehicle_1": ["own"], "vehicle_5": ["own"]} if scenario.vehicles == 5 else None
+    own = EthBrakeEnv(scenario, observation=other)
+    assert own.reset(seed=5)[0] in own.observation_space == single.observation_space
     pairs = [(many.reset(seed=5)[1], single.reset(seed=np.int64(5))[1])]
     pairs += [(many.step(np.full((2, 1), -0.5))[4], single.step(-0.5)[4]) for _ in range(12)]
     for columns, info in pairs:
