@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import NUMBER, State
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.sampling import Drawn, merged
@@ -39,7 +39,7 @@ class Stream:
         """
         first = self.next if seed is None else 0
         seed = chosen_seed(self.seed if seed is None else seed)
-        given = self._asked_for(n, checked_options(options))
+        given = self._asked_for(n, options)
         begun = self.game.start(n, seed, first) if given is None else self.game.begin(given.worlds)
         self.seed, self.next, self.given = seed, first + (n if given is None else 0), given
         return begun
@@ -62,8 +62,21 @@ class Stream:
         columns = {name: column[place] for name, column in columns_of(drawn).items()}
         return {**columns, "world_seed": np.full(state.n, seed), "world": numbers}
 
-    def _asked_for(self, n: int, options: Mapping[str, Any]) -> Drawn | None:
-        if len(options.keys() & set(OPTIONS)) == 2:
+    def _asked_for(self, n: int, options: Any) -> Drawn | None:
+        """Return the worlds of the options of a reset; None: it asks for none."""
+        if options is None:
+            return None
+        if not isinstance(options, Mapping):
+            example = f"{{'{OPTIONS[0]}': ...}}"
+            raise InvalidInput(f"reset: options = {options!r}: must be None or a mapping, for instance {example}")
+        if unknown := sorted(str(name) for name in options if name not in OPTIONS):
+            warnings.warn(
+                f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys:"
+                f" {', '.join(OPTIONS)}",
+                UnknownResetOption,
+                stacklevel=5,
+            )
+        if all(name in options for name in OPTIONS):
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
             one = worlds_from_state(self.scenario, options["initial_state"])
@@ -76,9 +89,7 @@ class Stream:
                 f"reset: listed_world = {wanted!r}: must be seed and number of a world in an evaluation list, for"
                 " instance {'seed': 7, 'number': 3}"
             )
-        for name in ("seed", "number"):
-            check_whole_number(f"reset: listed_world: {name}", wanted[name], 0)
-        drawn = self.scenario.draw(n, int(wanted["seed"]), first=int(wanted["number"]))
+        drawn = self.scenario.draw(n, wanted["seed"], first=wanted["number"])
         drawn.worlds.clock[:, NUMBER] = -1.0
         return drawn
 
@@ -90,22 +101,3 @@ def chosen_seed(seed: int | None) -> int:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
         raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
     return int(seed)
-
-
-def checked_options(options: Any) -> Mapping[str, Any]:
-    """Return the options of a reset; warn of unknown keys."""
-    if options is None:
-        return {}
-    if not isinstance(options, Mapping):
-        raise InvalidInput(
-            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{OPTIONS[0]}': ...}}"
-        )
-    unknown = sorted(str(name) for name in options if name not in OPTIONS)
-    if unknown:
-        warnings.warn(
-            f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys:"
-            f" {', '.join(OPTIONS)}",
-            UnknownResetOption,
-            stacklevel=5,
-        )
-    return options

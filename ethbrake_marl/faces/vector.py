@@ -80,10 +80,8 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
     def step(self, actions: Any) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with ``actions`` [n, 1]."""
         same, renewed = self.autoreset_mode is AutoresetMode.SAME_STEP, self._begun("step").ended
-        if renewed.any() and len(actions) == self.num_envs:  # their actions are ignored
-            actions = np.array(actions)
-            actions[renewed] = 0
         numbers = checked_actions(actions, (self.num_envs, 1), "the learners", self.actions)
+        numbers[renewed] = 0.0  # the action of a row that begins again is ignored
         state, step = self._advance(numbers)
         every, infos = np.ones(self.num_envs, np.bool_), dict[str, Any]()
         if same and state.ended.any():

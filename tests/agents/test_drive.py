@@ -148,6 +148,7 @@ def test_a_constant__beyond_the_capacity_is_refused(role: str) -> None:
 
 def test_commands_and_actions__are_each_others_inverse_and_clipped() -> None:
     state = PAPER.sample(200, 7)
+    state.car[:, DRIVING, 2] = 3.0
     actions = np.random.default_rng(1).uniform(-1.0, 1.0, 200)
     commands = to_command(state, 2, actions)
     assert (commands == actions * np.where(actions < 0.0, state.car[:, BRAKING, 2], state.car[:, DRIVING, 2])).all()

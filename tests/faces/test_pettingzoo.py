@@ -8,6 +8,7 @@ import pytest
 
 from ethbrake_marl.episode.full_state import full_state
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
+from ethbrake_marl.faces.shield import shield
 from tests.contract.interfaces import CRASH, PAPER, REST
 from tests.refused import refused
 
@@ -103,7 +104,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "reset: listed_world = {'seed': 7}: must be seed and number": lambda: began().reset(
         options={"listed_world": {"seed": 7}}
     ),
-    "reset: listed_world: number = -1: must be a whole number": lambda: began().reset(
+    "first world = -1: must be a whole number, at least 0": lambda: began().reset(
         options={"listed_world": {"seed": 7, "number": -1}}
     ),
 }
@@ -113,6 +114,12 @@ REFUSED: dict[str, Callable[[], Any]] = {
 def test_refusals(message: str) -> None:
     with refused(message):
         REFUSED[message]()
+
+
+def test_behind_a_shield__a_missing_action_is_no_proposal() -> None:
+    env = shield(EthBrakeParallelEnv(), "full_brake")
+    env.reset(seed=7)
+    assert env.step({})[4]["vehicle_2"]["shield_proposed_action"] == -1.0
 
 
 def test_a_line_without_learners__plays_by_itself() -> None:

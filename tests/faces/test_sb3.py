@@ -26,8 +26,9 @@ def test_last_infos__by_hand(horizon_is_end: bool) -> None:
     assert info["episode"] == {"r": pytest.approx(-36.0), "l": 8, "t": 0.0} and info["time_s"] == 1.3
     assert info["TimeLimit.truncated"] == (not horizon_is_end) and info["world_total_harm"] == pytest.approx(36.0)
     assert not np.array_equal(info["terminal_observation"], observation[1])
+    played(env, 3, 0.0)
     assert env.reset_infos[1]["world"] == 3 and env.reset_infos[1]["time_s"] == 0.5
-    assert played(env, 8, 0.0)[-1][3][0]["episode"] == infos[0]["episode"]
+    assert played(env, 5, 0.0)[-1][3][0]["episode"] == infos[0]["episode"]
 
 
 @pytest.mark.parametrize("appended", [None, "number", "state"])
@@ -39,10 +40,11 @@ def test_rows__are_the_learners_of_each_world_from_front_to_rear(appended: Any) 
         more = {"number": [[0], [1], [2]] * 2, "state": full_state(env.episode, 12.0, True).repeat(3, axis=0)}
         assert np.array_equal(seen, own if appended is None else np.hstack([own, np.array(more[appended])]))
         assert all(row in env.observation_space for row in seen)
-        seen, _, _, _ = env.step(np.arange(6)[:, np.newaxis] / 6.0 - 0.9 + 0.1 * k)
-        assert env.episode.commands_mps2[1, 2] == pytest.approx(
-            (5 / 6 - 0.9 + 0.1 * k) * (env.episode.braking_capacity_mps2[1, 2] if k == 0 else 3.0)
-        )
+        given = np.arange(6) / 6.0 - 0.5 + 0.1 * k
+        seen, _, _, _ = env.step(given[:, np.newaxis])
+        state, given = env.episode, given.reshape(2, 3)
+        capacity = np.where(given < 0.0, state.braking_capacity_mps2, state.driving_capacity_mps2)
+        assert np.allclose(state.commands_mps2, given * capacity)
 
 
 def test_infos__of_every_step_on_request_and_of_a_shield_always() -> None:
@@ -72,6 +74,7 @@ def test_snapshot__can_be_restored_again_and_elsewhere(scenario: Any, make: Any,
     other.reset()
     played(env, 20)
     saved = env.snapshot()
+    played(env, 5)
     seen = [[played(each, 90), each.reset_infos] for each in (env, other, other) if each.restore(saved) is None]
     for turns, begun in seen[1:]:
         assert begun == seen[0][1]
