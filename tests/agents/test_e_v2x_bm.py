@@ -113,6 +113,7 @@ def test_closed_form__has_every_printed_digit(gaps, speeds, latency, ends, best,
     [  # gap; front vehicle: speed, capacity, onset; rear vehicle: the same; the best deceleration of `body`
         (2, (12, 4, 4, 0, 10, 8, 0), (100 / 28 + 8) / 2, 0.0),  # from 100 / 28 on it stops behind: 2 + 12 m
         (2, (2, 30, 3, 0, 33, 9, 0), (3 + 9 / 4 + 9) / 2, 0.0),  # touches while both brake: 3^2 = 2 (a - 3) 2
+        (2, (10, 20, 2, 1, 28, 9, 0), (4 + 9) / 2, 0.0),  # the same, 1 s later: after 3 s both have 16 m/s
         (2, (4, 10, 5, 9, 14, 6, 0), (2 + 6) / 2, 0.0),  # touches while the front coasts: 4^2 = 2 * 2 * 4
         (2, (2, 10, 8, 3, 12, 1.5, 0), 1.0, 4e-10),  # strikes the coasting front lightly, or later hard: 2^2 = 2 * 2
         (2, (2, 10, 8, 1.5, 12, 1, 0), 8 / 9, 4 / 9),  # arrives when the front begins to brake: 2 = 3 - 1.5^2 a / 2
@@ -120,6 +121,7 @@ def test_closed_form__has_every_printed_digit(gaps, speeds, latency, ends, best,
         (2, (8, 10, 4, 0, 10, 9, 5), 4.5, 64.0),  # the front brakes before it may
         (1, (5, 10, 12, 0, 10, 5, 0), 10 / 2, 0.0),  # up to 10 it stops 5 m ahead, where the rear one stops in 10
         (1, (2, 30, 9, 0, 33, 3, 0), 0.75 / 2, 0.0),  # touches while both brake: 3^2 = 2 (3 - a) 2
+        (1, (15, 20, 9, 0, 26, 6, 1), 2 / 2, 0.0),  # the same, 1 s later: after 3 s both have 14 m/s
         (1, (17.5, 10, 9, 1, 20, 5, 0), 4 / 2, 0.0),  # after 1 s 10 m ahead of 15 m/s: 22.5 = 10 + 100 / (2 a)
         (1, (1, 10, 9, 0, 14, 2, 0), 0.0, 12.0),  # even if it coasts: 16 - 2 * 2 * 1
         (1, (20, 10, 8, 9, 14, 2, 0), 4.0, 0.0),  # the rear one is at rest before it brakes
@@ -251,6 +253,15 @@ def test_coupled__decides_ties_by_the_other_count_then_takes_the_middle():
     known = np.array([np.nan, 1.0, 2.0])
     e_v2x_bm.take_middle(np.arange(5.0), np.array([[1.0, 1.0, 3.0, 1.0, 1.0], [2.0, 4.0, 0.0, 2.0, 2.0]]), known)
     assert known[0] == 3.0  # of 0, 3 and 4
+
+
+def test_cells__between_steep_ones_are_split() -> None:
+    at, harm = np.arange(4.0)[np.newaxis], np.tile([10.0, 4.0, 4.0, 9.0], (2, 1, 1))
+    for steep, expected in ((1.0, [0, 1, 2]), (0.0, [])):
+        best, cells = np.full((1, 3), np.inf), np.empty((2, 4), np.int64)
+        given = harm if steep else np.full_like(harm, 4.0)
+        found = e_v2x_bm.find_cells(np.zeros(1, np.int64), at, given, np.ones(1), best, cells)
+        assert cells[1, :found].tolist() == expected and best[0, 1] == 4.0
 
 
 def test_choice__does_not_depend_on_the_batch_nor_on_coasting_before():
