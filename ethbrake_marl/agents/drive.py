@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ethbrake_marl.episode.game import Game, Shield
+from ethbrake_marl.episode.game import Game, Script, Shield
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step, asked, begun
 from ethbrake_marl.errors import InvalidInput
@@ -23,8 +23,10 @@ MODEL = "true model"  # also masses, restitution and scripts: everything that an
 NOBODY = np.zeros(0, np.int64)
 
 
-class Agent(Protocol):
-    """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do.
+class Agent(Script, Protocol):
+    """A ``Script`` with a name. It sees the whole state, and decides when the learners do.
+
+    It may also have ``check(game, body)``, which warns, or raises ``InvalidInput``, where it should not drive.
 
     >>> import ethbrake_marl as eb
     >>> class Half:
@@ -45,14 +47,6 @@ class Agent(Protocol):
     @property
     def knows(self) -> str:
         """What it has to know, for tables: one of the texts above."""
-
-    def begin(self, alert: State, body: int) -> Any:
-        """Return the memory for new episodes: None, an array with one row per world, or a tuple of memories."""
-
-    def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Return the commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the new memory."""
-
-    # An agent may have ``check(game, body)``, which warns, or raises ``InvalidInput``, where it should not drive.
 
 
 class Team(NamedTuple):
@@ -113,11 +107,11 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     """
     game = team.game(game)
     if game.shield is None:
-        state = game.begin(alert)
-        memories = {body: begun(agent, alert, body) for body, agent in game.agents(team.drivers).items()}
+        state, agents, actions = game.begin(alert), game.agents(team.drivers), np.zeros((alert.n, 0))
+        memories = {body: begun(agent, alert, body) for body, agent in agents.items()}
         state = state._replace(memories={**state.memories, **memories})
-        game = driven_by(game, team.drivers)
-        actions = np.zeros((alert.n, 0))
+        # From the first decision on, the learners' agents decide as scripts do.
+        game = game._replace(scripts={**game.scripts, **agents}, rules=game.rules._replace(learners=NOBODY))
     else:
         state, actions = game.begin(alert), None
     yield None, state
@@ -131,12 +125,6 @@ def drive(game: Game, alert: State, team: Team) -> State:
     for _, state in play(game, alert, team, donate=True):
         last = state
     return last
-
-
-def driven_by(game: Game, drivers: Mapping[int, Agent]) -> Game:
-    """Return the game in which the learners' agents decide as scripts do, from the first decision on."""
-    scripts = {**game.scripts, **game.agents(drivers)}
-    return game._replace(scripts=scripts, rules=game.rules._replace(learners=NOBODY))
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:

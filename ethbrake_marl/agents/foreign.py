@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.errors import InvalidInput, MissingExtra, describe_error, naming_extras
+from ethbrake_marl.errors import InvalidInput, describe_error, naming_extras
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.policies.policy import Policy
 
@@ -45,7 +45,6 @@ def ask_of(policy: Any, who: str) -> Ask:
     every batch.
     """
     if isinstance(policy, bytes) or (hasattr(policy, "run") and hasattr(policy, "get_inputs")):
-        _check_onnx(policy, who)
         return ask_onnx
     if hasattr(policy, "predict"):
         return ask_model
@@ -94,7 +93,7 @@ def ask_torch(module: Any, seen: Observations) -> Any:
 
 
 def ask_onnx(session: Any, seen: Observations) -> Any:
-    """Return the output ``action`` of an ONNX model, or its only one."""
+    """Return the output ``action`` of an ONNX model, or its first one."""
     session = session_of(session)
     names = [output.name for output in session.get_outputs()]
     return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: seen})[0]
@@ -120,22 +119,10 @@ def session_of(given: Any) -> Any:
 def _opened(content: bytes) -> Any:
     with naming_extras():
         import onnxruntime
-    return onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
-
-
-def _check_onnx(given: Any, who: str) -> None:
     try:
-        session = session_of(given)
-    except MissingExtra:
-        raise
+        return onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise InvalidInput(f"{who}: the file is no ONNX model that can be run: {describe_error(error)}") from error
-    inputs, outputs = ([each.name for each in ends] for ends in (session.get_inputs(), session.get_outputs()))
-    if len(inputs) != 1 or ("action" not in outputs and len(outputs) != 1):
-        raise InvalidInput(
-            f"{who}: the ONNX model has the inputs {inputs} and the outputs {outputs}; must have one input, and one"
-            " output or one called 'action'; write a function around a session that needs more"
-        )
+        raise InvalidInput(f"policy: the file is no ONNX model that can be run: {describe_error(error)}") from error
 
 
 def _refuse_training_mode(module: Any, who: str) -> None:
@@ -155,8 +142,7 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
     if ask is ask_onnx:
         listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(listed.split(",")) if listed else None
-    names = getattr(getattr(policy, "observation_space", None), "features", None)
-    return names if isinstance(names, tuple) else None
+    return getattr(getattr(policy, "observation_space", None), "features", None)
 
 
 def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
@@ -165,17 +151,18 @@ def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
     Raises ``InvalidInput`` if its action space is neither a box from -1 to 1 nor as ``given``.
     """
     space: Any = getattr(policy, "action_space", None)
-    count, least = getattr(space, "n", None), getattr(space, "start", None)
     if given is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
         given = int(space.n)
-    low, high = (np.asarray(getattr(space, end, np.nan)).tolist() for end in ("low", "high"))
-    fits = (low, high) == ([-1.0], [1.0]) if given is None else (count, least) == (given, 0)
+    if given is None:
+        fits = [np.asarray(getattr(space, end, None)).tolist() for end in ("low", "high")] == [[-1.0], [1.0]]
+        right = "a number in [-1, 1]; for indices of K evenly spaced actions pass actions=K"
+    else:
+        fits = (getattr(space, "n", None), getattr(space, "start", None)) == (given, 0)
+        right = f"an index from 0 to {given - 1} (actions={given})"
     if space is not None and not fits:
-        right = "a number in [-1, 1]" if given is None else f"an index from 0 to {given - 1} (actions={given})"
-        evenly = f"pass actions={count} if they are evenly spaced from -1 to 1, or " if least == 0 else ""
         raise InvalidInput(
-            f"{who}: the actions of the policy are in {space}; must be {right}; {evenly}write a function around the"
-            " policy that converts its actions"
+            f"{who}: the actions of the policy are in {space}; must be {right}; or write a function around the policy"
+            " that converts its actions"
         )
     return given
 
@@ -194,12 +181,11 @@ def check_wrappers(policy: Any, who: str) -> None:
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else layers_of(env):
         kind, library = type(layer), type(layer).__module__.partition(".")[0]
-        is_inner = hasattr(kind, "normalize_obs") and layer is not statistics
-        if library != "ethbrake_marl" and (is_inner or kind.__name__ not in HARMLESS.get(library, ())):
+        if library != "ethbrake_marl" and kind.__name__ not in HARMLESS.get(library, ()):
             name = vars(layer).get("modifier_class", kind).__name__  # of SuperSuit
             raise InvalidInput(
-                f"{who}: the model was trained under {name}{' inside another one' * is_inner}, which may change"
-                " observations or actions and is not applied here; write a function around the model that makes the"
+                f"{who}: the model was trained under {name}, which may change observations or"
+                " actions and is not applied here; write a function around the model that makes the"
                 " same changes, or pass ignore_wrappers=True if there are none"
             )
     if statistics is None and _was_normalised(policy):

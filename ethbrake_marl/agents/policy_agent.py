@@ -26,9 +26,9 @@ from ethbrake_marl.agents.foreign import (
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import View
-from ethbrake_marl.episode.state import NUMBER, State
+from ethbrake_marl.episode.state import NUMBER, State, mapped
 from ethbrake_marl.episode.step import LARGEST_ACTION
-from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, UnknownName, check_whole_number
+from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.policies.manifest import PHYSICS
@@ -117,7 +117,7 @@ class PolicyAgent:
 
     def begin(self, alert: State, body: int) -> Any:
         """Return the policy's memory for new episodes."""
-        return None if self.initial_state is None else self._memory(self.initial_state(alert.n), alert.n)
+        return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
         """Return the commands of vehicle ``body``, [n] m/s2, and the policy's new memory.
@@ -128,22 +128,24 @@ class PolicyAgent:
         if self.initial_state is None:
             answer = self.ask(self.policy, seen)
         else:
-            both = self.policy(seen, self._memory(memory, state.n))
+            both = self.policy(seen, self._own(memory, state.n))
             if not isinstance(both, tuple) or len(both) != 2:
                 right = "with initial_state must return a pair of actions and state"
                 raise AgentFailed(self.name, None, f"vehicle_{body}: returned {both!r:.60}; {right}")
-            answer, memory = both[0], self._memory(both[1], state.n)
+            answer, memory = both[0], self._own(both[1], state.n)
         return to_command(state, body, self._actions(answer, state, body)), memory
 
-    def _memory(self, memory: Any, n: int) -> Any:
+    def _own(self, memory: Any, n: int) -> Any:
         """Return a memory in arrays of its own."""
-        if isinstance(memory, tuple):
-            return tuple(self._memory(each, n) for each in memory)
-        array = np.array(to_array(memory))
-        if array.ndim < 1 or len(array) != n or array.dtype.hasobject:
-            right = f"must be an array with one row for each of {n} worlds, or a tuple of such arrays"
-            raise AgentFailed(self.name, None, f"its memory has {array.dtype} of the shape {array.shape}; {right}")
-        return array
+
+        def copied(part: Any) -> NDArray[Any]:
+            array = np.array(to_array(part))
+            if array.shape[:1] != (n,) or array.dtype.hasobject:
+                right = f"must be an array with one row for each of {n} worlds, or a tuple of such arrays"
+                raise AgentFailed(self.name, None, f"its memory has {array.dtype} of the shape {array.shape}; {right}")
+            return array
+
+        return mapped(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
         """Return the actions [n] in [-1, 1] for what the policy has answered."""
@@ -152,7 +154,7 @@ class PolicyAgent:
         if self.actions is not None:
             kinds, low, high, right = "iu", 0.0, float(last), f"an index from 0 to {last}"
         if given.shape not in ((n,), (n, 1)) or given.dtype.kind not in kinds:
-            what = f"{len(answer)} values" if isinstance(answer, tuple) else f"{given.dtype} of shape {given.shape}"
+            what = f"{answer!r:.40}, {given.dtype} of shape {given.shape}"
             reason = f"returned {what}; must return {right} for each of {n} worlds, in the shape ({n}, 1)"
             raise AgentFailed(self.name, None, f"vehicle_{body}: {reason}")
         values = given.reshape(n).astype(np.float64)
@@ -168,12 +170,10 @@ class PolicyAgent:
 
 
 def to_array(value: Any) -> NDArray[Any]:
-    """Return an array, tensor or sequence as an array; masked entries are NaN."""
-    if np.ma.is_masked(value):
-        return np.asarray(np.ma.filled(value.astype(np.float64), np.nan))
+    """Return an array, tensor or sequence as an array."""
     try:
         return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
-    except ValueError:  # lists of different lengths
+    except ValueError:  # lists of different lengths, or a tuple of arrays
         return np.empty(0, object)
 
 
@@ -253,13 +253,7 @@ def _view(given: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario |
             )
         return view
     if trained_on is not None:
-        try:
-            return View(trained_on)
-        except UnknownName as error:
-            raise InvalidInput(
-                f"{who}: was trained on what no vehicle observes: {error}; instead of appended='number' observe the"
-                " feature place, or write a function around the model"
-            ) from None
+        return View(trained_on)
     if trained_in is None:
         return View()
     views = views_of(trained_in)

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ethbrake_marl.agents.drive import SENSORS
-from ethbrake_marl.episode.state import NUMBER, State
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.motion.layout import BRAKING, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.roles import check_role, first_command
 
@@ -21,17 +18,8 @@ class Held(NamedTuple):
     knows: str = SENSORS
 
     def begin(self, alert: State, body: int) -> Floats:
-        """Return the command, [n] m/s2. Raises ``InvalidInput`` if it is beyond a capacity of the vehicle."""
-        braking, driving = alert.car[:, BRAKING, body], alert.car[:, DRIVING, body]
-        command = first_command(self.name, braking)
-        beyond = np.flatnonzero((command < -braking) | (command > driving))
-        if len(beyond):
-            k, numbers = beyond[0], alert.clock[:, NUMBER].astype(int)
-            raise InvalidInput(
-                f"agent {self.name!r}: vehicle_{body} can decelerate by at most {braking[k]:g} m/s2 and accelerate by"
-                f" at most {driving[k]:g} m/s2 in world {numbers[k] if numbers[k] >= 0 else k}"
-            )
-        return command
+        """Return the command, [n] m/s2."""
+        return first_command(self.name, alert.car[:, BRAKING, body])
 
     def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
         """Return the command, which is the memory."""

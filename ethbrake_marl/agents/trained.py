@@ -30,7 +30,7 @@ def make_trained(argument: str | None, settings: Any) -> Agent | Team:
                 f" instance {name}@runs/my-run"
             )
         return LearnedAgent(load_shipped(name), spec)
-    if has_policy_each(Path(path)):
+    if any(Path(path, "policy").glob("vehicle_[1-9]*")):  # each learner has its own
         policies = load_drivers(Path(path) / "policy")
         driver: Agent | Team = Team.of({vehicle: LearnedAgent(each, spec) for vehicle, each in policies.items()}, spec)
         policy = next(iter(policies.values()))
@@ -41,14 +41,6 @@ def make_trained(argument: str | None, settings: Any) -> Agent | Team:
         by = policy.manifest.algorithm
         raise InvalidInput(f"agent {spec!r}: the policy was trained by {by}; write {by}@{path}")
     return driver
-
-
-def has_policy_each(run: Path) -> bool:
-    """Return whether a run's learners have policies of their own."""
-    try:
-        return any((run / "policy").glob("vehicle_[1-9]*"))
-    except OSError:  # no path at all, such as one that is too long
-        return False
 
 
 def _shipped(name: str, what: str) -> Part:

@@ -36,17 +36,10 @@ def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, coun
         given = np.asarray(actions)
     except ValueError:  # lists of different lengths
         given = np.empty(0, object)
-    masked = isinstance(actions, np.ma.MaskedArray) and np.ma.is_masked(actions)
-    if given.dtype.kind not in "fiu" or masked:
-        right = "a number in [-1, 1]" if count is None else f"an index from 0 to {count - 1}"
+    right, kinds = ("a number in [-1, 1]", "fiu") if count is None else (f"an index from 0 to {count - 1}", "iu")
+    if given.dtype.kind not in kinds or (count is not None and not ((given >= 0) & (given < count)).all()):
         raise InvalidInput(f"action of {whose}: {actions!r:.60}: must be {right}")
     if count is not None:
-        good = (given >= 0) & (given < count) & (given.dtype.kind in "iu")
-        if not good.all():
-            raise InvalidInput(
-                f"action of {whose} = {given[~good][0].item()!r}: with actions={count}, an action must be an index, a"
-                f" whole number from 0 to {count - 1}"
-            )
         given = (2 * given.astype(np.int64) - (count - 1)) / (count - 1)
     if given.shape != shape:
         if [length for length in given.shape if length != 1] != [length for length in shape if length != 1]:

@@ -20,11 +20,11 @@ def register_environments() -> None:
     import gymnasium  # imported here, because the import takes time
     import pettingzoo
 
-    for id_ in (GYMNASIUM_ID, f"ethbrake/{GYMNASIUM_ID}"):
+    # Gymnasium's checker would warn about array rewards
+    of_vectors: dict[str, Any] = {"disable_env_checker": True, "kwargs": {"reward_vector": "vehicles"}}
+    for id_, settings in {GYMNASIUM_ID: dict[str, Any](), MO_GYMNASIUM_ID: of_vectors}.items():
         if id_ not in gymnasium.registry:
-            gymnasium.register(id_, **ENTRIES)
-    if MO_GYMNASIUM_ID not in gymnasium.registry:  # Gymnasium's checker would warn about array rewards
-        gymnasium.register(MO_GYMNASIUM_ID, **ENTRIES, disable_env_checker=True, kwargs={"reward_vector": "vehicles"})
+            gymnasium.register(id_, **ENTRIES, **settings)
     if not hasattr(pettingzoo, "parallel_registry"):
         raise MissingExtra(
             f"needs pettingzoo 1.27 or newer; {getattr(pettingzoo, '__version__', 'an older one')} is installed"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -12,8 +12,8 @@ from ethbrake_marl.registry import Registry
 FRAMES_PER_SECOND = 10
 
 
-class Renderer(Protocol):
-    """Draws the episodes of one environment."""
+class Renderer:
+    """Draws the episodes of one environment; this one, of render mode None, draws nothing."""
 
     def began(self, state: State) -> None:
         """Called after a reset."""
@@ -22,13 +22,13 @@ class Renderer(Protocol):
         """Called after a step."""
 
     def render(self) -> Any:
-        """Return what the render mode promises."""
+        """Return what the render mode promises; of many worlds, a list."""
 
     def close(self) -> None:
         """Give back windows and files."""
 
 
-MakeRenderer = Callable[[Any], Renderer]  # from an environment
+MakeRenderer = Callable[[Any], Any]  # environment -> object with the methods of Renderer
 
 
 def register_renderer(mode: str, make: MakeRenderer) -> None:
@@ -44,11 +44,11 @@ def render_metadata() -> dict[str, Any]:
     return {"render_modes": [*RENDERERS], "render_fps": FRAMES_PER_SECOND}
 
 
-def make_renderer(environment: Any, mode: str | None) -> Renderer | None:
-    """Return the renderer of a mode; None: no pictures. Raises ``InvalidInput``."""
+def make_renderer(environment: Any, mode: str | None) -> Any:
+    """Return the renderer of a mode. Raises ``InvalidInput``."""
     if mode is None:
-        return None
-    if not isinstance(mode, str) or mode not in RENDERERS:
+        return Renderer()
+    if mode not in RENDERERS:
         known = ", ".join(RENDERERS) or "none, because no installed package draws"
         raise InvalidInput(f"render_mode = {mode!r}: must be None or one of: {known}")
     return RENDERERS[mode](environment)

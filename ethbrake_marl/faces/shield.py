@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from inspect import Parameter, signature
+from functools import partial
+from inspect import signature
 from typing import Any
 
 from ethbrake_marl.agents.drive import Agent, Team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import make_renderer
-from ethbrake_marl.faces.stream import Stream
-from ethbrake_marl.names import Driver, team_of, teams_of
+from ethbrake_marl.names import team_of, teams_of
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario
-from ethbrake_marl.worlds.scenario import Scenario
 
 # (drivers, **options): body -> agent, perhaps empty; the options of the mode. One called ``scenario`` is the worlds'.
 MakeShield = Callable[..., Shield]
-Make = Callable[[Mapping[int, Agent] | None, Scenario | None], Shield]
+Make = Callable[[Mapping[int, Agent] | None], Shield]
 
 
 def register_shield_mode(name: str, make: MakeShield) -> None:
@@ -65,56 +65,43 @@ def shield(
     """
     if mode not in MODES:
         raise unknown_name("shield mode", mode, MODES)
-    wanted = signature(MODES[mode]).parameters
-    known = [name for name in wanted if name not in ("drivers", "scenario")]
-    for name in known:
-        if wanted[name].default is Parameter.empty and name not in options:
-            raise InvalidInput(f"shield: mode {mode!r} needs the option {name}")
-    for name in options:
-        if name not in known:
-            raise unknown_name(f"option of a shield in mode {mode}", name, known)
-
-    def make(drivers: Mapping[int, Agent] | None, worlds: Scenario | None) -> Shield:
-        if "scenario" not in wanted:
-            return MODES[mode](drivers, **options)
-        if worlds is None:
-            raise InvalidInput(f"shield: mode {mode!r} needs a scenario, which a team has not; shield an environment")
-        return MODES[mode](drivers, **options, scenario=worlds)
-
     if isinstance(env, str):
         raise InvalidInput(f"shield: {env!r:.60}: is a name; pass make_agent({env!r:.60}), or add +{mode} to the name")
-    if not isinstance(env, Team) and not hasattr(env, "act"):
-        if scenario is not None:
-            raise InvalidInput("shield: scenario: an environment has its own; leave it out")
-        return shielded_environment(env, policy, make, options.get("harm_count", "first"))
+    is_agent = hasattr(env, "act")
+    if is_agent == (scenario is None):
+        right = "pass scenario=..., in which it drives" if is_agent else "leave out scenario"
+        raise InvalidInput(f"shield: {env!r:.80}: {right}")
+    base = getattr(env, "unwrapped", None)
+    worlds: Any = getattr(base, "scenario", None) if scenario is None else load_scenario(scenario)
+    make = maker(mode, options, worlds)
+    if not is_agent and not isinstance(env, Team):
+        return shielded_environment(env, base, policy, make, options.get("harm_count", "first"))
+    team = team_of(env, worlds) if is_agent else env
     if policy is not None:
-        raise InvalidInput(f"shield: {env.name!r} proposes by itself; leave out policy")
-    team = shielded_team(env, scenario, make)
-    return team._replace(name=f"{team.name}+{mode}")
-
-
-def shielded_team(driver: Driver, scenario: AnyScenario | None, make: Make) -> Team:
-    """Return a team with a shield, or an agent for all learners of a scenario."""
-    loaded = None
-    if isinstance(driver, Team):
-        team = driver
-        if scenario is not None:
-            raise InvalidInput(f"shield: team {team.name!r}: needs no scenario; leave it out")
-    elif scenario is None:
-        raise InvalidInput(f"shield: agent {driver.name!r}: pass scenario=..., in which it drives")
-    else:
-        loaded = load_scenario(scenario)
-        team = team_of(driver, loaded)
+        raise InvalidInput(f"shield: {team.name!r} proposes by itself; leave out policy")
     if team.shield is not None:
         raise InvalidInput(f"shield: team {team.name!r} already has a shield")
-    return team._replace(shield=make(team.drivers, loaded))
+    return team._replace(shield=make(team.drivers), name=f"{team.name}+{mode}")
 
 
-def shielded_environment(env: Any, policy: Any, make: Make, harm_count: str) -> Any:
+def maker(mode: str, options: Mapping[str, Any], worlds: Any) -> Make:
+    """Return what makes the shield of a mode for its drivers. Raises ``InvalidInput`` for bad options."""
+    wanted = signature(MODES[mode])
+    if "scenario" in wanted.parameters:
+        if worlds is None:
+            raise InvalidInput(f"shield: mode {mode!r} needs a scenario, which a team has not; shield an environment")
+        options = {**options, "scenario": worlds}
+    try:
+        wanted.bind(None, **options)
+    except TypeError as error:
+        known = ", ".join([*wanted.parameters][1:])
+        raise InvalidInput(f"shield: mode {mode!r}: {error}; its options: {known}") from None
+    return partial(MODES[mode], **options)
+
+
+def shielded_environment(env: Any, base: Any, policy: Any, make: Make, harm_count: str) -> Any:
     """Return a copy of an environment with a shield. A policy that is a name minimises ``harm_count``."""
-    base: Any = getattr(env, "unwrapped", None)
-    game, stream = getattr(base, "game", None), getattr(base, "stream", None)
-    if isinstance(env, type) or not isinstance(game, Game) or not isinstance(stream, Stream):
+    if isinstance(env, type) or not isinstance(base, Face):
         raise InvalidInput(
             f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"
             " eb.EthBrakeEnv, eb.EthBrakeVectorEnv or eb.make_sb3_vec_env, perhaps in wrappers"
@@ -122,29 +109,24 @@ def shielded_environment(env: Any, policy: Any, make: Make, harm_count: str) -> 
     if hasattr(env, "venv"):  # copies of Stable-Baselines3's wrappers lose what they wrap
         name = type(env).__name__
         raise InvalidInput(f"shield: put the shield inside: {name}(eb.shield(env), ...) instead of shield({name}(env))")
+    game: Game = base.game
     if game.shield is not None:
         raise InvalidInput("shield: this environment already has a shield")
-    if not len(game.rules.learners):
-        raise InvalidInput(f"shield: scenario {game.name!r} has no learner to shield; pass learners=['vehicle_2']")
+    base._need_learner()
     if policy is None:
-        return guarded(env, base, game._replace(shield=make(None, base.scenario)))
+        return playing(env, game._replace(shield=make(None)))
     policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
     team = teams_of({"policy": policy}, base.scenario, harm_count=harm_count)["policy"]
     if team.shield is not None:
         raise InvalidInput(f"shield: policy {policy!r:.60} has a shield of its own; pass it without one")
-    return guarded(env, base, team._replace(shield=make(team.drivers, base.scenario)).game(game))
+    return playing(env, team._replace(shield=make(team.drivers)).game(game))
 
 
-def guarded(env: Any, base: Any, game: Game) -> Any:
+def playing(env: Any, game: Game) -> Any:
     """Return a copy of an environment, with its wrappers, that plays ``game`` and has no running episode."""
-    shared = {id(base.game): game, id(base.scenario): base.scenario, id(base.renderer): None}
-    if hasattr(base, "episode"):
-        shared[id(base.episode)] = None
-    other = copy.deepcopy(env, shared)
+    base = env.unwrapped
+    instead = {id(base.game): game, id(base.scenario): base.scenario, id(base.episode): None, id(base.renderer): None}
+    other = copy.deepcopy(env, instead)
     base = other.unwrapped
-    vars(base).pop("episode", None)
-    for name, none in (("agents", []), ("_running", False)):
-        if hasattr(base, name):
-            setattr(base, name, none)
     base.renderer = make_renderer(base, base.render_mode)
     return other

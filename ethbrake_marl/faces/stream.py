@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import NUMBER, State
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.sampling import Drawn, merged
@@ -32,21 +32,16 @@ class Stream:
         self.next = 0  # number of the next world
         self.given: Drawn | None = None  # the worlds that the last reset asked for
 
-    def restart(self, n: int, seed: int | None, options: Any = None, known: tuple[str, ...] = OPTIONS) -> State:
+    def restart(self, n: int, seed: int | None, options: Any = None) -> State:
         """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
 
         What raises changes nothing. Raises ``InvalidInput`` for a bad seed or option; warns of unknown options.
         """
-        before = self.seed, self.next
-        if seed is not None or self.seed is None:
-            self.seed, self.next = chosen_seed(seed), 0
-        try:
-            given = self._asked_for(n, checked_options(options, known))
-            begun = self.draw(n) if given is None else self.game.begin(given.worlds)
-        except Exception:
-            self.seed, self.next = before
-            raise
-        self.given = given
+        first = self.next if seed is None else 0
+        seed = chosen_seed(self.seed if seed is None else seed)
+        given = self._asked_for(n, options)
+        begun = self.game.start(n, seed, first) if given is None else self.game.begin(given.worlds)
+        self.seed, self.next, self.given = seed, first + (n if given is None else 0), given
         return begun
 
     def draw(self, n: int) -> State:
@@ -57,28 +52,31 @@ class Stream:
         return state
 
     def describe(self, state: State) -> dict[str, Any]:
-        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n].
+        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        numbers, seed = state.clock[:, NUMBER].astype(np.int64), self.seed or 0
+        place, parts = np.arange(state.n), [] if self.given is None else [self.given]
+        of_stream = np.flatnonzero(numbers >= 0)
+        place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
+        parts += [self.scenario.draw(1, seed, first=int(k), channel="training") for k in numbers[of_stream]]
+        drawn = merged(parts, np.arange(sum(part.worlds.n for part in parts)))
+        columns = {name: column[place] for name, column in columns_of(drawn).items()}
+        return {**columns, "world_seed": np.full(state.n, seed), "world": numbers}
 
-        A column that only some of the worlds have is NaN or an empty text for the others.
-        """
-        numbers, columns = state.clock[:, NUMBER].astype(np.int64), dict[str, Any]()
-        if (numbers < 0).any():
-            assert self.given is not None
-            columns = columns_of(self.given)
-        columns |= {"world_seed": np.full(state.n, self.seed), "world": numbers}
-        if (rows := numbers >= 0).any():
-            ordered, places = np.unique(numbers[rows], return_inverse=True)
-            seed = self.seed or 0
-            parts = [self.scenario.draw(1, seed, first=int(k), channel="training") for k in ordered]
-            drawn = merged(parts, np.arange(len(parts)))
-            for name, column in columns_of(drawn).items():
-                if name not in columns:
-                    columns[name] = np.full(state.n, "" if column.dtype.kind == "U" else np.nan, column.dtype)
-                columns[name][rows] = column[places]
-        return columns
-
-    def _asked_for(self, n: int, options: Mapping[str, Any]) -> Drawn | None:
-        if len(options.keys() & set(OPTIONS)) == 2:
+    def _asked_for(self, n: int, options: Any) -> Drawn | None:
+        """Return the worlds of the options of a reset; None: it asks for none."""
+        if options is None:
+            return None
+        if not isinstance(options, Mapping):
+            example = f"{{'{OPTIONS[0]}': ...}}"
+            raise InvalidInput(f"reset: options = {options!r}: must be None or a mapping, for instance {example}")
+        if unknown := sorted(str(name) for name in options if name not in OPTIONS):
+            warnings.warn(
+                f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys:"
+                f" {', '.join(OPTIONS)}",
+                UnknownResetOption,
+                stacklevel=5,
+            )
+        if all(name in options for name in OPTIONS):
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
             one = worlds_from_state(self.scenario, options["initial_state"])
@@ -91,9 +89,7 @@ class Stream:
                 f"reset: listed_world = {wanted!r}: must be seed and number of a world in an evaluation list, for"
                 " instance {'seed': 7, 'number': 3}"
             )
-        for name in ("seed", "number"):
-            check_whole_number(f"reset: listed_world: {name}", wanted[name], 0)
-        drawn = self.scenario.draw(n, int(wanted["seed"]), first=int(wanted["number"]))
+        drawn = self.scenario.draw(n, wanted["seed"], first=wanted["number"])
         drawn.worlds.clock[:, NUMBER] = -1.0
         return drawn
 
@@ -105,22 +101,3 @@ def chosen_seed(seed: int | None) -> int:
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:
         raise InvalidInput(f"reset: seed = {seed!r}: must be None or a whole number, at least 0")
     return int(seed)
-
-
-def checked_options(options: Any, known: tuple[str, ...]) -> Mapping[str, Any]:
-    """Return the options of a reset; warn of keys that are not ``known``."""
-    if options is None:
-        return {}
-    if not isinstance(options, Mapping):
-        raise InvalidInput(
-            f"reset: options = {options!r}: must be None or a mapping, for instance {{'{known[0]}': ...}}"
-        )
-    unknown = sorted(str(name) for name in options if name not in known)
-    if unknown:
-        warnings.warn(
-            f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys:"
-            f" {', '.join(known)}",
-            UnknownResetOption,
-            stacklevel=4,
-        )
-    return options

@@ -15,7 +15,7 @@ from ethbrake_marl.agents.pairwise import CANDIDATES, find_candidates, meet, pai
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert, begin
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.motion.layout import BRAKING, LATENCY, MASS, SPEED, Floats
+from ethbrake_marl.motion.layout import BRAKING, LATENCY, SPEED, Floats
 from ethbrake_marl.names import make_agent, open_game
 from tests.motion.lines import lines
 
@@ -113,6 +113,7 @@ def test_closed_form__has_every_printed_digit(gaps, speeds, latency, ends, best,
     [  # gap; front vehicle: speed, capacity, onset; rear vehicle: the same; the best deceleration of `body`
         (2, (12, 4, 4, 0, 10, 8, 0), (100 / 28 + 8) / 2, 0.0),  # from 100 / 28 on it stops behind: 2 + 12 m
         (2, (2, 30, 3, 0, 33, 9, 0), (3 + 9 / 4 + 9) / 2, 0.0),  # touches while both brake: 3^2 = 2 (a - 3) 2
+        (2, (10, 20, 2, 1, 28, 9, 0), (4 + 9) / 2, 0.0),  # the same, 1 s later: after 3 s both have 16 m/s
         (2, (4, 10, 5, 9, 14, 6, 0), (2 + 6) / 2, 0.0),  # touches while the front coasts: 4^2 = 2 * 2 * 4
         (2, (2, 10, 8, 3, 12, 1.5, 0), 1.0, 4e-10),  # strikes the coasting front lightly, or later hard: 2^2 = 2 * 2
         (2, (2, 10, 8, 1.5, 12, 1, 0), 8 / 9, 4 / 9),  # arrives when the front begins to brake: 2 = 3 - 1.5^2 a / 2
@@ -120,6 +121,7 @@ def test_closed_form__has_every_printed_digit(gaps, speeds, latency, ends, best,
         (2, (8, 10, 4, 0, 10, 9, 5), 4.5, 64.0),  # the front brakes before it may
         (1, (5, 10, 12, 0, 10, 5, 0), 10 / 2, 0.0),  # up to 10 it stops 5 m ahead, where the rear one stops in 10
         (1, (2, 30, 9, 0, 33, 3, 0), 0.75 / 2, 0.0),  # touches while both brake: 3^2 = 2 (3 - a) 2
+        (1, (15, 20, 9, 0, 26, 6, 1), 2 / 2, 0.0),  # the same, 1 s later: after 3 s both have 14 m/s
         (1, (17.5, 10, 9, 1, 20, 5, 0), 4 / 2, 0.0),  # after 1 s 10 m ahead of 15 m/s: 22.5 = 10 + 100 / (2 a)
         (1, (1, 10, 9, 0, 14, 2, 0), 0.0, 12.0),  # even if it coasts: 16 - 2 * 2 * 1
         (1, (20, 10, 8, 9, 14, 2, 0), 4.0, 0.0),  # the rear one is at rest before it brakes
@@ -134,19 +136,25 @@ def test_choice_for_one_pair__by_hand(body, pair, expected, harm):
     assert found.harm[0] == pytest.approx(harm, rel=1e-3 if harm < 1e-6 else 1e-12, abs=1e-14)
 
 
-def test_closed_form__takes_the_middle_of_a_flat_minimum():
-    # The front pair meets while both coast, whatever Vehicle 2 does: 2^2. The rear one stops in 14.4 m, so Vehicle 2
-    # may stop in 9.4 m: 72 / 9.4 m/s2 and less do no further harm.
-    world = alert([1.0, 5.0], [10.0, 12.0, 12.0], braking_capacity_mps2=[5.0, 8.0, 5.0], latency_s=1.0)
-    deceleration, harm = pairwise(world, 2)
-    assert harm[0] == 4.0 and deceleration[0] == pytest.approx(36 / 9.4, abs=1e-12)
-
-
-def test_closed_form__takes_the_first_of_two_minima():
-    # H is 60 at 2.4 and at 6.4 m/s2, and more between.
-    settings = {"braking_capacity_mps2": [8.0, 7.0, 3.0], "latency_s": [0.0, 0.0, 1.0]}
-    deceleration, harm = pairwise(alert([5.0, 6.0], [10.0, 12.0, 12.0], **settings), 2)
-    assert deceleration[0] == pytest.approx(2.4, abs=1e-12) and harm[0] == pytest.approx(60.0, abs=1e-12)
+@pytest.mark.parametrize(
+    ("gaps", "speeds", "settings", "expected", "harm"),
+    [
+        # The front pair meets while both coast, whatever Vehicle 2 does: 2^2. The rear one stops in 14.4 m, so Vehicle
+        # 2 may stop in 9.4 m: 72 / 9.4 m/s2 and less do no further harm, and the middle of them is chosen.
+        ([1.0, 5.0], [10.0, 12.0, 12.0], {"braking_capacity_mps2": [5.0, 8.0, 5.0], "latency_s": 1.0}, 36 / 9.4, 4.0),
+        # H is 60 at 2.4 and at 6.4 m/s2, and more between: the first of two minima is chosen.
+        (
+            [5.0, 6.0],
+            [10.0, 12.0, 12.0],
+            {"braking_capacity_mps2": [8.0, 7.0, 3.0], "latency_s": [0.0, 0.0, 1.0]},
+            2.4,
+            60.0,
+        ),
+    ],
+)
+def test_closed_form__decides_ties(gaps, speeds, settings, expected, harm):
+    deceleration, least = pairwise(alert(gaps, speeds, **settings), 2)
+    assert least[0] == pytest.approx(harm, abs=1e-12) and deceleration[0] == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize(("vehicles", "body"), [(3, 2), (2, 1), (2, 2), (5, 3)])
@@ -180,12 +188,6 @@ def test_pairwise__refuses_what_the_proof_excludes():
         pairwise(slow, 1)
 
 
-def test_coupled__coasts_if_nobody_else_brakes():
-    world = alert([10.0, 10.0], [20.0, 20.0, 20.0], braking_capacity_mps2=6.0)
-    deceleration, harm = coupled(world._replace(wanted=np.zeros((1, 4))), 2, "total", 30.0)
-    assert harm[0] == 0.0 and 0.0 <= deceleration[0] <= 10.0 * 2.0 / 30.0**2
-
-
 def test_coupled__takes_the_middle_of_what_does_no_harm_behind_and_ahead_of_gentle_brakes():
     rng = np.random.default_rng(25)
     gaps, speeds = rng.uniform(9.0, 16.0, (100, 2)), rng.uniform(18.0, 22.0, (100, 3))
@@ -198,13 +200,6 @@ def test_coupled__takes_the_middle_of_what_does_no_harm_behind_and_ahead_of_gent
     assert (best.deceleration_mps2[free] == closed.deceleration_mps2[free]).all()
 
 
-def test_coupled__brakes_as_hard_as_it_can_if_that_is_not_enough():
-    # Front pair alone: harm falls linearly, 0 from 2 + 4^2 / (2 * 8) = 3 on.
-    world = alert([8.0, 500.0], [20.0, 24.0, 0.0], braking_capacity_mps2=[2.0, 2.9, 6.0])
-    deceleration, harm = coupled(world, 2, "first", 30.0)
-    assert deceleration[0] == 2.9 and harm[0] == pytest.approx(16.0 - 2.0 * 0.9 * 8.0, abs=1e-12)
-
-
 def test_coupled__stays_off_the_edge_of_a_jump():
     # The least harm, 1.2376, ends at 5.93951 m/s2, from where a second impact makes it 1.6387.
     world = alert([7.59, 9.53], [20.07, 19.34, 20.35], latency_s=[0.0, 0.5, 0.8], **PAPER)
@@ -215,8 +210,9 @@ def test_coupled__stays_off_the_edge_of_a_jump():
     assert best.harm[0] == first[1]
 
 
-@pytest.mark.parametrize(("vehicles", "body"), [(3, 2), (2, 1), (4, 3)])
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize(
+    ("vehicles", "body", "count"), [(3, 2, "first"), (3, 2, "total"), (2, 1, "first"), (4, 3, "total")]
+)
 def test_coupled__is_not_worse_than_a_grid(vehicles, body, count):
     rng = np.random.default_rng(21)
     n = 150
@@ -257,6 +253,15 @@ def test_coupled__decides_ties_by_the_other_count_then_takes_the_middle():
     known = np.array([np.nan, 1.0, 2.0])
     e_v2x_bm.take_middle(np.arange(5.0), np.array([[1.0, 1.0, 3.0, 1.0, 1.0], [2.0, 4.0, 0.0, 2.0, 2.0]]), known)
     assert known[0] == 3.0  # of 0, 3 and 4
+
+
+def test_cells__between_steep_ones_are_split() -> None:
+    at, harm = np.arange(4.0)[np.newaxis], np.tile([10.0, 4.0, 4.0, 9.0], (2, 1, 1))
+    for steep, expected in ((1.0, [0, 1, 2]), (0.0, [])):
+        best, cells = np.full((1, 3), np.inf), np.empty((2, 4), np.int64)
+        given = harm if steep else np.full_like(harm, 4.0)
+        found = e_v2x_bm.find_cells(np.zeros(1, np.int64), at, given, np.ones(1), best, cells)
+        assert cells[1, :found].tolist() == expected and best[0, 1] == 4.0
 
 
 def test_choice__does_not_depend_on_the_batch_nor_on_coasting_before():
@@ -309,13 +314,6 @@ def test_agents__have_the_harm_of_the_readme():
     assert [f"{mean:.2f}" for mean in means] == ["19.20", "20.68", "9.45"] and agent.knows == STATE
 
 
-@pytest.mark.long
-def test_coupled_agent__has_the_harm_of_the_readme():
-    scenario, game = open_game("paper-random")
-    last = drive(game, scenario.sample(10_000, 7), Team("coupled", {2: make_agent("e_v2x_bm", scenario=scenario)}))
-    assert [f"{last.harm(count).mean():.2f}" for count in ("first", "total")] == ["15.30", "16.44"]
-
-
 def test_agent__assumes_that_learners_brake_and_scripts_hold_their_command():
     scenario, _ = open_game("paper-random")
     roles = {"vehicle_1": "constant:3", "vehicle_2": "learner", "vehicle_3": "learner"}
@@ -341,12 +339,3 @@ def test_agents__refuse_vehicles_that_react_and_other_arguments():
         make_agent("e_v2x_bm:both")
     with pytest.raises(InvalidInput, match="needs a scenario"):
         make_agent("e_v2x_bm")
-
-
-def test_masses__matter_to_the_coupled_choice_alone():
-    worlds = open_game("paper-random")[0].sample(50, 7)
-    heavy = worlds.car.copy()
-    heavy[:, MASS, 2] *= 5.0
-    other = worlds._replace(car=heavy)
-    assert (pairwise(worlds, 2)[0] == pairwise(other, 2)[0]).all()
-    assert (coupled(worlds, 2).harm != coupled(other, 2).harm).any()

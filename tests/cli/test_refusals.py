@@ -143,10 +143,6 @@ def test_output__is_a_folder_of_its_own(line: str, message: str, refuse: Refuse)
     refuse(line, message)
 
 
-def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
-    refuse(f"evaluate --agents ppo@{'a' * 5000}", "cannot be read (File name too long)")
-
-
 @pytest.mark.parametrize(
     ("code", "line", "message"),
     [

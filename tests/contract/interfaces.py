@@ -117,7 +117,9 @@ class Interface:
 
     def drawn(self) -> list[dict[str, Any]]:
         """What each running world was drawn as."""
-        return [self.env.unwrapped.describe_world()]
+        columns = self.env.unwrapped.describe_worlds()
+        worlds = ({name: column[k].item() for name, column in columns.items()} for k in range(self.n))
+        return [{name: value for name, value in world.items() if value != ""} for world in worlds]  # of other worlds
 
     def one_row(self, observation: Array, reward: float, terminated: bool, truncated: bool, info: Any) -> Turn:
         turn = Turn(observation[np.newaxis], np.array([reward]), np.array([terminated]), np.array([truncated]))
@@ -172,16 +174,7 @@ class Single(Interface):
         return self.one_row(*self.env.step(action[0]))
 
 
-class Batch(Interface):
-    """Several worlds at once."""
-
-    def drawn(self) -> list[dict[str, Any]]:
-        columns = self.env.unwrapped.describe_worlds()
-        worlds = ({name: column[k].item() for name, column in columns.items()} for k in range(self.n))
-        return [{name: value for name, value in world.items() if value != ""} for world in worlds]  # of other worlds
-
-
-class Vector(Batch):
+class Vector(Interface):
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
         self.env, self.n = wrap(eb.EthBrakeVectorEnv(n, scenario, autoreset_mode="SameStep", **settings)), n
         self.space = self.env.single_observation_space
@@ -198,7 +191,7 @@ class Vector(Batch):
         return turn
 
 
-class Sb3(Batch):
+class Sb3(Interface):
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
         self.env, self.n = wrap(eb.make_sb3_vec_env(scenario, n, seed=None, horizon_is_end=False, **settings)), n
         self.space = self.env.observation_space

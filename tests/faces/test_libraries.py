@@ -1,23 +1,25 @@
-"""The checks that the libraries give for environments, and a training with each of their interfaces."""
+"""The libraries find and accept the environments: their ids, their own checks, their wrappers."""
 
 import warnings
 from typing import Any
 
+import gymnasium
 import numpy as np
+import pettingzoo
 import pytest
 from gymnasium.utils.env_checker import check_env
-from gymnasium.wrappers import FrameStackObservation, RecordEpisodeStatistics, TimeLimit
-from gymnasium.wrappers.vector import RecordEpisodeStatistics as RecordVectorStatistics
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
+from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
+from ethbrake_marl.errors import MissingExtra
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
-from ethbrake_marl.faces.sb3 import make_sb3_vec_env
+from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 
 SETTINGS: list[dict[str, Any]] = [
-    {}, {"scenario": "cooperation-4-five"}, {"scenario": "paper-random-obstacle", "agents": "learners"},
-    {"actions": 5, "reward": "paper"}, {"scenario": "mixture-delays", "max_cycles": 7},
+    {"scenario": "paper-random-obstacle", "agents": "learners"}, {"actions": 5, "reward": "paper"},
+    {"scenario": "mixture-delays", "max_cycles": 7},
 ]  # fmt: skip
 
 
@@ -31,45 +33,31 @@ def test_pettingzoo__finds_nothing_wrong(settings: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("settings", [{}, {"scenario": "paper-random-buildup", "actions": 3}], ids=str)
-def test_gymnasium__finds_nothing_wrong(settings: dict[str, Any]) -> None:
+def test_gymnasium_and_stable_baselines3__find_nothing_wrong(settings: dict[str, Any]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", ".*(not within|different from the unwrapped version|no render modes).*")
         check_env(EthBrakeEnv(**settings), skip_render_check=True)
+        check_for_sb3(EthBrakeEnv(**settings))
 
 
-def test_gymnasium__wrappers_count_and_cut() -> None:
-    environment = RecordEpisodeStatistics(TimeLimit(FrameStackObservation(EthBrakeEnv(), 3), 5))
-    observation, _ = environment.reset(seed=1)
-    assert observation.shape == (3, *EthBrakeEnv().observation_space.shape)
-    for _ in range(5):
-        *_, truncated, info = environment.step(np.array([-1.0], np.float32))
-    assert truncated
-    assert info["episode"]["l"] == 5
-    many = RecordVectorStatistics(EthBrakeVectorEnv(4))
-    many.reset(seed=1)
-    lengths = [
-        info["episode"]["l"][info["_episode"]]
-        for *_, info in (many.step(np.full((4, 1), -1.0, np.float32)) for _ in range(100))
-        if "episode" in info
-    ]
-    assert np.concatenate(lengths).max() <= 76  # 7.6 s of decisions
+def test_ids__make_the_environments_of_each_library() -> None:
+    register_environments()
+    register_environments()  # has no effect
+    single = gymnasium.make("EthBrake-v1", scenario="paper-random-obstacle", max_episode_steps=3)
+    many = gymnasium.make_vec("EthBrake-v1", 2, max_episode_steps=3, autoreset_mode="SameStep")
+    vectors = gymnasium.make("EthBrakeMO-v1")
+    assert type(single.unwrapped) is type(vectors.unwrapped) is EthBrakeEnv and type(many) is EthBrakeVectorEnv
+    for env, action in ((single, np.zeros(1, np.float32)), (many, np.zeros((2, 1)))):
+        env.reset(seed=1)
+        assert [np.all(env.step(action)[3]) for _ in range(3)] == [False, False, True]
+    vectors.reset(seed=1)
+    assert vectors.step([0.0])[1].shape == vectors.unwrapped.reward_space.shape == (3,)
+    assert type(pettingzoo.make("parallel", "ethbrake/ethbrake-v1").unwrapped) is EthBrakeParallelEnv
+    assert type(pettingzoo.make("aec", "ethbrake/ethbrake-v1").unwrapped) is EthBrakeParallelEnv
 
 
-def test_stable_baselines3__checks_and_trains() -> None:
-    stable_baselines3 = pytest.importorskip("stable_baselines3")
-    from stable_baselines3.common.env_checker import check_env as check_for_sb3
-
-    check_for_sb3(EthBrakeEnv())
-    for environment in (make_sb3_vec_env("cooperation-3-pair", 4, seed=1), make_sb3_vec_env("paper-random", 3, seed=1)):
-        model = stable_baselines3.PPO("MlpPolicy", environment, n_steps=32, batch_size=32, n_epochs=1, seed=1)
-        assert model.learn(256).num_timesteps >= 256
-
-
-def test_supersuit__makes_a_vector_of_the_learners() -> None:
-    supersuit = pytest.importorskip("supersuit")
-    environment = supersuit.pettingzoo_env_to_vec_env_v1(EthBrakeParallelEnv("cooperation-4-all", agents="learners"))
-    seen, _ = environment.reset(seed=1)
-    assert len(seen) == 3
-    _, rewards, *_ = environment.step(np.full((3, 1), -1.0, np.float32))
-    assert len(rewards) == 3
+def test_an_old_pettingzoo__is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(pettingzoo, "parallel_registry")
+    with pytest.raises(MissingExtra, match=r"needs pettingzoo 1.27 or newer; 1\..* is installed"):
+        register_environments()

@@ -227,9 +227,8 @@ def forged(saved: dict[str, Any], place: str, value: Any) -> None:
 
 FORGED = {
     "model/environment/stream": [1, "2"],
-    "model/environment/state/0": torch.zeros(8, 7, 3, dtype=torch.float64),
-    "model/environment/rows/1": torch.zeros(8),
-    "model/environment/memories": {},
+    "model/environment/episode": [torch.zeros(8, 7, 3, dtype=torch.float64)],
+    "model/environment/_steps": torch.zeros(8),
     "model/last/0": torch.zeros(8, 5),
     "model/counters/num_timesteps": -1,
     "model/counters/_n_updates": 1.5,

@@ -273,5 +273,5 @@ def test_capacity__is_that_on_the_road() -> None:
 
 
 def test_mode__says_which_option_it_needs() -> None:
-    with refused("shield: mode 'robust' needs the option uncertainty"):
+    with refused("shield: mode 'robust': missing a required argument: 'uncertainty'"):
         eb.shield(eb.parallel_env("paper-random"), mode="robust")

@@ -1,0 +1,83 @@
+"""What all interfaces share: a game, the stream of its worlds, the running episodes, and pictures of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.infos import dictionaries
+from ethbrake_marl.episode.state import ENDED, State
+from ethbrake_marl.episode.step import TRUNCATED, Step
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.faces.rendering import make_renderer
+from ethbrake_marl.faces.stream import Stream
+from ethbrake_marl.motion.layout import Floats, Ints
+from ethbrake_marl.worlds.scenario import Scenario
+
+
+class Face:
+    """Base of all interfaces. ``bodies`` [B] are the vehicles that an interface shows."""
+
+    bodies: Ints
+    episode: State = None  # type: ignore[assignment]  # until the first reset
+    begins_again = False  # whether an ended episode is followed by the next one, without a reset
+
+    def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
+        """Open a game, whose episodes are truncated after ``most_steps``; None: at the horizon alone."""
+        if most_steps is not None:
+            check_whole_number("number of steps of an episode", most_steps, 1)
+        (self.scenario, self.game), self.render_mode, self._most_steps = opened, render_mode, most_steps
+        self.stream, self.renderer = Stream(*opened), make_renderer(self, render_mode)
+        self._of_state = self.scenario.horizon_s, self.scenario.has_obstacle
+
+    def _need_learner(self) -> None:
+        if not len(self.game.rules.learners):
+            raise InvalidInput(f"scenario {self.scenario.name!r} has no learner; pass learners=['vehicle_2']")
+
+    def _begin(self, n: int, seed: int | None, options: Any) -> State:
+        """Start episodes in n worlds."""
+        self.episode = self.stream.restart(n, seed, options)
+        self.renderer.began(self.episode)
+        return self.episode
+
+    def _begun(self, what: str) -> State:
+        if self.episode is None:
+            raise InvalidInput(f"{what}: no episode is running; call reset first")
+        return self.episode
+
+    def _advance(self, actions: Floats) -> tuple[State, Step]:
+        """Advance all worlds by one time step with the learners' actions [n, L]."""
+        before = self._begun("step")
+        if not self.begins_again and before.clock[0, ENDED] == 1.0:
+            raise InvalidInput("step: no episode is running; call reset first")
+        state, step = self.game.step(before, actions, donate=self.begins_again)
+        if self._most_steps is not None:
+            rows = (state.steps >= self._most_steps) & (step.terminated | ~state.ended)
+            state.clock[rows, ENDED] = 1.0
+            step.out[TRUNCATED, rows] = 1.0
+        self.episode = state
+        return state, step
+
+    def _rewards(self, step: Step) -> Floats:
+        """Return the rewards of a step, [n, B], or [n, B, K] where they are vectors."""
+        rewards: Floats = (step.reward if step.vector is None else step.vector).take(self.bodies - 1, axis=1)
+        return rewards
+
+    def _infos(self, state: State, step: Step | None) -> list[dict[str, Any]]:
+        return dictionaries(self.game, state, step, self.stream.seed or 0, self.bodies)
+
+    def describe_worlds(self) -> dict[str, Any]:
+        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        return self.stream.describe(self._begun("describe_worlds"))
+
+    def describe_world(self) -> dict[str, Any]:
+        """Return what was drawn for the first running world: a name such as ``gap_1_m`` or ``scenario`` -> value."""
+        return {name: column[0].item() for name, column in self.describe_worlds().items()}
+
+    def render(self) -> Any:
+        """Return a picture, as the render mode has it; a tuple of many worlds."""
+        return self.renderer.render()
+
+    def close(self, **kwargs: Any) -> None:
+        """Give back what the render mode holds."""
+        self.renderer.close()

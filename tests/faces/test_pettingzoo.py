@@ -1,0 +1,129 @@
+"""PettingZoo: agents, what each is given, vector rewards, and refusals of actions and settings."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.episode.full_state import full_state
+from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
+from ethbrake_marl.faces.shield import shield
+from tests.contract.interfaces import CRASH, PAPER, REST
+from tests.refused import refused
+
+SCRIPTED = PAPER.replace(roles={vehicle: "full_brake" for vehicle in PAPER.vehicle_names})
+
+
+def began(**settings: Any) -> EthBrakeParallelEnv:
+    env = EthBrakeParallelEnv(**settings)
+    env.reset(seed=7)
+    return env
+
+
+def test_crash__by_hand() -> None:
+    env = began(scenario=CRASH)
+    seen = [env.step({"vehicle_1": [1.0], "vehicle_2": [0.0]}) for _ in range(8)]  # from 0.5 s to the horizon at 1.3 s
+    harm = [rewards["vehicle_1"] for _, rewards, *_ in seen]
+    assert harm[:4] == [0.0] * 4 and sum(harm) == pytest.approx(-36.0)
+    infos = seen[-1][4]
+    borne = {agent: info["first_impact_harm"] for agent, info in infos.items()}
+    assert borne == {"vehicle_1": pytest.approx(27.0), "vehicle_2": pytest.approx(9.0)}
+    assert infos["vehicle_1"]["chosen_action"] == -1.0 and infos["vehicle_2"]["chosen_action"] == 0.0
+    assert seen[-1][3] == {"vehicle_1": True, "vehicle_2": True} and env.agents == []
+    assert np.array_equal(env.state(), full_state(env.episode, 1.3, False)[0]) and env.state() in env.state_space
+    with refused("step: no episode is running; call reset first"):
+        env.step({"vehicle_2": [0.0]})
+
+
+@pytest.mark.parametrize("agents", ["all", "learners"])
+def test_agents__are_given_what_their_own_vehicle_observes(agents: str) -> None:
+    observation = {"vehicle_2": ["own", "rear_1"], "vehicle_3": ["own", "place"]}
+    env = EthBrakeParallelEnv("cooperation-4-five", agents=agents, observation=observation)
+    seen, _ = env.reset(seed=7)
+    for _ in range(9):
+        for agent in env.agents:
+            body = int(agent[-1])
+            own = env.game.views[body].observe(env.episode, np.array([body]), 0.1)[0, 0]
+            assert np.array_equal(seen[agent], own) and seen[agent] in env.observation_space(agent)
+        seen, *_ = env.step({f"vehicle_{body}": [-0.3] for body in env.game.rules.learners})
+    names = list(env.scenario.vehicle_names)
+    assert env.agents == (names if agents == "all" else [names[i - 1] for i in env.scenario.learners])
+
+
+def test_max_cycles__truncates_also_an_episode_that_it_ends_with() -> None:
+    for most, ends in ((9, (False, True)), (10, (True, True)), (11, (True, False))):
+        env = began(scenario=REST, max_cycles=most)  # at rest after 10 steps
+        while env.agents:
+            _, _, terminations, truncations, _ = env.step({"vehicle_2": [-1.0]})
+        assert (terminations["vehicle_2"], truncations["vehicle_1"]) == ends
+
+
+def test_vector_rewards__are_the_harm_that_each_vehicle_bears() -> None:
+    env, scalar = began(scenario=CRASH, reward_vector="vehicles"), began(scenario=CRASH)
+    for _ in range(8):
+        rewards, numbers = env.step({"vehicle_2": [0.0]})[1], scalar.step({"vehicle_2": [0.0]})[1]
+        assert all(rewards[agent].sum() == pytest.approx(numbers[agent]) for agent in numbers)
+        if numbers["vehicle_1"]:
+            assert rewards["vehicle_2"].tolist() == pytest.approx([-27.0, -9.0])
+    assert rewards["vehicle_1"] in env.reward_space("vehicle_1") and env.reward_spaces.keys() == rewards.keys()
+    with refused("reward_space: rewards are numbers here"):
+        scalar.reward_space("vehicle_1")
+
+
+def test_indices__are_evenly_spaced_actions() -> None:
+    env = began(scenario="cooperation-3-pair", actions=5)
+    for index in range(5):
+        infos = env.step({"vehicle_2": index, "vehicle_3": [np.int64(4 - index)]})[4]
+        assert infos["vehicle_2"]["chosen_action"] == pytest.approx(index / 2 - 1)
+        assert infos["vehicle_3"]["chosen_action"] == pytest.approx(1 - index / 2)
+
+
+REFUSED: dict[str, Callable[[], Any]] = {
+    "step: the action of learner vehicle_2 is missing": lambda: began().step({"vehicle_1": [0.0]}),
+    "unknown agent 'vehicle_9'": lambda: began().step({"vehicle_9": [0.0]}),
+    "step: actions = [0.0]: must be a mapping from agent to action": lambda: began().step([0.0]),  # type: ignore[arg-type]
+    "action of vehicle_2: [[0.1], [0.1, 0.2]]: must be a number": lambda: began().step(
+        {"vehicle_2": [[0.1], [0.1, 0.2]]}
+    ),
+    "action of vehicle_2: True: must be a number": lambda: began().step({"vehicle_2": True}),
+    "action of vehicle_2: 5: must be an index from 0 to 4": lambda: began(actions=5).step({"vehicle_2": 5}),
+    "action of vehicle_2: -1: must be an index": lambda: began(actions=5).step({"vehicle_2": -1}),
+    "action of vehicle_2: 1.0: must be an index": lambda: began(actions=5).step({"vehicle_2": 1.0}),
+    "actions = 1: must be a whole number, at least 2": lambda: EthBrakeParallelEnv(actions=1),
+    "agents = 'some': must be 'all' or 'learners'": lambda: EthBrakeParallelEnv(agents="some"),
+    "has no learner; pass learners=['vehicle_2']": lambda: EthBrakeParallelEnv(SCRIPTED, agents="learners"),
+    "number of steps of an episode = 0: must be": lambda: EthBrakeParallelEnv(max_cycles=0),
+    "state: no episode is running": lambda: EthBrakeParallelEnv().state(),
+    "describe_worlds: no episode is running": lambda: EthBrakeParallelEnv().describe_world(),
+    "render_mode = 'film': must be None or one of": lambda: EthBrakeParallelEnv(render_mode="film"),
+    "reset: options = [1]: must be None or a mapping": lambda: began().reset(options=[1]),  # type: ignore[arg-type]
+    "reset: options has both initial_state and listed_world": lambda: began().reset(
+        options={"initial_state": {}, "listed_world": {}}
+    ),
+    "reset: listed_world = {'seed': 7}: must be seed and number": lambda: began().reset(
+        options={"listed_world": {"seed": 7}}
+    ),
+    "first world = -1: must be a whole number, at least 0": lambda: began().reset(
+        options={"listed_world": {"seed": 7, "number": -1}}
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_refusals(message: str) -> None:
+    with refused(message):
+        REFUSED[message]()
+
+
+def test_behind_a_shield__a_missing_action_is_no_proposal() -> None:
+    env = shield(EthBrakeParallelEnv(), "full_brake")
+    env.reset(seed=7)
+    assert env.step({})[4]["vehicle_2"]["shield_proposed_action"] == -1.0
+
+
+def test_a_line_without_learners__plays_by_itself() -> None:
+    env = began(scenario=SCRIPTED)
+    while env.agents:
+        *_, infos = env.step({})
+    assert infos["vehicle_1"]["time_s"] > 2.0
