@@ -39,14 +39,8 @@ class CatalogueEntry:
 
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
     """Return the folder of the shipped scenarios or recipes (``train``), in the checkout or the installed package."""
-    checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
-    if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
-        return checkout
-    if not installed.is_dir():
-        raise InvalidInput(
-            f"the shipped files are missing: neither {checkout} nor {installed} exists; reinstall the package"
-        )
-    return installed
+    checkout = _PACKAGE.parent / folder
+    return checkout if (_PACKAGE.parent / "pyproject.toml").is_file() else _PACKAGE / "_data" / folder
 
 
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
@@ -144,18 +138,14 @@ def _whole(document: Document, folder: Path) -> Document:
 
 def _member(document: Document, i: int, entry: Any, folder: Path) -> Any:
     """Return entry i of a mixture with the content of its scenario. What is no entry is left to the schema."""
+    if not isinstance(entry, dict) or "scenario" not in entry:
+        return entry
     at: YamlPath = ("mixture", i, "scenario")
-    member = entry.get("scenario") if isinstance(entry, dict) else None
-    if member is None or not isinstance(member, str):
-        return entry if member is None else {**entry, "scenario": _with_rows(document, at, member, folder)}
-    try:
-        path = scenario_path(member, folder)
-        content = read_yaml(path).content
-        if isinstance(content, dict) and "mixture" in content:
-            raise InvalidInput(f"a mixture cannot contain another mixture; list the scenarios of {member} instead")
-        return {**entry, "scenario": load_scenario(path).declared()}
-    except InvalidInput as error:
-        raise InvalidInput(f"{document.where(at)}: mixture[{i}].scenario = {member}: {error}") from None
+    member = entry["scenario"]
+    if not isinstance(member, str):
+        return {**entry, "scenario": _with_rows(document, at, member, folder)}
+    with document.refusing_at(at):
+        return {**entry, "scenario": load_scenario(scenario_path(member, folder)).declared()}
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
@@ -167,6 +157,6 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
     with document.refusing_at((*at, "table", "file")):
         if path.is_absolute() or ".." in path.parts:
             raise InvalidInput(f"table.file = {path}: must be a relative path in the scenario's folder")
-        rows = read_rows(folder / path, table.get("columns"), table.get("weights"))
+        rows = read_rows(folder / path, table.get("columns"))
     entries = {key: value for key, value in table.items() if key != "file"}  # the file's name does not matter
-    return {**content, "table": {**entries, **rows}}
+    return {**content, "table": {**entries, "rows": rows}}

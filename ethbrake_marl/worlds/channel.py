@@ -18,12 +18,11 @@ latency is over, and it has the message of Vehicle 1 or has seen the vehicle ahe
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from operator import not_
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
-from pydantic import ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -33,7 +32,7 @@ from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.counters import Numbers
-from ethbrake_marl.worlds.quantity import Part
+from ethbrake_marl.worlds.quantity import Part, ordered
 
 if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game
@@ -48,7 +47,7 @@ Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
 class Equipage(Part):
-    """V2X equipment of one vehicle, or of all vehicles of one type."""
+    """V2X equipment of the vehicles of one type."""
 
     sends: bool = Field(default=True, description="whether the vehicle sends messages")
     hears: Hears = Field(
@@ -56,21 +55,6 @@ class Equipage(Part):
         description="senders whose messages the vehicle receives, if the channel delivers them: all, front (vehicles"
         " ahead) or none",
     )
-
-
-class Equipped(NamedTuple):
-    """V2X equipment of the vehicles of n worlds; n = 1 if it is the same in all of them."""
-
-    sends: Bools  # [n, N]
-    hears: Ints  # [n, N] index of HEARS
-
-    @property
-    def unheard(self) -> Bools:
-        """Whether vehicle i never receives a message from vehicle j, [n, N, N]."""
-        receiver, sender = np.indices((self.sends.shape[1],) * 2)
-        hears = self.hears[:, :, np.newaxis]
-        unheard: Bools = ~self.sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
-        return unheard
 
 
 class Channel(NamedTuple):
@@ -99,23 +83,24 @@ class Channel(NamedTuple):
         delay[u[..., 2] < self.lost] = np.inf
         return delay
 
-    def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
+    def heard_and_seen(self, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
         """Return when i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
 
-        ``u`` [n, PER_LINK N^2] are the uniform numbers of the links. Infinite: never. Minus infinite: at once.
+        ``u`` [n, PER_LINK N^2] are the uniform numbers of the links, ``unheard`` [n or 1, N, N] says whose equipment
+        lets no message through (``unheard_by``). Infinite: never. Minus infinite: at once.
         """
-        N = equipped.sends.shape[1]
+        N = unheard.shape[1]
         links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
-        unheard = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}[self.hears]
-        heard = np.where(unheard | equipped.unheard, np.inf, self.first_message_s(links))
+        deaf = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}[self.hears]
+        heard = np.where(deaf | unheard, np.inf, self.first_message_s(links))
         ahead = sender == receiver - 1
         in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": sender < 0}[self.senses]
         low, high = self.sensing_s
         return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
 
-    def news(self, own_latency: Floats, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
+    def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
         """Return when each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
-        N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, equipped)
+        N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, unheard)
         latency = own_latency.copy()
         for i in range(1, N if self.timing != "latency" else 0):
             first = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
@@ -124,15 +109,18 @@ class Channel(NamedTuple):
         known[:, np.arange(N), np.arange(N)] = latency
         return latency, known
 
-    def latest_reaction_s(self, own_latency: Sequence[float], equipped: Equipped) -> list[float]:
-        """Return upper bounds of the times from which the vehicles can react, from those of their own latencies."""
-        latest = list(own_latency)
-        slowest = np.array([[1.0, 0.0, 1.0, 1.0]])  # numbers of a link with the largest delay of a message
-        heard = float(self.first_message_s(slowest)[0]) if self.hears != "none" and self.lost == 0.0 else np.inf
-        for i in range(1, len(latest) if self.timing != "latency" else 0):
-            seen = latest[i - 1] + self.sensing_s[1] if self.senses != "none" else np.inf
-            latest[i] = max(latest[i], min(seen, np.inf if equipped.unheard[0, i, 0] else heard))
-        return latest
+    def latest_reaction_s(self, own_latency: Floats, unheard: Bools) -> Floats:
+        """Return upper bounds of the times from which vehicles can react, [n, N] s, from their own latencies."""
+        slowest = np.tile([1.0, 0.0, 0.0, 1.0], (len(own_latency), own_latency.shape[1] ** 2))  # numbers of links
+        return self.news(own_latency, slowest, unheard)[0]
+
+
+def unheard_by(sends: Bools, hears: Ints) -> Bools:
+    """Return whether vehicle i never receives a message of j, [n, N, N]; ``hears`` [n, N] are indices of ``HEARS``."""
+    receiver, sender = np.indices((sends.shape[1],) * 2)
+    hears = hears[:, :, np.newaxis]
+    unheard: Bools = ~sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
+    return unheard
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
@@ -152,7 +140,6 @@ class Extension(Protocol):
     """What a package adds to the knowledge of vehicles, declared by keys of ``v2x``."""
 
     name: str  # of its memory in `State.memories`
-    keys: tuple[str, ...]  # of `v2x`
     schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
 
     def read(self, key: str, value: Any) -> Any:
@@ -167,10 +154,7 @@ class Extension(Protocol):
     def check(self, scenario: Scenario) -> None:
         """Refuse a scenario in which these keys cannot be used."""
 
-    def check_alike(self, where: str, first: Scenario, other: Scenario) -> None:
-        """Raise ``InvalidInput`` unless worlds of both scenarios can be drawn together."""
-
-    def at_alert(self, scenario: Scenario, numbers: Numbers, equipped: Equipped, n: int) -> Any:
+    def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
         """Return the memory of n worlds at the alert."""
 
     def game(self, game: Game) -> Game:
@@ -229,51 +213,41 @@ class V2X(Part):
         default=None, description="t_proc, time until the receiver has processed a message"
     )
     actuation_s: Seconds | None = Field(default=None, description="t_act, time until the receiver's brakes respond")
-    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = Field(
+    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False), AfterValidator(ordered)] | None = Field(
         default=None, description="[low, high]: range of the uniform delay after which a neighbour is seen"
-    )
-    vehicles: dict[str, Equipage] | None = Field(
-        default=None,
-        exclude_if=not_,
-        description="vehicles with other V2X equipment than the rest, such as {vehicle_3: {sends: false, hears: none}}",
     )
 
     @model_validator(mode="before")
     @classmethod
     def _by_name(cls, value: Any) -> Any:
-        place = ("preset",) if isinstance(value, dict) else ()
-        value = {"preset": value} if isinstance(value, str) else value
+        if isinstance(value, V2X):
+            return value
         name = value.get("preset", "paper") if isinstance(value, dict) else value
         right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
-        require(isinstance(value, V2X) or (isinstance(name, str) and name in CHANNELS), place, name, right)
-        if not isinstance(value, dict):
-            return value
-        known = cls.model_fields
-        for key in value.keys() - known.keys():
-            close = suggestion(str(key), [*known, *EXTENSIONS]) or f"known: {', '.join((*known, *EXTENSIONS))}"
-            require(key in EXTENSIONS, (key,), UNSHOWN, f"unknown key; {close}")
-        return {key: each if key in known else EXTENSIONS[key].read(key, each) for key, each in value.items()}
+        place = ("preset",) if isinstance(value, dict) else ()
+        require(isinstance(name, str) and name in CHANNELS, place, name, right)
+        written = value if isinstance(value, dict) else {"preset": value}
+        known = (*cls.model_fields, *EXTENSIONS)
+        for key in written:
+            close = suggestion(str(key), known) or f"known: {', '.join(known)}"
+            require(key in known, (key,), UNSHOWN, f"unknown key; {close}")
+        return {key: EXTENSIONS[key].read(key, each) if key in EXTENSIONS else each for key, each in written.items()}
 
     @model_validator(mode="after")
-    def _possible(self) -> V2X:
+    def _possible(self) -> Self:
         channel, timing = self.channel, self.channel.timing
         used = [key for extension in self.extensions for key in extension.uses(self)]
-        useless: dict[str, str] = {}  # key -> why it has no effect
-        if channel.senses == "none":
-            useless |= {"sensing_s": "senses: none means that no vehicle is in sight"}
-        if timing == "latency":
-            useless |= dict.fromkeys((*OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
-        if timing == "fixed":
-            unused = [key for key in OF_MESSAGES if key not in used]
-            useless |= dict.fromkeys(unused, "link_latency_s fixes the delay of messages")
-        if channel.hears == "none":
-            unheard = ("link_latency_s", "lost", "vehicles", *OF_MESSAGES)
-            useless |= dict.fromkeys(unheard, "hears: none means that no vehicle gets messages")
-        for key, why in useless.items():
-            value = getattr(self, key)
-            require(value is None, (key,), value, f"has no effect, because {why}; leave it out")
-        low, high = channel.sensing_s
-        require(low <= high, ("sensing_s",), channel.sensing_s, "low must not be above high")
+        unused = [key for key in OF_MESSAGES if key not in used]
+        unheard = ("link_latency_s", "lost", *OF_MESSAGES)
+        for useless, keys, why in (
+            (channel.senses == "none", ["sensing_s"], "senses: none means that no vehicle is in sight"),
+            (channel.hears == "none", unheard, "hears: none means that no vehicle gets messages"),
+            (timing == "latency", OF_MESSAGES, f"preset {self.preset} generates no messages"),
+            (timing == "fixed", unused, "link_latency_s fixes the delay of messages"),
+        ):
+            for key in keys if useless else ():
+                value = getattr(self, key)
+                require(value is None, (key,), value, f"has no effect, because {why}; leave it out")
         silent = timing == "messages" or channel.hears == "none" or channel.lost > 0.0
         blind = channel.senses == "none" and silent and timing != "latency"
         right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"

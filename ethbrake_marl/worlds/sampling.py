@@ -13,12 +13,23 @@ from ethbrake_marl.episode.step import at_alert, begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
 from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, FAR_M, GAP, LATENCY, Bools, Floats, Ints
-from ethbrake_marl.worlds.channel import PER_LINK, Equipped
+from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.counters import Channel, Numbers, numbers_of, world_numbers
 from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
 from ethbrake_marl.worlds.quantity import pick, values
 from ethbrake_marl.worlds.roles import first_command
-from ethbrake_marl.worlds.rules import CAR_ROWS, MIXTURE, NEWS, OF_WORLD, PER_TYPE, ROW, RULES, TYPES, width_of
+from ethbrake_marl.worlds.rules import (
+    CAR_ROWS,
+    MIXTURE,
+    NEWS,
+    OF_WORLD,
+    PER_TYPE,
+    RECORDING,
+    ROW,
+    RULES,
+    TYPES,
+    width_of,
+)
 from ethbrake_marl.worlds.table import TableColumn
 from ethbrake_marl.worlds.vehicle_types import WithLoad
 
@@ -48,7 +59,7 @@ class Drawn(NamedTuple):
         return cls(worlds, np.full(n, np.nan), np.full((n, worlds.vehicles), ""), np.full(n, ""), np.full(n, ""))
 
 
-def draw(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Drawn:
+def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) -> Drawn:
     """Return worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
 
     World k of a mixture is world k of the member that is chosen for it. Raises ``InvalidInput`` for bad arguments, and
@@ -72,14 +83,14 @@ def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     """Return the worlds of these random numbers, early impacts included. The scenario is no mixture."""
-    n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.recordings
+    n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     kind, load = (None, None) if line is None else line.draw(numbers(PER_TYPE * N, TYPES).reshape(n, N, PER_TYPE))
     declared = _declared_values(scenario, numbers, n, kind, load)
     whole = world_values(scenario, declared)
     if scenario.has_obstacle:
         whole["obstacle_gap_m"] = obstacle_gap(scenario, whole, declared)
     return Drawn(
-        state_of(scenario, whole, numbers, scenario.equipped(kind), index),
+        state_of(scenario, whole, numbers, scenario.unheard(kind), index),
         whole["friction"][:, 0] if "friction" in whole else np.full(n, np.nan),
         np.full((n, N), "") if line is None else np.array(line.names)[kind],
         np.full(n, ""),
@@ -94,7 +105,7 @@ def _declared_values(
     streams: dict[tuple[int, ...], Floats] = {}
 
     def declared(key: str) -> Floats:
-        entries = scenario.declarations(key)
+        entries = scenario.sources[key]
         drawn = np.empty((n, len(entries)))
         for i, possible in enumerate(entries):
             for k, quantity in possible.items():
@@ -115,7 +126,7 @@ def _declared_values(
     return declared
 
 
-def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equipped, index: Ints) -> State:
+def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools, index: Ints) -> State:
     """Return worlds at the alert from all their quantities, and the random numbers of their links.
 
     With the channel of the paper a vehicle knows everything once its own latency is over.
@@ -125,7 +136,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equi
     know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))
     latency, known = whole["latency_s"], whole["latency_s"][:, :, np.newaxis]
     if scenario.v2x.by_link:
-        latency, known = scenario.v2x.channel.news(latency, numbers(PER_LINK * N * N, NEWS), equipped)
+        latency, known = scenario.v2x.channel.news(latency, numbers(PER_LINK * N * N, NEWS), unheard)
     obstacle = whole.get("obstacle_gap_m", np.full((n, 1), FAR_M))
     of_car = [(row, whole[key]) for key, row in CAR_ROWS.items() if key in whole and row != LATENCY]
     of_car += [(LATENCY, latency), (layout.OWN_LATENCY, whole["latency_s"])]
@@ -140,7 +151,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equi
         know[rows, 1:, 1:] = known[rows]
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], whole["braking_capacity_mps2"][:, i])
-    memories = {each.name: each.at_alert(scenario, numbers, equipped, n) for each in scenario.v2x.extensions}
+    memories = {each.name: each.at_alert(scenario, numbers, unheard, n) for each in scenario.v2x.extensions}
     return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 

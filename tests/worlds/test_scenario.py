@@ -19,7 +19,7 @@ from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.worlds import catalogue, explain
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import numbers_of
-from ethbrake_marl.worlds.describe import clusters_of, columns_of, kinds_of
+from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
 from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
@@ -172,40 +172,15 @@ TABLE = {
 
 
 def test_table__gives_whole_rows() -> None:
-    scenario = line(table={**TABLE, "weights": [1, 2, 1]})
+    scenario = line(table=TABLE)
     drawn = scenario.draw(400, 7)
     u = numbers_of(7, "list", 0, np.arange(400))(4, (6,))[:, 1]
-    row = np.where(u < 0.25, 0, np.where(u < 0.75, 1, 2))
+    row = np.floor(3 * u)
     assert drawn.worlds.gaps_m[:, 0].tolist() == (5.0 + row).tolist()
     assert drawn.worlds.speeds_mps[:, 1].tolist() == (11.0 + row).tolist()
     assert drawn.worlds.gaps_m[:, 1].tolist() == [7.0] * 400
     assert sorted(set(clusters_of(columns_of(drawn)))) == ["a", "b"]
     assert scenario.bounds("gaps_m") == ((5.0, 7.0), (7.0, 7.0))
-
-
-TABLES = {
-    "table.columns = gap_9_m: unknown column; did you mean": {"columns": ["gap_9_m"], "rows": [[1]]},
-    "table.rows[0][0] = -1: gap_1_m must be finite and in [0, 10000] m": {"columns": ["gap_1_m"], "rows": [[-1]]},
-    "table.rows[1]: has 2 values; must have one for each of the 1 columns": {
-        "columns": ["gap_1_m"], "rows": [[1], [1, 2]],
-    },
-    "table.weights: must be 2 numbers, one per row": {"columns": ["gap_1_m"], "rows": [[1], [2]], "weights": [1]},
-    "table.columns = [gap_1_m, gap_1_m]: must not list a column twice": {"columns": ["gap_1_m"] * 2, "rows": [[1, 2]]},
-    "table.rows: must be given as lists here": {"columns": ["gap_1_m"], "file": "x.csv"},
-    "gaps_m = 7: must be left out, because the table has columns of it for all": {
-        "columns": ["gap_1_m", "gap_2_m"], "rows": [[1, 2]],
-    },
-    "must also have a column of numbers": {"columns": ["recording"], "rows": [["a"]]},
-    "table.rows[0][1] = 2: recording must be a printable text, such as drive_1.csv: 2-3-4": {
-        "columns": ["gap_1_m", "recording"], "rows": [[1, 2]],
-    },
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("message", TABLES)
-def test_table__is_refused(message: str) -> None:
-    with refused(message):
-        line(table=TABLES[message])
 
 
 def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> None:
@@ -268,16 +243,26 @@ def test_new_way_to_declare__takes_the_place_of_the_old_one() -> None:
     assert margin.obstacle_margin_m is None
 
 
-def test_describe__has_a_column_for_all_that_was_drawn() -> None:
-    columns = load_scenario("engineering-loaded-lorries").describe(3, 7, first=5)
-    assert [*columns][:5] == ["world", "vehicle_1_type", "vehicle_2_type", "vehicle_3_type", "gap_1_m"]
-    assert [*load_scenario("mixture-delays").describe(1, 7)][:3] == ["world", "scenario", "gap_1_m"]
-    assert columns["world"].tolist() == [5, 6, 7]
-    assert PAPER.describe(2, 7)["gap_1_m"].round(2).tolist() == [6.62, 5.33]
-    assert "obstacle_gap_m" not in PAPER.describe(2, 7)
-    wet = line(friction={"uniform": [0.2, 0.4]}).describe(2, 7)
-    assert (wet["braking_capacity_1_mps2"] == wet["friction"] * 9.81).all()
-    assert kinds_of(PAPER.draw(2, 7)) == {}
+def test_columns__are_all_that_was_drawn() -> None:
+    def columns(scenario: Scenario, n: int, first: int = 0) -> dict[str, Any]:
+        return columns_of(scenario.draw(n, 7, first=first))
+
+    loaded = columns(load_scenario("engineering-loaded-lorries"), 3, 5)
+    assert [*loaded][:5] == ["world", "vehicle_1_type", "vehicle_2_type", "vehicle_3_type", "gap_1_m"]
+    assert [*columns(load_scenario("mixture-delays"), 1)][:3] == ["world", "scenario", "gap_1_m"]
+    assert loaded["world"].tolist() == [5, 6, 7]
+    paper = columns(PAPER, 2)
+    assert [*paper][:2] == ["world", "gap_1_m"]
+    assert "obstacle_gap_m" not in paper
+    assert paper["gap_1_m"].round(2).tolist() == [6.62, 5.33]
+    wet = line(friction={"uniform": [0.2, 0.4]})
+    drawn = columns(wet, 2)
+    assert (drawn["braking_capacity_1_mps2"] == drawn["friction"] * 9.81).all()
+    assert fixed_columns(wet) == {*drawn} - {"world", "friction"} - {
+        f"{name}_{end}" for name in ("gap_1", "gap_2", "speed_1", "speed_2", "speed_3", "braking_capacity_1",
+        "braking_capacity_2", "braking_capacity_3", "driving_capacity_1", "driving_capacity_2", "driving_capacity_3")
+        for end in ("m", "mps", "mps2")
+    }  # fmt: skip
 
 
 def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -302,11 +287,13 @@ def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: 
         catalogue.register_scenarios("sub")
 
 
-def test_keys__have_ranges_and_defaults() -> None:
+def test_keys__have_examples_and_ranges() -> None:
     keys = {key.name: key for key in explain.listed_keys()}
-    assert keys["mass_t"][1:] == ("", "finite and in (0, 1000] t (tonnes)", "mass of each vehicle")
-    assert keys["horizon_s"].default == "8"
-    assert keys["early_impacts"].default == "keep"
+    assert keys["mass_t"][1:] == (
+        "[4.5, 5.5, 5.9]", "mass of each vehicle", "mass of each vehicle; finite and in (0, 1000] t (tonnes)",
+    )  # fmt: skip
+    assert keys["time_gaps_s"].comment.endswith("; finite and in (0, 60] s (seconds); give either this key or gaps_m")
+    assert keys["horizon_s"].example == "8"
 
 
 def test_sentences__say_what_each_key_means() -> None:
