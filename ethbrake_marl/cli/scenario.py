@@ -210,13 +210,13 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
     from ethbrake_marl.evaluation.named_measures import MEASURES, USUAL
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
-    from ethbrake_marl.worlds.channel import CHANNELS
+    from ethbrake_marl.worlds.channel import PRESETS
 
     features = FEATURES.usable().items()
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
     parts = {
         "Observation": [*WHOLE_GROUPS, "front_K", "rear_K", *GROUPS, *own],
-        "V2X presets": [*CHANNELS],
+        "V2X presets": [*PRESETS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Terms": [*BUILT_IN, *TERMS],
         "Measures": [name for name in MEASURES if name not in USUAL],

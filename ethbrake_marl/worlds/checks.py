@@ -63,12 +63,12 @@ def _check_declared_once(scenario: Scenario) -> None:
 
 def _check_channel(scenario: Scenario) -> None:
     """Refuse a time step above the horizon, and V2X equipment that has no effect."""
-    v2x, channel = scenario.v2x, scenario.v2x.channel
+    v2x = scenario.v2x
     in_time = scenario.time_step_s <= scenario.horizon_s
     right = f"must not be above horizon_s ({scenario.horizon_s:g} s)"
     require(in_time, ("time_step_s",), scenario.time_step_s, right)
     right = f"has no effect, because v2x: {v2x.preset} generates no messages; use another v2x, such as nominal"
-    sent = channel.timing != "latency" and channel.hears != "none"
+    sent = v2x.timing != "latency" and v2x.hears != "none"
     for name, kind in (scenario.vehicle_types or {}).items():
         require(sent or kind.v2x is None, ("vehicle_types", name, "v2x"), kind.v2x, right)
     right = "works only with v2x: paper, because messages before the alert are not modelled"

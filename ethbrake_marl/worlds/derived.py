@@ -71,7 +71,7 @@ def mistakes(scenario: Scenario, low: Values, high: Values) -> Iterator[tuple[st
     def first(holds: Any) -> Any:
         return np.flatnonzero(~holds)[:1].tolist()
 
-    latest = scenario.v2x.channel.latest_reaction_s(high["latency_s"], scenario.unheard())
+    latest = scenario.v2x.latest_reaction_s(high["latency_s"], scenario.unheard())
     for i, (name, role) in enumerate(scenario.roles.items()):
         slow, fast, limit = low["speeds_mps"][:, i], high["speeds_mps"][:, i], low["speed_limit_mps"][:, i]
         for row in first((slow >= 0.0) & (fast <= limit)):

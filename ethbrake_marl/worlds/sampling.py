@@ -136,7 +136,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
     know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))
     latency, known = whole["latency_s"], whole["latency_s"][:, :, np.newaxis]
     if scenario.v2x.by_link:
-        latency, known = scenario.v2x.channel.news(latency, numbers(PER_LINK * N * N, NEWS), unheard)
+        latency, known = scenario.v2x.news(latency, numbers(PER_LINK * N * N, NEWS), unheard)
     obstacle = whole.get("obstacle_gap_m", np.full((n, 1), FAR_M))
     of_car = [(row, whole[key]) for key, row in CAR_ROWS.items() if key in whole and row != LATENCY]
     of_car += [(LATENCY, latency), (layout.OWN_LATENCY, whole["latency_s"])]

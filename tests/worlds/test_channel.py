@@ -5,7 +5,7 @@ import pytest
 
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.channel import CHANNELS, PER_LINK, V2X, burst_periods, register_preset
+from ethbrake_marl.worlds.channel import PER_LINK, PRESETS, V2X, burst_periods, register_preset
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.refused import refused
 
@@ -26,7 +26,7 @@ def test_burst__lasts_as_long_as_the_gilbert_elliott_channel_says() -> None:
 
 
 def test_first_message__by_hand() -> None:
-    channel = CHANNELS["congested"]  # 0.02 + 0.1 + 0.2 s on the way, every 0.1 s, 5 % lost; P(k >= 1) = 0.25
+    channel = V2X.model_validate("congested")  # 0.02 + 0.1 + 0.2 s on the way, every 0.1 s, 5 % lost; P(k >= 1) = 0.25
     u = np.array([[0.5, 0.9, 0.5, 0.0], [0.5, 0.24, 0.5, 0.0], [0.5, 0.9, 0.04, 0.0]])
     assert channel.first_message_s(u).tolist() == pytest.approx([0.37, 0.47, np.inf])
 
@@ -56,9 +56,9 @@ def test_vehicle__that_does_not_send_is_only_seen() -> None:
     assert ahead.know[0, 1:, 1:].tolist() == [[0.0, 1.0, np.inf], [0.4, 0.4, 0.4], [0.5, 0.5, 0.5]]
 
 
-@pytest.mark.parametrize("preset", CHANNELS)
+@pytest.mark.parametrize("preset", PRESETS)
 def test_latest_reaction__bounds_all_that_is_drawn(preset: str) -> None:
-    channel, own = CHANNELS[preset], np.tile([0.0, 0.2, 0.9, 0.1], (2000, 1))
+    channel, own = V2X.model_validate(preset), np.tile([0.0, 0.2, 0.9, 0.1], (2000, 1))
     u = np.random.default_rng(3).random((2000, 16 * PER_LINK))
     latency, known = channel.news(own, u, EVERYBODY)
     assert (latency <= channel.latest_reaction_s(own[:1], EVERYBODY)).all()
@@ -68,7 +68,7 @@ def test_latest_reaction__bounds_all_that_is_drawn(preset: str) -> None:
 def test_presets_of_ones_own() -> None:
     register_preset("test-lossy", {"preset": "nominal", "lost": 0.5})
     register_preset("test-lossy", {"preset": "nominal", "lost": 0.5})
-    assert V2X.model_validate("test-lossy").channel.lost == 0.5
+    assert V2X.model_validate("test-lossy").lost == 0.5
     with refused("preset 'test-lossy': another channel is already registered under this name", AlreadyExists):
         register_preset("test-lossy", {"preset": "nominal"})
     with refused("preset 'Lossy': the name must be 1 to 64 characters"):

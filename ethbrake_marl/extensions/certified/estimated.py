@@ -103,7 +103,7 @@ class Lines(NamedTuple):
         for other, (name, role) in enumerate(scenario.roles.items(), 1):
             if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
                 raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
-        N, channel, of = scenario.vehicles, scenario.v2x.channel, scenario.unheard()
+        N, channel, of = scenario.vehicles, scenario.v2x, scenario.unheard()
         median = draw_once(scenario, lambda width, stream: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
         late = channel.latest_reaction_s(np.zeros((1, N)), of)
         usual = channel.news(np.zeros((1, N)), np.full((1, PER_LINK * N * N), 0.5), of)[0] if late.any() else late

@@ -72,17 +72,17 @@ class Messages:
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
         """Return the keys that later messages use; refuse keys that have no effect."""
-        channel, tells = v2x.channel, _value(v2x, "tells")
+        tells = _value(v2x, "tells")
         right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
-        sent = channel.hears != "none" and channel.timing != "latency"
+        sent = v2x.hears != "none" and v2x.timing != "latency"
         require(sent or not _is_periodic(v2x), ("persistence",), "periodic", right)
         right = "has no effect, because hears: none means that no vehicle gets messages; leave it out"
-        require(tells is None or channel.hears != "none", ("tells",), tells, right)
+        require(tells is None or v2x.hears != "none", ("tells",), tells, right)
         return ("message_period_s", "loss_begins", "loss_ends") if _is_periodic(v2x) else ()
 
     def is_random(self, v2x: V2X) -> bool:
         """Return whether messages after the first may be lost."""
-        return _is_periodic(v2x) and v2x.channel.loss_begins > 0.0
+        return _is_periodic(v2x) and v2x.loss_begins > 0.0
 
     def check(self, scenario: Scenario) -> None:
         """Refuse contents of unknown vehicles, and a delay of too many time steps."""
@@ -99,12 +99,12 @@ class Messages:
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Memory:
         """Return the memory of n worlds at the alert."""
-        N, v2x, of = scenario.vehicles, scenario.v2x, scenario.v2x.channel
-        heard, seen = of.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
+        N, v2x = scenario.vehicles, scenario.v2x
+        heard, seen = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
         channel: Floats = np.zeros((n, CHANNEL_COLUMNS))
         if _is_periodic(v2x):
-            channel[:, PERIOD], channel[:, DELAY] = of.message_period_s, _delay_s(v2x)
-            channel[:, LOSS_BEGINS], channel[:, LOSS_ENDS] = of.loss_begins, of.loss_ends
+            channel[:, PERIOD], channel[:, DELAY] = v2x.message_period_s, _delay_s(v2x)
+            channel[:, LOSS_BEGINS], channel[:, LOSS_ENDS] = v2x.loss_begins, v2x.loss_ends
             channel[:, KEY] = numbers(OF_WORLD, LATER_LOSSES)[:, 0] * 2.0**53
         return silent(_contents(scenario), heard, seen, channel, _kept(scenario))
 
@@ -122,9 +122,8 @@ def _is_periodic(v2x: V2X) -> bool:
 
 
 def _delay_s(v2x: V2X) -> float:
-    channel = v2x.channel
-    on_the_way = channel.radio_s + channel.processing_s + channel.actuation_s
-    return channel.link_latency_s if channel.timing == "fixed" else on_the_way
+    on_the_way = v2x.radio_s + v2x.processing_s + v2x.actuation_s
+    return on_the_way if v2x.link_latency_s is None else v2x.link_latency_s
 
 
 def _kept(scenario: Scenario) -> int:
