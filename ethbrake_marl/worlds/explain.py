@@ -80,7 +80,7 @@ _EXAMPLES = {
 
 def check_file_name(kind: str, name: str) -> None:
     """Raise ``InvalidInput`` unless ``name`` can name a scenario or recipe (``kind``) and its file."""
-    if re.fullmatch(NAME_PATTERN, name) is None or name.endswith("\n"):
+    if re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(
             f"{kind} name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"
             " digit"
@@ -100,8 +100,8 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: s
         "description": "What the scenario is for.",
     }
     values["source"] = f"Values of {base.name}, to be changed. Its own source: {base.source}"
-    if base.table is not None and rows_file:
-        values["table"] = {"file": rows_file, "columns": list(base.table.columns)}
+    if rows_file and "file" in values.get("table", {}):
+        values["table"] |= {"file": rows_file}
     text = _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario", "scenario schema")
     for key in listed_keys():
         line = f"{key.name}: {flow_text(values[key.name])}" if key.name in values else f"# {key.name}: {key.example}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, FAR_M, GAP, LATENCY, 
 from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.counters import Channel, Numbers, numbers_of, world_numbers
 from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
-from ethbrake_marl.worlds.quantity import pick, values
+from ethbrake_marl.worlds.quantity import pick
 from ethbrake_marl.worlds.roles import first_command
 from ethbrake_marl.worlds.rules import (
     CAR_ROWS,
@@ -84,7 +85,9 @@ def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     """Return the worlds of these random numbers, early impacts included. The scenario is no mixture."""
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
-    kind, load = (None, None) if line is None else line.draw(numbers(PER_TYPE * N, TYPES).reshape(n, N, PER_TYPE))
+    numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
+    if line is not None:
+        kind, load = line.draw(numbers(PER_TYPE * N, TYPES).reshape(n, N, PER_TYPE))
     declared = _declared_values(scenario, numbers, n, kind, load)
     whole = world_values(scenario, declared)
     if scenario.has_obstacle:
@@ -98,29 +101,22 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     )
 
 
-def _declared_values(
-    scenario: Scenario, numbers: Numbers, n: int, kind: Ints | None, load: Floats | None
-) -> Callable[[str], Floats]:
+def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, load: Floats) -> Callable[[str], Floats]:
     """Return a function: key -> values of a declared quantity, [n, entries]. ``kind`` and ``load`` are [n, N]."""
-    streams: dict[tuple[int, ...], Floats] = {}
 
     def declared(key: str) -> Floats:
         entries = scenario.sources[key]
         drawn = np.empty((n, len(entries)))
         for i, possible in enumerate(entries):
             for k, quantity in possible.items():
-                rows: Any = slice(None) if kind is None or len(possible) == 1 else kind[:, i] == k
+                rows: Any = slice(None) if len(possible) == 1 else kind[:, i] == k
                 if isinstance(quantity, float):
                     drawn[rows, i] = quantity
                     continue
                 stream, column = ROW if isinstance(quantity, TableColumn) else RULES[key].place(i)
-                if stream not in streams:
-                    streams[stream] = numbers(width_of(stream, scenario.vehicles), stream)
-                u = streams[stream][rows, column]
-                if isinstance(quantity, WithLoad) and load is not None:
-                    drawn[rows, i] = quantity.value(load[rows, i], u)
-                else:
-                    drawn[rows, i] = values(quantity, u)
+                u = numbers(width_of(stream, scenario.vehicles), stream)[rows, column]
+                of = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)
+                drawn[rows, i] = quantity.value(*of)
         return drawn
 
     return declared
@@ -189,12 +185,10 @@ def has_early_impact(scenario: Scenario, alert: State) -> Bools:
 def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
     """Return the worlds of all parts in one, with row i of them in row ``place[i]``."""
 
+    order = np.argsort(place)
+
     def of_parts(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        whole, begins = np.empty((len(place), *arrays[0].shape[1:]), np.result_type(*arrays)), 0
-        for array in arrays:
-            whole[place[begins : begins + len(array)]] = array
-            begins += len(array)
-        return whole
+        return np.concatenate(arrays)[order]
 
     worlds = State.join([part.worlds for part in parts], of_parts)
     friction, types, scenarios, recordings = map(of_parts, zip(*(part[1:5] for part in parts), strict=True))

@@ -91,12 +91,6 @@ class Table(Part):
                     good = rule is not None and rule.allows(cell, cell)
                 require(good, ("rows", k, c), cell, right)
 
-    def to_csv(self) -> str:
-        """Return the rows as the text of a CSV file."""
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows([self.columns, *(self.rows or ())])
-        return text.getvalue()
-
     @cached_property
     def by_name(self) -> dict[str, TableColumn]:
         """The columns by name, ``recording`` among them."""
