@@ -184,7 +184,6 @@ def has_early_impact(scenario: Scenario, alert: State) -> Bools:
 
 def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
     """Return the worlds of all parts in one, with row i of them in row ``place[i]``."""
-
     order = np.argsort(place)
 
     def of_parts(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
