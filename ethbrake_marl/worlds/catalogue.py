@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import Document, YamlPath, read_yaml
 from ethbrake_marl.worlds.scenario import Scenario, plain
 from ethbrake_marl.worlds.table import read_rows
@@ -88,7 +88,7 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
 
     What ends in ``.yaml`` or ``.yml`` is a path. Otherwise shipped and registered names come first, so that no file
     changes the meaning of a command. Any other name means a file below ``folder``: ``my/folder/mine`` means
-    ``my/folder/mine.yaml``. ``~`` is the user's home.
+    ``my/folder/mine.yaml`` or ``mine.yml``. ``~`` is the user's home.
     """
     text, paths = str(name_or_path), _known_paths()
     path = folder / Path(text).expanduser()
@@ -96,11 +96,9 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
         return path
     if text in paths:
         return paths[text]
-    if os.path.isfile(beside := f"{path}.yaml"):
-        return Path(beside)
-    files = (*path.parent.glob("*.yml"), *path.parent.glob("*/*.y*ml"))
-    if near := sorted(file for file in files if file.stem == path.name):
-        raise UnknownName(f"unknown scenario {text!r}; did you mean {os.path.relpath(near[0], folder)}?")
+    for beside in (f"{path}.yaml", f"{path}.yml"):
+        if os.path.isfile(beside):
+            return Path(beside)
     raise unknown_name("scenario", text, paths)
 
 

@@ -329,14 +329,11 @@ def test_name_of_a_new_scenario__is_a_plain_word(name: str) -> None:
         new_scenario_text(name)
 
 
-def test_unknown_scenario__is_told_what_is_near(empty_folder: Path) -> None:
+def test_unknown_scenario__is_told_what_is_near() -> None:
     with refused("unknown scenario 'paper-randon'; did you mean 'paper-random'?", UnknownName):
         load_scenario("paper-randon")
     with refused("unknown scenario 'zzz'; known: cooperation-0-sensors, ", UnknownName):
         load_scenario("zzz")
-    Path("near.yml").touch()
-    with refused("unknown scenario 'near'; did you mean near.yml?", UnknownName):
-        load_scenario("near")
 
 
 def test_file__has_the_name_of_its_scenario(empty_folder: Path) -> None:

@@ -253,6 +253,9 @@ def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: 
     monkeypatch.setenv("USERPROFILE", str(empty_folder))
     for path in ("mine.yaml", "mine", "./mine", "~/mine.yaml", "~/mine", empty_folder / "mine.yaml"):
         assert load_scenario(path).name == "mine"
+    Path("mine.yaml").rename("mine.yml")
+    assert load_scenario("mine").name == "mine"
+    Path("mine.yml").rename("mine.yaml")
     monkeypatch.setattr(catalogue, "FOLDERS", {})
     catalogue.register_scenarios("~")
     catalogue.register_scenarios("~")
