@@ -52,7 +52,6 @@ if TYPE_CHECKING:
 PER_LINK = 4  # uniform numbers of a link: wait, burst, loss, hop
 
 Hears = Literal["all", "front", "none"]
-HEARS: tuple[Hears, ...] = ("all", "front", "none")
 Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
@@ -66,14 +65,6 @@ class Equipage(Part):
         description="senders whose messages the vehicle receives, if the channel delivers them: all, front (vehicles"
         " ahead) or none",
     )
-
-
-def unheard_by(sends: Bools, hears: Ints) -> Bools:
-    """Return whether vehicle i never receives a message of j, [n, N, N]; ``hears`` [n, N] are indices of ``HEARS``."""
-    receiver, sender = np.indices((sends.shape[1],) * 2)
-    hears = hears[:, :, np.newaxis]
-    unheard: Bools = ~sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
-    return unheard
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
@@ -266,7 +257,7 @@ class V2X(Part):
         """Return when i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
 
         ``u`` [n, PER_LINK N^2] are the uniform numbers of the links, ``unheard`` [n or 1, N, N] says whose equipment
-        lets no message through (``unheard_by``). Infinite: never. Minus infinite: at once.
+        lets no message through (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
         """
         N = unheard.shape[1]
         links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))

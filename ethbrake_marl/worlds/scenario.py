@@ -29,7 +29,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, explain
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
-from ethbrake_marl.worlds.channel import HEARS, V2X, Equipage, unheard_by
+from ethbrake_marl.worlds.channel import V2X
 from ethbrake_marl.worlds.checks import ScenarioWording, check_whole
 from ethbrake_marl.worlds.counters import Channel
 from ethbrake_marl.worlds.derived import world_values
@@ -262,15 +262,9 @@ class Scenario(Part):
 
         Without types: [1, N, N], whether i may never get a message of j.
         """
-        line = self.types_of_line
-        if line is None:
+        if self.types_of_line is None:
             return np.zeros((1, self.vehicles, self.vehicles), np.bool_)
-        each = [kind.v2x or Equipage() for kind in line.kinds]
-        sends, hears = np.array([one.sends for one in each]), np.array([HEARS.index(one.hears) for one in each])
-        if types is not None:
-            return unheard_by(sends[types], hears[types])
-        least = np.array([(sends | ~line.possible).all(axis=1)]), np.array([(hears * line.possible).max(axis=1)])
-        return unheard_by(*least)
+        return self.types_of_line.unheard(types)
 
     # ---- its quantities
 

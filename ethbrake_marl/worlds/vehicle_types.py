@@ -134,3 +134,16 @@ class TypesOfLine:
                 rows = types[:, i] == kind
                 load[rows, i] = values(self.kinds[kind].load, u[rows, i, 1])
         return types, load
+
+    def unheard(self, types: Ints | None) -> Bools:
+        """Return ``Scenario.unheard``."""
+        each = [kind.v2x or Equipage() for kind in self.kinds]
+        silent = np.array([not one.sends for one in each])
+        hears = np.array([("all", "front", "none").index(one.hears) for one in each])
+        if types is None:  # of the types that are possible at each place the one with the least equipment
+            silent, hears = (np.max(one * self.possible, axis=1)[np.newaxis] for one in (silent, hears))
+        else:
+            silent, hears = silent[types], hears[types]
+        receiver, sender = np.indices((len(self.weights),) * 2)
+        deaf = (hears == 2)[:, :, np.newaxis] | (hears == 1)[:, :, np.newaxis] & (sender >= receiver)
+        return np.asarray(silent[:, np.newaxis] | deaf)

@@ -6,7 +6,6 @@ import pytest
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.channel import PER_LINK, PRESETS, V2X, burst_periods, register_preset
-from ethbrake_marl.worlds.scenario import Scenario
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")
@@ -21,39 +20,42 @@ def test_burst__lasts_as_long_as_the_gilbert_elliott_channel_says() -> None:
     u = np.array([0.5, 0.0910, 0.0908, 0.0455, 0.0454, 0.0228, 0.0227, 0.0114])
     assert burst_periods(u, 0.05, 0.5).tolist() == [0, 0, 1, 1, 2, 2, 3, 3]
     assert burst_periods(u, 0.0, 0.5).tolist() == [0] * 8
-    grid = (np.arange(1_000_000) + 0.5) / 1e6
-    assert (burst_periods(grid, 0.2, 0.2) >= 3).mean() == pytest.approx(0.5 * 0.8**2, abs=2e-6)
+    # 0.02 + 0.1 + 0.2 s on the way, every 0.1 s, 5 % lost; P(k >= 1) = 0.25
+    links = np.array([[0.5, 0.9, 0.5, 0.0], [0.5, 0.24, 0.5, 0.0], [0.5, 0.9, 0.04, 0.0]])
+    assert V2X.model_validate("congested").first_message_s(links).tolist() == pytest.approx([0.37, 0.47, np.inf])
 
 
-def test_first_message__by_hand() -> None:
-    channel = V2X.model_validate("congested")  # 0.02 + 0.1 + 0.2 s on the way, every 0.1 s, 5 % lost; P(k >= 1) = 0.25
-    u = np.array([[0.5, 0.9, 0.5, 0.0], [0.5, 0.24, 0.5, 0.0], [0.5, 0.9, 0.04, 0.0]])
-    assert channel.first_message_s(u).tolist() == pytest.approx([0.37, 0.47, np.inf])
+FIXED = {"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1]}  # messages take 0.4 s, a hop takes 1 s
 
 
-def test_news__by_hand() -> None:
-    # Vehicle 2 acts when it hears of Vehicle 1 (0.4 s), Vehicle 3 after its own 0.5 s.
-    know = LATE.replace(v2x={"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1]}).sample(1, 7).know[0]
-    assert know[1:, 1:].tolist() == [[0.0, 0.4, 0.4], [0.4, 0.4, 0.4], [0.5, 0.5, 0.5]]
-    ahead = LATE.replace(v2x={"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1], "hears": "front"})
-    assert ahead.sample(1, 7).know[0, 1:, 1:].tolist() == [[0.0, 1.0, np.inf], [0.4, 0.4, 1.0], [0.5, 0.5, 0.5]]
-    seen = LATE.replace(v2x={"preset": "sensors-only", "sensing_s": [1, 1]}).sample(1, 7)
-    assert seen.latency_s[0].tolist() == [0.0, 1.0, 2.0]  # one hop after the other
-    assert seen.know[0, 3, 1] == np.inf
-    assert (PAPER.sample(1, 7).know[0, 1:, 1:] == PAPER.sample(1, 7).latency_s[0][:, np.newaxis]).all()
+@pytest.mark.parametrize(
+    ("v2x", "old", "known"),
+    [
+        ("paper", {}, [[0.0] * 3, [0.2] * 3, [0.5] * 3]),
+        # Vehicle 2 acts when it hears of Vehicle 1, Vehicle 3 after its own 0.5 s
+        (FIXED, {}, [[0.0, 0.4, 0.4], [0.4, 0.4, 0.4], [0.5, 0.5, 0.5]]),
+        ({**FIXED, "hears": "front"}, {}, [[0.0, 1.0, np.inf], [0.4, 0.4, 1.0], [0.5, 0.5, 0.5]]),
+        ({"preset": "sensors-only", "sensing_s": [1, 1]}, {}, [[0, 1, np.inf], [1, 1, 1], [np.inf, 2, 2]]),
+        # Vehicles 1 and 3 are of a type without V2X
+        (FIXED, {"sends": False}, [[0.0, 0.4, np.inf], [1, 1, 1], [np.inf, 2, 2]]),
+        (FIXED, {"hears": "none"}, [[0, 1, np.inf], [0.4, 0.4, 0.4], [np.inf, 1.4, 1.4]]),
+        (FIXED, {"hears": "front"}, [[0, 1, np.inf], [0.4, 0.4, 0.4], [0.5, 0.5, 0.5]]),
+    ],
+)
+def test_news__by_hand(v2x: object, old: dict[str, object], known: list[list[float]]) -> None:
+    types = {"vehicle_types": {"old": {"v2x": old}, "new": {}}, "types": ["old", "new", {"old": 1, "new": 1e-9}]}
+    worlds = LATE.replace(v2x=v2x, **(types if old else {})).sample(1, 7)
+    assert worlds.know[0, 1:, 1:].tolist() == known
+    assert worlds.latency_s[0].tolist() == np.diag(known).tolist()
 
 
-def test_vehicle__that_does_not_send_is_only_seen() -> None:
-    def of(**v2x: object) -> Scenario:
-        types = {"vehicle_types": {"old": {"v2x": v2x}, "new": {}}, "types": ["old", "new", {"old": 1, "new": 1e-9}]}
-        return LATE.replace(v2x={"preset": "nominal", "link_latency_s": 0.4, "sensing_s": [1, 1]}, **types)
-
-    silent, deaf = (of(**v2x).sample(1, 7) for v2x in ({"sends": False}, {"hears": "none"}))
-    assert silent.know[0, 1:, 1:].tolist() == [[0.0, 0.4, np.inf], [1.0, 1.0, 1.0], [np.inf, 2.0, 2.0]]
-    assert silent.latency_s[0].tolist() == [0.0, 1.0, 2.0]
-    assert deaf.know[0, 1:, 1:].tolist() == [[0.0, 1.0, np.inf], [0.4, 0.4, 0.4], [np.inf, 1.4, 1.4]]
-    ahead = of(hears="front").sample(1, 7)
-    assert ahead.know[0, 1:, 1:].tolist() == [[0.0, 1.0, np.inf], [0.4, 0.4, 0.4], [0.5, 0.5, 0.5]]
+def test_latest_reaction__is_that_of_the_type_with_the_least_equipment() -> None:
+    types = {"old": {"v2x": {"sends": False, "hears": "none"}}, "new": {}}
+    LATE.replace(v2x=FIXED, vehicle_types=types, types="new", horizon_s=2)
+    with refused(
+        "v2x = {preset: nominal, link_latency_s: 0.4, sensing_s: [1, 1]}: vehicle_3 may not be able to act until 2"
+    ):
+        LATE.replace(v2x=FIXED, vehicle_types=types, types="any", horizon_s=2)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -66,9 +68,12 @@ def test_latest_reaction__bounds_all_that_is_drawn(preset: str) -> None:
 
 
 def test_presets_of_ones_own() -> None:
-    register_preset("test-lossy", {"preset": "nominal", "lost": 0.5})
-    register_preset("test-lossy", {"preset": "nominal", "lost": 0.5})
-    assert V2X.model_validate("test-lossy").lost == 0.5
+    for _ in range(2):
+        register_preset("test-lossy", {"preset": "nominal", "lost": 0.5})
+        register_preset("test-mute", {"hears": "front"})
+    lossy, mute = V2X.model_validate({"preset": "test-lossy", "loss_ends": 1.0}), V2X.model_validate("test-mute")
+    assert (lossy.timing, lossy.loss_begins, lossy.loss_ends, lossy.lost) == ("messages", 0.05, 1.0, 0.5)
+    assert (mute.timing, mute.hears, mute.by_link) == ("latency", "front", True)
     with refused("preset 'test-lossy': another channel is already registered under this name", AlreadyExists):
         register_preset("test-lossy", {"preset": "nominal"})
     with refused("preset 'Lossy': the name must be 1 to 64 characters"):

@@ -75,6 +75,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "line 5: gaps_m.uniform = [5, 6, 7]: must have 2 entries": lambda: given(gaps_m="{uniform: [5, 6, 7]}"),
     "line 5: gaps_m.uniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{uniform: [9, 6]}"),
+    "line 5: gaps_m.loguniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{loguniform: [9, 6]}"),
     "line 5: gaps_m.uniform[1] = .nan: must be a finite number": lambda: given(gaps_m="{uniform: [5, .nan]}"),
     "line 5: gaps_m.choice: cannot be combined with the other keys here; a quantity has only one": lambda: given(
         gaps_m="{uniform: [5, 9], choice: [7]}"
