@@ -125,6 +125,9 @@ REFUSED: dict[str, Callable[[], object]] = {
     "line 13: roles.vehicle_2 = learner:1: agent 'learner:1': learner takes no argument": lambda: given(
         roles="{vehicle_2: learner:1}"
     ),
+    "line 13: roles.vehicle_2 = mine.py:drive: agent 'mine.py:drive': is a function in a Python file": lambda: given(
+        roles="{vehicle_2: mine.py:drive}"
+    ),
     "line 13: roles.vehicle_2 = 2: must be learner or the name of a script": lambda: given(roles="{vehicle_2: 2}"),
     "line 13: roles = [learner]: must be a mapping": lambda: given(roles="[learner]"),
     "line 13: roles.vehicle_1 = constant: agent 'constant': constant needs a finite deceleration": lambda: given(

@@ -119,6 +119,11 @@ ROLES = {"vehicle_1": "constant:2", "vehicle_2": "learner", "vehicle_3": "my_age
             {"obstacle_margin_m": 1.5, "braking_capacity_mps2": 5, "latency_s": 0.5, "friction": 4 / 9.81},
             {"obstacle_gap_m": 61.5},
         ),
+        # brakes build up for 0.5 s: 10 + (10 - 10 x 0.5^3 / 6) + 18.75^2 / (2 x 5) + 1.5
+        (
+            {"obstacle_margin_m": 1.5, "braking_capacity_mps2": 5, "latency_s": 0.5, "brake_rate_mps3": 10},
+            {"obstacle_gap_m": 56.447916666666664},
+        ),
         ({"roles": ROLES}, {"wanted": [0, -2, 0, 0]}),
         ({"roles": {"vehicle_1": "coast"}}, {"wanted": [0, 0, -7, -6]}),
     ],
@@ -149,9 +154,8 @@ def test_bounds__hold_for_every_draw() -> None:
 
 
 def test_types_and_loads__are_drawn_first() -> None:
-    kinds = {"car": {"weight": 3, "mass_t": 1.5}, "truck": {"mass_t": {"with_load": [14, 40]}}}
-    content = {key: value for key, value in LINE.items() if key != "mass_t"}
-    drawn = Scenario(**content, vehicle_types=kinds).draw(300, 7)
+    kinds = {"car": {"weight": 3}, "truck": {"mass_t": {"with_load": [14, 40]}}}
+    drawn = line(mass_t=1.5, vehicle_types=kinds).draw(300, 7)
     u = numbers_of(7, "list", 0, np.arange(300))(12, (3,)).reshape(300, 3, 4)
     assert (drawn.types == np.where(u[..., 0] < 0.75, "car", "truck")).all()
     assert (drawn.worlds.mass_t == np.where(u[..., 0] < 0.75, 1.5, 14 + 26 * u[..., 1])).all()
@@ -178,6 +182,7 @@ def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> N
     delays = load_scenario("mixture-delays")
     heavy = delays.replace(mass_t=[40, 1, 1])
     assert np.unique(heavy.sample(20, 7).mass_t[:, 0]).tolist() == [40.0]
+    assert {"title", "source"}.isdisjoint(delays.content()["mixture"][0]["scenario"])
     assert heavy.sample(20, 7).gaps_m.tolist() == delays.sample(20, 7).gaps_m.tolist()
     assert [each.learners for each in delays.with_learners(["vehicle_3"]).members] == [(3,)] * 3
     Path("own.yaml").write_text(json.dumps(PAPER.replace(name="own", title="").declared()))
@@ -237,6 +242,8 @@ def test_columns__are_all_that_was_drawn() -> None:
     assert [*of_mixture][:3] == ["world", "scenario", "gap_1_m"]
     assert [*of_types][:5] == ["world", "vehicle_1_type", "vehicle_2_type", "vehicle_3_type", "gap_1_m"]
     assert of_types["world"].tolist() == [5, 6, 7]
+    some = load_scenario("mixture-universal").draw(30, 7)
+    assert set(columns_of(some)["obstacle_gap_m"][some.worlds.obstacle_gap_m == np.inf].astype(str)) == {"nan"}
     assert (of_wet["braking_capacity_1_mps2"] == of_wet["friction"] * 9.81).all()
     fixed = {f"{name}_{i}_{unit}" for name, unit in (("mass", "t"), ("latency", "s")) for i in (1, 2, 3)}
     assert fixed_columns(wet) == fixed | {f"speed_limit_{i}_mps" for i in (1, 2, 3)} | {"restitution"}
