@@ -225,6 +225,9 @@ REFUSED: dict[str, Callable[[], object]] = {
     "v2x = {preset: blocked}: vehicle_3 may not be able to act until 2.2 s; this time must be below": lambda: given(
         v2x="blocked", horizon_s="2"
     ),
+    "mine.yaml, line 2: table.file = ../rows.csv: must be a relative path in the scenario's folder": lambda: loaded(
+        "table: {file: ../rows.csv, columns: [gap_1_m]}"
+    ),
     "mine.yaml, line 2: mixture = 3: must be a list": lambda: loaded("mixture: 3"),
     "mine.yaml, line 2: mixture = []: must not be empty": lambda: loaded("mixture: []"),
     "mine.yaml, line 2: mixture[0].scenario: missing; write, for instance": lambda: loaded("mixture: [{weight: 1}]"),

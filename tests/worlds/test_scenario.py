@@ -20,6 +20,7 @@ from ethbrake_marl.worlds import catalogue, explain
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import numbers_of
 from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
+from ethbrake_marl.worlds.game import Pool, views_of
 from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
@@ -250,6 +251,14 @@ def test_columns__are_all_that_was_drawn() -> None:
     assert fixed_columns(wet) < {*of_wet}
 
 
+def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
+    pool = Pool(PAPER)
+    for seed, first in ((0, 0), (0, 500), (1, 500), (1, 5000), (1, 10)):
+        assert bits(pool(3, seed, first)) == bits(PAPER.sample(3, seed, first=first, channel="training"))
+    assert not any(name.startswith("obstacle") for name in views_of(line())[0].names)
+    assert any(name.startswith("obstacle") for name in views_of(line(obstacle_gap_m=42))[0].names)
+
+
 def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(list_scenarios()) == 55
     assert len(group_of_scenarios("benchmark")) == 10
@@ -260,6 +269,9 @@ def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: 
     monkeypatch.setenv("USERPROFILE", str(empty_folder))
     for path in ("mine.yaml", "mine", "./mine", "~/mine.yaml", "~/mine", empty_folder / "mine.yaml"):
         assert load_scenario(path).name == "mine"
+    Path("paper-random.yaml").touch()
+    assert load_scenario("paper-random") == PAPER
+    Path("paper-random.yaml").unlink()
     Path("mine.yaml").rename("mine.yml")
     assert load_scenario("mine").name == "mine"
     Path("mine.yml").rename("mine.yaml")
