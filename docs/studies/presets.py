@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl import load_scenario
-from ethbrake_marl.worlds.channel import CHANNELS
+from ethbrake_marl.worlds.channel import PRESETS
 
 base = load_scenario("cooperation-2-paper")
-for preset in [*CHANNELS][1:]:
+for preset in [*PRESETS][1:]:
     worlds = base.replace(v2x=preset, latency_s=0).sample(100_000, seed=7)
     reacts, known = worlds.latency_s, worlds.know  # the latter by body: 1 is Vehicle 1
     columns = (reacts[:, 1], reacts[:, 2], known[:, 2, 3])

@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.statistics import difference, mean, rate
 from ethbrake_marl.extensions.report.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.worlds.channel import CHANNELS
+from ethbrake_marl.worlds.channel import V2X
 
 SCENARIO, WORLDS, SEED = "cooperation-2-paper", 1000, 7
 PRESETS = ("paper", "clear", "nominal", "congested", "blocked", "sensors-only")
@@ -42,7 +42,8 @@ def channels() -> dict[str, dict[str, str]]:
     named = {}
     for preset in PRESETS:
         named[preset] = {"preset": preset}
-        if CHANNELS[preset].timing == "messages" and CHANNELS[preset].hears != "none":
+        channel = V2X.model_validate(preset)
+        if channel.timing == "messages" and channel.hears != "none":
             named[f"{preset}, periodic"] = {"preset": preset, "persistence": "periodic"}
     return named
 

@@ -181,19 +181,21 @@ def scenario_new(
 ) -> None:
     """Write a new scenario file with comments.
 
-    The file NAME.yaml has every key of a scenario. If the scenario has a table, its rows are written to NAME.csv in the
-    same folder.
+    The file NAME.yaml has every key of a scenario. If the scenario has a table in a CSV file, this file is copied to
+    NAME.csv in the same folder.
     """
-    from ethbrake_marl.worlds.catalogue import load_scenario
+    from ethbrake_marl.files.yaml import read_yaml
+    from ethbrake_marl.worlds.catalogue import scenario_path
     from ethbrake_marl.worlds.explain import new_scenario_text
 
     with Out(force=force) as out:
         file, rows = output / f"{name}.yaml", output / f"{name}.csv"
         text = new_scenario_text(name, based_on, rows_file=rows.name)
-        table = load_scenario(based_on).table
+        base = scenario_path(based_on)
+        table = read_yaml(base).content.get("table", {})
         out.check(file)
-        if table is not None:
-            out.write(rows, table.to_csv(), what="rows")
+        if "file" in table:
+            out.write(rows, (base.parent / table["file"]).read_text("utf-8"), what="rows")
         out.write(file, text)
         out.note(f"written: {file}; change the file, then run: ethbrake scenario validate {file}")
 
@@ -210,13 +212,13 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
     from ethbrake_marl.evaluation.named_measures import MEASURES, USUAL
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
-    from ethbrake_marl.worlds.channel import CHANNELS
+    from ethbrake_marl.worlds.channel import PRESETS
 
     features = FEATURES.usable().items()
     own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
     parts = {
         "Observation": [*WHOLE_GROUPS, "front_K", "rear_K", *GROUPS, *own],
-        "V2X presets": [*CHANNELS],
+        "V2X presets": [*PRESETS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Terms": [*BUILT_IN, *TERMS],
         "Measures": [name for name in MEASURES if name not in USUAL],

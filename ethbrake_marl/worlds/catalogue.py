@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import Document, YamlPath, read_yaml
 from ethbrake_marl.worlds.scenario import Scenario, plain
 from ethbrake_marl.worlds.table import read_rows
@@ -39,14 +39,8 @@ class CatalogueEntry:
 
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
     """Return the folder of the shipped scenarios or recipes (``train``), in the checkout or the installed package."""
-    checkout, installed = _PACKAGE.parent / folder, _PACKAGE / "_data" / folder
-    if (_PACKAGE.parent / "pyproject.toml").is_file() and checkout.is_dir():
-        return checkout
-    if not installed.is_dir():
-        raise InvalidInput(
-            f"the shipped files are missing: neither {checkout} nor {installed} exists; reinstall the package"
-        )
-    return installed
+    checkout = _PACKAGE.parent / folder
+    return checkout if (_PACKAGE.parent / "pyproject.toml").is_file() else _PACKAGE / "_data" / folder
 
 
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
@@ -94,7 +88,7 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
 
     What ends in ``.yaml`` or ``.yml`` is a path. Otherwise shipped and registered names come first, so that no file
     changes the meaning of a command. Any other name means a file below ``folder``: ``my/folder/mine`` means
-    ``my/folder/mine.yaml``. ``~`` is the user's home.
+    ``my/folder/mine.yaml`` or ``mine.yml``. ``~`` is the user's home.
     """
     text, paths = str(name_or_path), _known_paths()
     path = folder / Path(text).expanduser()
@@ -102,11 +96,9 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
         return path
     if text in paths:
         return paths[text]
-    if os.path.isfile(beside := f"{path}.yaml"):
-        return Path(beside)
-    files = (*path.parent.glob("*.yml"), *path.parent.glob("*/*.y*ml"))
-    if near := sorted(file for file in files if file.stem == path.name):
-        raise UnknownName(f"unknown scenario {text!r}; did you mean {os.path.relpath(near[0], folder)}?")
+    for beside in (f"{path}.yaml", f"{path}.yml"):
+        if os.path.isfile(beside):
+            return Path(beside)
     raise unknown_name("scenario", text, paths)
 
 
@@ -144,18 +136,14 @@ def _whole(document: Document, folder: Path) -> Document:
 
 def _member(document: Document, i: int, entry: Any, folder: Path) -> Any:
     """Return entry i of a mixture with the content of its scenario. What is no entry is left to the schema."""
+    if not isinstance(entry, dict) or "scenario" not in entry:
+        return entry
     at: YamlPath = ("mixture", i, "scenario")
-    member = entry.get("scenario") if isinstance(entry, dict) else None
-    if member is None or not isinstance(member, str):
-        return entry if member is None else {**entry, "scenario": _with_rows(document, at, member, folder)}
-    try:
-        path = scenario_path(member, folder)
-        content = read_yaml(path).content
-        if isinstance(content, dict) and "mixture" in content:
-            raise InvalidInput(f"a mixture cannot contain another mixture; list the scenarios of {member} instead")
-        return {**entry, "scenario": load_scenario(path).declared()}
-    except InvalidInput as error:
-        raise InvalidInput(f"{document.where(at)}: mixture[{i}].scenario = {member}: {error}") from None
+    member = entry["scenario"]
+    if not isinstance(member, str):
+        return {**entry, "scenario": _with_rows(document, at, member, folder)}
+    with document.refusing_at(at):
+        return {**entry, "scenario": load_scenario(scenario_path(member, folder)).declared()}
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
@@ -167,6 +155,6 @@ def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> 
     with document.refusing_at((*at, "table", "file")):
         if path.is_absolute() or ".." in path.parts:
             raise InvalidInput(f"table.file = {path}: must be a relative path in the scenario's folder")
-        rows = read_rows(folder / path, table.get("columns"), table.get("weights"))
+        rows = read_rows(folder / path, table.get("columns"))
     entries = {key: value for key, value in table.items() if key != "file"}  # the file's name does not matter
-    return {**content, "table": {**entries, **rows}}
+    return {**content, "table": {**entries, "rows": rows}}

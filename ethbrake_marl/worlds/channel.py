@@ -18,12 +18,22 @@ latency is over, and it has the message of Vehicle 1 or has seen the vehicle ahe
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
-from operator import not_
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Protocol
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
-from pydantic import ConfigDict, Field, GetJsonSchemaHandler, model_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    GetJsonSchemaHandler,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    SerializationInfo,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -33,7 +43,7 @@ from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.counters import Numbers
-from ethbrake_marl.worlds.quantity import Part
+from ethbrake_marl.worlds.quantity import Part, ordered
 
 if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game
@@ -42,13 +52,12 @@ if TYPE_CHECKING:
 PER_LINK = 4  # uniform numbers of a link: wait, burst, loss, hop
 
 Hears = Literal["all", "front", "none"]
-HEARS: tuple[Hears, ...] = ("all", "front", "none")
 Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
 class Equipage(Part):
-    """V2X equipment of one vehicle, or of all vehicles of one type."""
+    """V2X equipment of the vehicles of one type."""
 
     sends: bool = Field(default=True, description="whether the vehicle sends messages")
     hears: Hears = Field(
@@ -56,83 +65,6 @@ class Equipage(Part):
         description="senders whose messages the vehicle receives, if the channel delivers them: all, front (vehicles"
         " ahead) or none",
     )
-
-
-class Equipped(NamedTuple):
-    """V2X equipment of the vehicles of n worlds; n = 1 if it is the same in all of them."""
-
-    sends: Bools  # [n, N]
-    hears: Ints  # [n, N] index of HEARS
-
-    @property
-    def unheard(self) -> Bools:
-        """Whether vehicle i never receives a message from vehicle j, [n, N, N]."""
-        receiver, sender = np.indices((self.sends.shape[1],) * 2)
-        hears = self.hears[:, :, np.newaxis]
-        unheard: Bools = ~self.sends[:, np.newaxis] | (hears == 2) | ((hears == 1) & (sender >= receiver))
-        return unheard
-
-
-class Channel(NamedTuple):
-    """All settings of a channel."""
-
-    timing: Literal["latency", "fixed", "messages"]  # tau is the receiver's latency, link_latency_s, or drawn
-    hears: Hears = "all"
-    senses: Literal["both", "front", "none"] = "both"
-    link_latency_s: float = 0.0
-    loss_begins: float = 0.0
-    loss_ends: float = 1.0
-    lost: float = 0.0
-    message_period_s: float = 0.1
-    radio_s: float = 0.02
-    processing_s: float = 0.1
-    actuation_s: float = 0.2
-    sensing_s: tuple[float, float] = (0.8, 1.1)
-
-    def first_message_s(self, u: Floats) -> Floats:
-        """Return tau of links (s) for uniform numbers ``u`` [..., PER_LINK]; infinite: no message arrives."""
-        delay = np.full(u.shape[:-1], -np.inf if self.timing == "latency" else self.link_latency_s)
-        if self.timing == "messages":
-            periods = burst_periods(u[..., 1], self.loss_begins, self.loss_ends)
-            on_the_way = self.radio_s + self.processing_s + self.actuation_s
-            delay = (u[..., 0] + periods) * self.message_period_s + on_the_way
-        delay[u[..., 2] < self.lost] = np.inf
-        return delay
-
-    def heard_and_seen(self, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """Return when i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
-
-        ``u`` [n, PER_LINK N^2] are the uniform numbers of the links. Infinite: never. Minus infinite: at once.
-        """
-        N = equipped.sends.shape[1]
-        links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
-        unheard = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}[self.hears]
-        heard = np.where(unheard | equipped.unheard, np.inf, self.first_message_s(links))
-        ahead = sender == receiver - 1
-        in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": sender < 0}[self.senses]
-        low, high = self.sensing_s
-        return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
-
-    def news(self, own_latency: Floats, u: Floats, equipped: Equipped) -> tuple[Floats, Floats]:
-        """Return when each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
-        N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, equipped)
-        latency = own_latency.copy()
-        for i in range(1, N if self.timing != "latency" else 0):
-            first = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
-            latency[:, i] = np.maximum(latency[:, i], first)
-        known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
-        known[:, np.arange(N), np.arange(N)] = latency
-        return latency, known
-
-    def latest_reaction_s(self, own_latency: Sequence[float], equipped: Equipped) -> list[float]:
-        """Return upper bounds of the times from which the vehicles can react, from those of their own latencies."""
-        latest = list(own_latency)
-        slowest = np.array([[1.0, 0.0, 1.0, 1.0]])  # numbers of a link with the largest delay of a message
-        heard = float(self.first_message_s(slowest)[0]) if self.hears != "none" and self.lost == 0.0 else np.inf
-        for i in range(1, len(latest) if self.timing != "latency" else 0):
-            seen = latest[i - 1] + self.sensing_s[1] if self.senses != "none" else np.inf
-            latest[i] = max(latest[i], min(seen, np.inf if equipped.unheard[0, i, 0] else heard))
-        return latest
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
@@ -152,7 +84,6 @@ class Extension(Protocol):
     """What a package adds to the knowledge of vehicles, declared by keys of ``v2x``."""
 
     name: str  # of its memory in `State.memories`
-    keys: tuple[str, ...]  # of `v2x`
     schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
 
     def read(self, key: str, value: Any) -> Any:
@@ -167,10 +98,7 @@ class Extension(Protocol):
     def check(self, scenario: Scenario) -> None:
         """Refuse a scenario in which these keys cannot be used."""
 
-    def check_alike(self, where: str, first: Scenario, other: Scenario) -> None:
-        """Raise ``InvalidInput`` unless worlds of both scenarios can be drawn together."""
-
-    def at_alert(self, scenario: Scenario, numbers: Numbers, equipped: Equipped, n: int) -> Any:
+    def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
         """Return the memory of n worlds at the alert."""
 
     def game(self, game: Game) -> Game:
@@ -184,14 +112,14 @@ def register_v2x_extension(key: str, extension: Extension) -> None:
 
 EXTENSIONS: Registry[Extension] = Registry("key of v2x", "v2x_extensions", register_v2x_extension)
 
-CHANNELS = {
-    "paper": Channel("latency", senses="none"),
-    "clear": Channel("messages", loss_begins=0.01, loss_ends=0.5),
-    "nominal": Channel("messages", loss_begins=0.05, loss_ends=0.5),
-    "congested": Channel("messages", loss_begins=0.10, loss_ends=0.30, lost=0.05),
-    "blocked": Channel("messages", loss_begins=0.20, loss_ends=0.20, lost=0.20),
-    "sensors-only": Channel("messages", hears="none"),
-}
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {"senses": "none"},
+    "clear": {"loss_begins": 0.01, "loss_ends": 0.5},
+    "nominal": {"loss_begins": 0.05, "loss_ends": 0.5},
+    "congested": {"loss_begins": 0.10, "loss_ends": 0.30, "lost": 0.05},
+    "blocked": {"loss_begins": 0.20, "loss_ends": 0.20, "lost": 0.20},
+    "sensors-only": {"hears": "none"},
+}  # the key `preset` of a preset of the user names the one of these on which it is based
 
 OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
 
@@ -205,87 +133,90 @@ class V2X(Part):
     model_config = ConfigDict(extra="allow")
 
     preset: str = Field(default="paper", description="preset whose values are used for keys that are left out")
-    hears: Hears | None = Field(
-        default=None, description="senders whose messages a vehicle receives: all, front (vehicles ahead) or none"
+    hears: Hears = Field(
+        default="all", description="senders whose messages a vehicle receives: all, front (vehicles ahead) or none"
     )
-    senses: Literal["both", "front", "none"] | None = Field(
-        default=None, description="direct neighbours in sight: both, front or none"
+    senses: Literal["both", "front", "none"] = Field(
+        default="both", description="direct neighbours in sight: both, front or none"
     )
     link_latency_s: Seconds | None = Field(
         default=None, description="fixed delay from every sender to every receiver, instead of a random one"
     )
-    lost: Share | None = Field(default=None, description="share of links (not of vehicles) on which no message arrives")
-    message_period_s: Annotated[Seconds, Field(ge=1e-3)] | None = Field(
-        default=None, description="T, time between two messages of a sender"
+    lost: Share = Field(default=0.0, description="share of links (not of vehicles) on which no message arrives")
+    message_period_s: Annotated[Seconds, Field(ge=1e-3)] = Field(
+        default=0.1, description="T, time between two messages of a sender"
     )
-    loss_begins: Share | None = Field(
-        default=None, description="p, probability per message period that a burst of losses begins"
+    loss_begins: Share = Field(
+        default=0.0, description="p, probability per message period that a burst of losses begins"
     )
-    loss_ends: Annotated[Share, Field(ge=0.01)] | None = Field(
-        default=None, description="r, probability per message period that a burst of losses ends"
+    loss_ends: Annotated[Share, Field(ge=0.01)] = Field(
+        default=1.0, description="r, probability per message period that a burst of losses ends"
     )
-    radio_s: Seconds | None = Field(default=None, description="L_radio, time to transmit a message")
-    processing_s: Seconds | None = Field(
-        default=None, description="t_proc, time until the receiver has processed a message"
-    )
-    actuation_s: Seconds | None = Field(default=None, description="t_act, time until the receiver's brakes respond")
-    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False)] | None = Field(
-        default=None, description="[low, high]: range of the uniform delay after which a neighbour is seen"
-    )
-    vehicles: dict[str, Equipage] | None = Field(
-        default=None,
-        exclude_if=not_,
-        description="vehicles with other V2X equipment than the rest, such as {vehicle_3: {sends: false, hears: none}}",
+    radio_s: Seconds = Field(default=0.02, description="L_radio, time to transmit a message")
+    processing_s: Seconds = Field(default=0.1, description="t_proc, time until the receiver has processed a message")
+    actuation_s: Seconds = Field(default=0.2, description="t_act, time until the receiver's brakes respond")
+    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False), AfterValidator(ordered)] = Field(
+        default=(0.8, 1.1), description="[low, high]: range of the uniform delay after which a neighbour is seen"
     )
 
-    @model_validator(mode="before")
+    _keys: frozenset[str] = PrivateAttr(default=frozenset())  # `preset`, and what the file says beside it
+
+    @model_validator(mode="wrap")
     @classmethod
-    def _by_name(cls, value: Any) -> Any:
-        place = ("preset",) if isinstance(value, dict) else ()
-        value = {"preset": value} if isinstance(value, str) else value
+    def _with_preset(cls, value: Any, build: ModelWrapValidatorHandler[Self]) -> Self:
+        if isinstance(value, V2X):
+            return build(value)
         name = value.get("preset", "paper") if isinstance(value, dict) else value
-        right = f"must be a preset ({', '.join(CHANNELS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
-        require(isinstance(value, V2X) or (isinstance(name, str) and name in CHANNELS), place, name, right)
-        if not isinstance(value, dict):
-            return value
-        known = cls.model_fields
-        for key in value.keys() - known.keys():
-            close = suggestion(str(key), [*known, *EXTENSIONS]) or f"known: {', '.join((*known, *EXTENSIONS))}"
-            require(key in EXTENSIONS, (key,), UNSHOWN, f"unknown key; {close}")
-        return {key: each if key in known else EXTENSIONS[key].read(key, each) for key, each in value.items()}
+        right = f"must be a preset ({', '.join(PRESETS)}), or a mapping such as {{preset: nominal, lost: 0.1}}"
+        place = ("preset",) if isinstance(value, dict) else ()
+        require(isinstance(name, str) and name in PRESETS, place, name, right)
+        written = value if isinstance(value, dict) else {"preset": value}
+        known = (*cls.model_fields, *EXTENSIONS)
+        for key in written:
+            close = suggestion(str(key), known) or f"known: {', '.join(known)}"
+            require(key in known, (key,), UNSHOWN, f"unknown key; {close}")
+        read = {key: EXTENSIONS[key].read(key, each) if key in EXTENSIONS else each for key, each in written.items()}
+        v2x = build({**PRESETS[name], **read, "preset": name})
+        v2x._keys = frozenset({"preset", *written})
+        v2x._check()
+        return v2x
 
-    @model_validator(mode="after")
-    def _possible(self) -> V2X:
-        channel, timing = self.channel, self.channel.timing
+    @model_serializer(mode="wrap")
+    def _as_written(self, dump: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
+        """Return the keys in the file; the others, whose values the preset gives, are null or left out."""
+        whole = not (info.exclude_unset or info.exclude_none)
+        return {
+            key: each if key in self._keys else None for key, each in dump(self).items() if whole or key in self._keys
+        }
+
+    def _check(self) -> None:
+        """Refuse keys that have no effect, and a channel that may leave a vehicle without any news."""
         used = [key for extension in self.extensions for key in extension.uses(self)]
-        useless: dict[str, str] = {}  # key -> why it has no effect
-        if channel.senses == "none":
-            useless |= {"sensing_s": "senses: none means that no vehicle is in sight"}
-        if timing == "latency":
-            useless |= dict.fromkeys((*OF_MESSAGES, "vehicles"), f"preset {self.preset} generates no messages")
-        if timing == "fixed":
-            unused = [key for key in OF_MESSAGES if key not in used]
-            useless |= dict.fromkeys(unused, "link_latency_s fixes the delay of messages")
-        if channel.hears == "none":
-            unheard = ("link_latency_s", "lost", "vehicles", *OF_MESSAGES)
-            useless |= dict.fromkeys(unheard, "hears: none means that no vehicle gets messages")
-        for key, why in useless.items():
-            value = getattr(self, key)
-            require(value is None, (key,), value, f"has no effect, because {why}; leave it out")
-        low, high = channel.sensing_s
-        require(low <= high, ("sensing_s",), channel.sensing_s, "low must not be above high")
-        silent = timing == "messages" or channel.hears == "none" or channel.lost > 0.0
-        blind = channel.senses == "none" and silent and timing != "latency"
+        unused = [key for key in OF_MESSAGES if key not in used]
+        unheard = ("link_latency_s", "lost", *OF_MESSAGES)
+        for useless, keys, why in (
+            (self.senses == "none", ["sensing_s"], "senses: none means that no vehicle is in sight"),
+            (self.hears == "none", unheard, "hears: none means that no vehicle gets messages"),
+            (self.timing == "latency", OF_MESSAGES, f"preset {self.preset} generates no messages"),
+            (self.timing == "fixed", unused, "link_latency_s fixes the delay of messages"),
+        ):
+            for key in keys if useless else ():
+                right = f"has no effect, because {why}; leave it out"
+                require(key not in self._keys, (key,), getattr(self, key), right)
+        silent = self.timing == "messages" or self.hears == "none" or self.lost > 0.0
+        blind = self.senses == "none" and silent and self.timing != "latency"
         right = "a vehicle that may never get a message must see the vehicle ahead; use senses: both or front"
         require(not blind, (), self, right)
-        return self
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         mapping = handler(core)
         added = {key: extension.schemas[key] for key, extension in EXTENSIONS.usable().items()}
-        mapping = {**mapping, "properties": {**mapping["properties"], **added}, "additionalProperties": False}
-        return {"anyOf": [{"enum": list(CHANNELS), "type": "string"}, mapping]}
+        by_preset = {
+            key: {k: v for k, v in each.items() if k != "default"} for key, each in mapping["properties"].items()
+        }
+        mapping = {**mapping, "properties": {**by_preset, **added}, "additionalProperties": False}
+        return {"anyOf": [{"enum": list(PRESETS), "type": "string"}, mapping]}
 
     @property
     def extensions(self) -> tuple[Extension, ...]:
@@ -293,25 +224,65 @@ class V2X(Part):
         return tuple(dict.fromkeys(EXTENSIONS[key] for key in self.model_extra or ()))
 
     @property
-    def channel(self) -> Channel:
-        """The preset's settings, except those that are written here."""
-        own = {key: getattr(self, key) for key in Channel._fields[1:] if getattr(self, key) is not None}
-        base = CHANNELS[self.preset]
-        return base._replace(timing="fixed" if self.link_latency_s is not None else base.timing, **own)
+    def timing(self) -> Literal["latency", "fixed", "messages"]:
+        """Whether a message can be used after the receiver's latency, after ``link_latency_s``, or is drawn."""
+        if self.link_latency_s is not None:
+            return "fixed"
+        return "latency" if PRESETS[self.preset].get("preset", self.preset) == "paper" else "messages"
 
     @property
     def by_link(self) -> bool:
         """Whether the channel differs from that of the paper: each vehicle knows everything after its own latency."""
-        return self.channel != CHANNELS["paper"]
+        return self.timing != "latency" or (self.hears, self.senses, self.lost) != ("all", "none", 0.0)
 
     @property
     def drawn(self) -> bool:
         """Whether random numbers determine what vehicles know, or when."""
-        channel = self.channel
-        heard = channel.hears != "none" and (channel.timing == "messages" or 0.0 < channel.lost < 1.0)
-        seen = channel.senses != "none" and channel.sensing_s[0] != channel.sensing_s[1]
+        heard = self.hears != "none" and (self.timing == "messages" or 0.0 < self.lost < 1.0)
+        seen = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
         own = any(extension.is_random(self) for extension in self.extensions)
         return self.by_link and (heard or seen or own)
+
+    def first_message_s(self, u: Floats) -> Floats:
+        """Return tau of links (s) for uniform numbers ``u`` [..., PER_LINK]; infinite: no message arrives."""
+        delay = np.full(u.shape[:-1], -np.inf if self.link_latency_s is None else self.link_latency_s)
+        if self.timing == "messages":
+            periods = burst_periods(u[..., 1], self.loss_begins, self.loss_ends)
+            on_the_way = self.radio_s + self.processing_s + self.actuation_s
+            delay = (u[..., 0] + periods) * self.message_period_s + on_the_way
+        delay[u[..., 2] < self.lost] = np.inf
+        return delay
+
+    def heard_and_seen(self, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
+        """Return when i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
+
+        ``u`` [n, PER_LINK N^2] are the uniform numbers of the links, ``unheard`` [n or 1, N, N] says whose equipment
+        lets no message through (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
+        """
+        N = unheard.shape[1]
+        links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
+        deaf = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}[self.hears]
+        heard = np.where(deaf | unheard, np.inf, self.first_message_s(links))
+        ahead = sender == receiver - 1
+        in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": sender < 0}[self.senses]
+        low, high = self.sensing_s
+        return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
+
+    def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
+        """Return when each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
+        N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, unheard)
+        latency = own_latency.copy()
+        for i in range(1, N if self.timing != "latency" else 0):
+            first = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
+            latency[:, i] = np.maximum(latency[:, i], first)
+        known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
+        known[:, np.arange(N), np.arange(N)] = latency
+        return latency, known
+
+    def latest_reaction_s(self, own_latency: Floats, unheard: Bools) -> Floats:
+        """Return upper bounds of the times from which vehicles can react, [n, N] s, from their own latencies."""
+        slowest = np.tile([1.0, 0.0, 0.0, 1.0], (len(own_latency), own_latency.shape[1] ** 2))  # numbers of links
+        return self.news(own_latency, slowest, unheard)[0]
 
 
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:
@@ -326,6 +297,8 @@ def register_preset(name: str, settings: Mapping[str, Any]) -> None:
             " digit"
         )
     document = Document(f"preset {name!r}", settings, {})
-    channel = read_model(document, V2X, Wording(V2X), "such as {'lost': 0.1}").channel
-    if CHANNELS.setdefault(name, channel) != channel:
+    v2x = read_model(document, V2X, Wording(V2X), "such as {'lost': 0.1}")
+    written = {key: getattr(v2x, key) for key in v2x._keys if key != "preset"}
+    preset = {"preset": v2x.preset, **PRESETS[v2x.preset], **written}
+    if PRESETS.setdefault(name, preset) != preset:
         raise AlreadyExists(f"preset {name!r}: another channel is already registered under this name; choose another")

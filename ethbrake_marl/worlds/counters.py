@@ -23,14 +23,9 @@ _PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 def world_numbers(n: int, seed: int, first: int, channel: str) -> Ints:
     """Return ``first`` to ``first + n - 1``, [n]. Raises ``InvalidInput`` unless there are such worlds."""
-    for name, value, least in (("number of worlds", n, 1), ("seed of the list", seed, 0), ("first world", first, 0)):
-        check_whole_number(name, value, least)
-    if not n <= MOST_AT_ONCE:
-        raise InvalidInput(f"number of worlds = {n}: must be at most {MOST_AT_ONCE:,}; draw more with several calls")
-    if not int(first) + int(n) <= _MOST_WORLDS:
-        raise InvalidInput(
-            f"sample: first = {first!r}: first + n must be at most {_MOST_WORLDS}, the number of worlds of one seed"
-        )
+    check_whole_number("number of worlds", n, 1, MOST_AT_ONCE)
+    check_whole_number("seed of the list", seed, 0)
+    check_whole_number("first world", first, 0, _MOST_WORLDS)
     if channel not in CHANNELS:
         raise InvalidInput(f"sample: channel = {channel!r}: must be one of {', '.join(CHANNELS)}")
     return np.arange(int(first), int(first) + int(n), dtype=np.int64)

@@ -1,20 +1,22 @@
-"""What a world's quantities are: those that are declared, and those that follow from them."""
+"""What a world's quantities are: those that are declared, those that follow from them, and what must hold of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ethbrake_marl.motion.forces import stopping_distances
 from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.worlds.roles import deceleration_of
 from ethbrake_marl.worlds.rules import OPTIONAL, USUAL
 
 if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
 
 GRAVITY_MPS2 = 9.81
+LEAST_WEIGHT = 1e-6  # least weight of harm that one vehicle of a line must have, so that shares of weights are exact
 
 Values = dict[str, Floats]  # key of a quantity -> values in k worlds, [k, vehicles, pairs or 1]
 
@@ -30,7 +32,7 @@ def world_values(
     time of the alert`` grow with what is declared: bounds of the declared quantities give bounds of these. Friction
     limits capacities to friction x gravity. ``settle`` may replace the values of a key, before others follow from it.
     """
-    keys = [key for key in (*USUAL, *OPTIONAL) if key != "obstacle_gap_m" and scenario.declares(key)]
+    keys = [key for key in (*USUAL, *OPTIONAL) if key != "obstacle_gap_m" and key in scenario.sources]
     values = {key: declared(key) for key in keys}
     if scenario.alert_s is not None:
         values["latency_s"] = values["latency_s"] + declared("alert_s")
@@ -51,9 +53,41 @@ def obstacle_gap(scenario: Scenario, values: Values, declared: Callable[[str], F
     It is declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: the margin is what is left if Vehicle 1 brakes fully
     (longer while its brakes build up: ``motion.forces.stopping_m``).
     """
-    if scenario.declares("obstacle_gap_m"):
+    if "obstacle_gap_m" in scenario.sources:
         return declared("obstacle_gap_m")
     speed, latency, capacity = (values[key][:, 0] for key in ("speeds_mps", "latency_s", "braking_capacity_mps2"))
     rate = values["brake_rate_mps3"][:, 0] if "brake_rate_mps3" in values else np.full(len(speed), np.inf)
     stop = stopping_distances(*np.broadcast_arrays(speed, latency, capacity, rate))
     return declared("obstacle_margin_m") + stop[:, np.newaxis]
+
+
+def mistakes(scenario: Scenario, low: Values, high: Values) -> Iterator[tuple[str, int, int, str]]:
+    """Yield what cannot be in k worlds whose quantities are from ``low`` to ``high``, each [k, entries].
+
+    A mistake is the key of a quantity (``v2x``: of news), the index of the vehicle, the row of the first such world,
+    and what would be right.
+    """
+
+    def first(holds: Any) -> Any:
+        return np.flatnonzero(~holds)[:1].tolist()
+
+    latest = scenario.v2x.latest_reaction_s(high["latency_s"], scenario.unheard())
+    for i, (name, role) in enumerate(scenario.roles.items()):
+        slow, fast, limit = low["speeds_mps"][:, i], high["speeds_mps"][:, i], low["speed_limit_mps"][:, i]
+        for row in first((slow >= 0.0) & (fast <= limit)):
+            speed = f"{slow[row]:g}" if slow[row] == fast[row] else f"{slow[row]:g} to {fast[row]:g}"
+            right = f"its speed must be from 0 to its speed_limit_mps, {limit[row]:g} m/s"
+            yield "speeds_mps", i, row, f"{name} has a speed of {speed} m/s; {right}"
+        for row in first(latest[:, i] < scenario.horizon_s):
+            key = "v2x" if latest[row, i] > high["latency_s"][row, i] else "latency_s"
+            right = f"this time must be below horizon_s ({scenario.horizon_s:g} s)"
+            yield key, i, row, f"{name} may not be able to act until {latest[row, i]:g} s; {right}"
+        deceleration = deceleration_of(role) or 0.0
+        key = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
+        for row in first(low[key][:, i] >= abs(deceleration)):
+            right = f"must be at least {abs(deceleration):g} m/s2 on the road, because roles.{name} = {role}"
+            yield key, i, row, right
+    if "harm_weight" in low:
+        for row in first((low["harm_weight"] >= LEAST_WEIGHT).any(axis=1)):
+            right = f"at least one vehicle must always have a weight of {LEAST_WEIGHT:g} or more"
+            yield "harm_weight", 0, row, right

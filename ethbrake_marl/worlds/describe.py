@@ -47,7 +47,7 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
 
 def fixed_columns(scenario: Scenario) -> set[str]:
     """Return the columns of ``quantities_of`` that are the same in every world; gaps and speeds never are."""
-    keys = [key for key in CAR_ROWS if key in USUAL or scenario.declares(key)] + ["restitution"]
+    keys = [key for key in CAR_ROWS if key in USUAL or key in scenario.sources] + ["restitution"]
     ends = {RULES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
     return {name for name, (low, high) in ends.items() if low == high}
 
@@ -60,19 +60,14 @@ def kinds_of(drawn: Drawn) -> dict[str, Texts]:
     return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
 
 
-def recording_of(texts: Texts) -> Texts:
-    """Return the recording that each cell of the column ``recording`` names: what stands before the last ": "."""
-    before, _, after = np.char.rpartition(texts, ": ").T
-    names: Texts = np.where(before == "", after, before)
-    return names
-
-
 def clusters_of(columns: Mapping[str, NDArray[Any]]) -> Texts | None:
     """Return the name of each world's cluster, [n], from its columns; None if all worlds are independent.
 
-    Worlds of one recording depend on each other. A world without a recording is a cluster of its own.
+    Worlds of one recording depend on each other; its name stands before the last ": " of a cell. A world without a
+    recording is a cluster of its own.
     """
     if RECORDING not in columns:
         return None
-    recording = recording_of(columns[RECORDING])
+    before, _, after = np.char.rpartition(columns[RECORDING], ": ").T
+    recording = np.where(before == "", after, before)
     return np.where(recording == "", np.char.add(" ", columns["world"].astype(str)), recording)

@@ -20,25 +20,19 @@ class Key(NamedTuple):
     """A key of a scenario file."""
 
     name: str
-    default: str  # in YAML; empty: none
-    range: str  # of a quantity: ``finite and in (0, 1000] t (tonnes)``
+    example: str  # of its value, in YAML
     about: str
-
-    @property
-    def text(self) -> str:
-        """What the key means, its range, and which key cannot stand beside it."""
-        other = {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}.get(self.name)
-        either = f"give either this key or {other}" if other else ""
-        return "; ".join(part for part in (self.about, self.range, either) if part)
+    comment: str  # what the key means, its range, and which key cannot stand beside it
 
 
 def listed_keys() -> list[Key]:
     """Return every key of a scenario file, in the order of the file."""
-    keys = []
+    keys, others = [], {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}
     for name, field in Scenario.model_fields.items():
-        fixed = field.default_factory is None and field.default is not None and not field.is_required()
-        interval = RULES[name].interval if name in RULES else ""
-        keys.append(Key(name, flow_text(field.default) if fixed else "", interval, str(field.description)))
+        about, rule = str(field.description), RULES.get(name)
+        example = _EXAMPLES.get(name) or flow_text(field.default) if rule is None else rule.example
+        either = [f"give either this key or {others[name]}"] if name in others else []
+        keys.append(Key(name, example, about, "; ".join([about, *([rule.interval] if rule else []), *either])))
     return keys
 
 
@@ -86,7 +80,7 @@ _EXAMPLES = {
 
 def check_file_name(kind: str, name: str) -> None:
     """Raise ``InvalidInput`` unless ``name`` can name a scenario or recipe (``kind``) and its file."""
-    if re.fullmatch(NAME_PATTERN, name) is None or name.endswith("\n"):
+    if re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(
             f"{kind} name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"
             " digit"
@@ -106,14 +100,12 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: s
         "description": "What the scenario is for.",
     }
     values["source"] = f"Values of {base.name}, to be changed. Its own source: {base.source}"
-    if base.table is not None and rows_file:
-        weights = {"weights": "weight"} if base.table.weights is not None else {}
-        values["table"] = {"file": rows_file, "columns": list(base.table.columns), **weights}
+    if rows_file and "file" in values.get("table", {}):
+        values["table"] |= {"file": rows_file}
     text = _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario", "scenario schema")
     for key in listed_keys():
-        example = RULES[key.name].example if key.name in RULES else _EXAMPLES.get(key.name, key.default)
-        line = f"{key.name}: {flow_text(values[key.name])}" if key.name in values else f"# {key.name}: {example}"
-        text += f"\n# {key.text}\n{line}\n"
+        line = f"{key.name}: {flow_text(values[key.name])}" if key.name in values else f"# {key.name}: {key.example}"
+        text += f"\n# {key.comment}\n{line}\n"
     return text
 
 

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import suggestion
-from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.checks import LEAST_WEIGHT
-from ethbrake_marl.worlds.derived import obstacle_gap, world_values
+from ethbrake_marl.worlds.derived import mistakes, obstacle_gap, world_values
 from ethbrake_marl.worlds.game import AnyScenario
-from ethbrake_marl.worlds.roles import deceleration_of
-from ethbrake_marl.worlds.rules import OPTIONAL, RECORDING, RULES, USUAL, Entry, table_columns
+from ethbrake_marl.worlds.rules import OPTIONAL, RULES, USUAL, Entry, table_columns
 from ethbrake_marl.worlds.sampling import state_of
 from ethbrake_marl.worlds.scenario import Scenario
 from ethbrake_marl.worlds.table import CsvFile
@@ -46,9 +44,9 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
 def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """Return worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
-    ``columns`` may also be a pandas or polars data frame, or a pyarrow table. Rows are paired by position. Gaps and
-    speeds are needed; any other column of ``given_columns`` may follow. What has no column has the scenario's value,
-    which must be fixed. Raises ``InvalidInput`` with column and row (from 0).
+    ``columns`` may also be a pandas or polars data frame, or a pyarrow table. Rows are paired by position. What has no
+    column (``given_columns``) has the scenario's value, which must be fixed. Raises ``InvalidInput`` with column and
+    row (from 0).
     """
     scenario, where = load_scenario(scenario), "initial states"
     names = getattr(columns, "column_names", None) or getattr(columns, "columns", columns)  # of pyarrow, or a frame
@@ -81,13 +79,13 @@ def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
     entries = _entries(file.header, scenario, f"{file.path}, line 1")
     table = np.array(file.cells(file.header), np.float64)
     columns = dict(zip(entries, table.T, strict=True))
-    return _worlds(scenario, columns, str(file.path), lambda row: f", line {file.lines[row]}")
+    return _worlds(scenario, columns, str(file.path), lambda row: f", line {[*file.rows][row]}")
 
 
 def given_keys(scenario: Scenario) -> tuple[str, ...]:
     """Return the quantities that worlds of this scenario have: ``gaps_m`` and so on."""
     there = {"obstacle_gap_m": scenario.has_obstacle}
-    return USUAL + tuple(key for key in OPTIONAL if there.get(key, scenario.declares(key)))
+    return USUAL + tuple(key for key in OPTIONAL if there.get(key, key in scenario.sources))
 
 
 def given_columns(scenario: Scenario) -> dict[str, Entry]:
@@ -101,22 +99,12 @@ def _check_known(what: str, name: str, known: Sequence[str]) -> None:
 
 
 def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entry]:
-    """Return what the columns of a header mean. Raises ``InvalidInput`` for unknown, repeated and missing columns."""
+    """Return what the columns of a header mean. Raises ``InvalidInput`` for unknown and repeated columns."""
     known = given_columns(scenario)
     for name in header:
         if header.count(name) > 1:
             raise InvalidInput(f"{where}: column {name!r} occurs twice")
-        if name == RECORDING:
-            raise InvalidInput(
-                f"{where}: column {name!r} is possible only in the table of a scenario; put this table into a scenario"
-                " (key table), or remove the column (confidence intervals then treat all worlds as independent)"
-            )
         _check_known(f"{where}: unknown column {name!r}", name, [*known])
-    for name, (key, _) in known.items():
-        if key in ("gaps_m", "speeds_mps") and name not in header:
-            raise InvalidInput(
-                f"{where}: column {name!r} is missing; a table for {scenario.vehicles} vehicles must have it"
-            )
     return [known[name] for name in header]
 
 
@@ -132,17 +120,12 @@ def _worlds(
             f"{where}: scenario {scenario.name!r} is a mixture, so it is unknown to which of its scenarios a"
             f" world belongs; use one of these scenarios: {', '.join(member.name for member in scenario.members)}"
         )
-    n, N = len(next(iter(given.values()))) if given else 1, scenario.vehicles
+    n = len(next(iter(given.values()))) if given else 1
 
-    def name(key: str, i: int) -> str:
-        by_key = f": {key}" if RULES[key].per == "world" else f": {key}[{i}]"
-        return by_key if row_text is None else f", column {RULES[key].column_of(i)}"
-
-    def require(good: Bools, key: str, i: int, column: Floats, right: str) -> None:
-        if not good.all():
-            row = int(np.argmin(good))
-            place = f"{where}{row_text(row) if row_text else ''}{name(key, i)}"
-            raise InvalidInput(f"{place} = {column[row]:.12g}: {right}")
+    def refuse(key: str, i: int, row: int, right: str) -> NoReturn:
+        by_key = key if RULES[key].per == "world" else f"{key}[{i}]"
+        place = f": {by_key}" if row_text is None else f"{row_text(row)}, column {RULES[key].column_of(i)}"
+        raise InvalidInput(f"{where}{place}{right}")
 
     def fixed(key: str) -> Floats:
         low, high = scenario.ends(key)
@@ -154,29 +137,18 @@ def _worlds(
         for i in range(whole.shape[1]):
             column = whole[:, i] = given.get((key, i), known[:, i])
             if (key, i) not in given and np.isnan(column).any():
-                right = f"is missing; scenario {scenario.name!r} has no fixed value for it"
-                raise InvalidInput(f"{where}: {name(key, i)[2:]} {right}")
+                refuse(key, i, 0, f" is missing; scenario {scenario.name!r} has no fixed value for it")
             good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
-            require(good, key, i, column, f"must be {rule.interval}")
+            for row in np.flatnonzero(~good).tolist():
+                refuse(key, i, row, f" = {column[row]:.12g}: must be {rule.interval}")
         return whole
 
     whole = world_values(scenario, fixed, settle)
     if scenario.has_obstacle:
         whole["obstacle_gap_m"] = settle("obstacle_gap_m", obstacle_gap(scenario, whole, fixed))
-    for i in range(N):
-        latency, speed, limit = (whole[key][:, i] for key in ("latency_s", "speeds_mps", "speed_limit_mps"))
-        right = f"must be below horizon_s of the scenario ({scenario.horizon_s:g} s)"
-        require(latency < scenario.horizon_s, "latency_s", i, latency, right)
-        right = f"must not be above speed_limit_mps of vehicle_{i + 1}, {limit[np.argmin(speed <= limit)]:g} m/s"
-        require(speed <= limit, "speeds_mps", i, speed, right)
-        role = scenario.roles[f"vehicle_{i + 1}"]
-        deceleration = deceleration_of(role) or 0.0
-        key = "braking_capacity_mps2" if deceleration > 0.0 else "driving_capacity_mps2"
-        right = f"must be at least {abs(deceleration):g} m/s2, because roles.vehicle_{i + 1} = {role}"
-        require(whole[key][:, i] >= abs(deceleration), key, i, whole[key][:, i], right)
-    weights = whole.get("harm_weight", np.ones((n, 1)))
-    right = f"the weight of at least one vehicle must be {LEAST_WEIGHT:g} or more"
-    require(np.asarray((weights >= LEAST_WEIGHT).any(axis=1)), "harm_weight", 0, weights[:, 0], right)
+    for mistake, i, row, right in mistakes(scenario, whole, whole):
+        key = "latency_s" if mistake == "v2x" else mistake
+        refuse(key, i, row, f" = {whole[key][row, i]:.12g}: {right}")
     line = scenario.types_of_line
     equipment_drawn = line is not None and any(kind.v2x is not None for kind in line.kinds)
     if scenario.v2x.drawn or equipment_drawn:
@@ -189,7 +161,7 @@ def _worlds(
     def no_chance(width: int, stream: tuple[int, ...]) -> Floats:
         return np.zeros((n, width))
 
-    return state_of(scenario, whole, no_chance, scenario.equipped(), np.full(n, -1))
+    return state_of(scenario, whole, no_chance, scenario.unheard(), np.full(n, -1))
 
 
 def _numbers(what: str, value: Any) -> Floats:

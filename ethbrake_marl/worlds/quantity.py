@@ -6,12 +6,11 @@ Every distribution uses its inverse cumulative distribution function. ``exp``, `
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, field_validator, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from ethbrake_marl.files.model import FileModel, require
 from ethbrake_marl.motion.elementary import exp_each, log, normal_probability, normal_quantile_each
@@ -19,10 +18,19 @@ from ethbrake_marl.motion.layout import Floats, Ints
 
 LEAST_MASS = 1e-6  # least probability of [low, high] before truncation; below it the quantile loses precision
 
+
+def ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    """Refuse, in a pydantic model, [low, high] with low above high."""
+    require(ends[0] <= ends[1], (), ends, "low must not be above high")
+    return ends
+
+
 Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[Number, Field(gt=0.0)]
+Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 Pair = Annotated[tuple[Number, Number], Field(strict=False)]
-Numbers = Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
-Condition = tuple[bool, str, str]  # whether it holds, the field that it is about, and what would be right
+Ends = Annotated[Pair, AfterValidator(ordered)]
+PositiveEnds = Annotated[tuple[Positive, Positive], Field(strict=False), AfterValidator(ordered)]
 
 
 def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
@@ -50,24 +58,11 @@ class Distribution(Part):
         shape = getattr(self, next(iter(type(self).model_fields)))
         return (min(shape), max(shape)) if isinstance(shape, tuple) else (shape.low, shape.high)
 
-    def conditions(self) -> Iterator[Condition]:
-        """Yield what must hold. A later condition is asked for only if the earlier ones hold."""
-        raise NotImplementedError
-
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        for holds, field, right in self.conditions():
-            require(holds, (field,), getattr(self, field), right)
-        return self
-
 
 class Uniform(Distribution):
     """``{uniform: [low, high]}``: ``low + (high - low) u``."""
 
-    uniform: Pair = Field(description="[low, high]")
-
-    def conditions(self) -> Iterator[Condition]:
-        yield self.uniform[0] <= self.uniform[1], "uniform", "low must not be above high"
+    uniform: Ends = Field(description="[low, high]")
 
     def value(self, u: Floats) -> Floats:
         """Return the values; none is above high, because u is at most 1 - 2^-53."""
@@ -78,11 +73,7 @@ class Uniform(Distribution):
 class LogUniform(Distribution):
     """``{loguniform: [low, high]}``: ``low (high / low)^u``, so 1 to 2 is as likely as 2 to 4."""
 
-    loguniform: Pair = Field(description="[low, high], both above 0")
-
-    def conditions(self) -> Iterator[Condition]:
-        yield self.loguniform[0] > 0.0, "loguniform", "low must be above 0"
-        yield self.loguniform[0] <= self.loguniform[1], "loguniform", "low must not be above high"
+    loguniform: PositiveEnds = Field(description="[low, high], both above 0")
 
     def value(self, u: Floats) -> Floats:
         low, high = self.loguniform
@@ -93,9 +84,24 @@ class NormalShape(Part):
     """Mean and standard deviation before truncation, and the smallest and largest possible value."""
 
     mean: Number
-    sd: Number
+    sd: Positive
     low: Number
     high: Number
+
+    @model_validator(mode="after")
+    def _likely(self) -> Self:
+        _check_likely(self, self)
+        return self
+
+    def shares(self) -> tuple[float, float]:
+        """Return the probabilities of a value below ``low`` and below ``high`` before truncation."""
+        low, high = (normal_probability((end - self.mean) / self.sd) for end in (self.low, self.high))
+        return low, high
+
+    def value(self, u: Floats) -> Floats:
+        """Return ``mean + sd Q(p_low + (p_high - p_low) u)`` with the standard normal quantile function Q."""
+        below, above = self.shares()
+        return np.clip(self.mean + self.sd * normal_quantile_each(below + (above - below) * u), self.low, self.high)
 
 
 class Normal(Distribution):
@@ -103,25 +109,34 @@ class Normal(Distribution):
 
     normal: NormalShape
 
-    def conditions(self) -> Iterator[Condition]:
-        yield self.normal.sd > 0.0, "normal", "sd must be above 0"
-        yield from _truncation("normal", self.normal)
-
     def value(self, u: Floats) -> Floats:
-        return _truncated(self.normal, u)
+        return self.normal.value(u)
 
 
 class LogNormalShape(Part):
     """Median and standard deviation of the logarithm before truncation, and the smallest and largest value."""
 
-    median: Number
-    sigma: Number
-    low: Number
-    high: Number
+    median: Positive
+    sigma: Positive
+    low: Positive
+    high: Positive
+
+    @model_validator(mode="after")
+    def _likely(self) -> Self:
+        _check_likely(self, self.of_logarithm())
+        return self
 
     def of_logarithm(self) -> NormalShape:
         """Return the shape of the normal distribution of the logarithm."""
-        return NormalShape(mean=log(self.median), sd=self.sigma, low=log(self.low), high=log(self.high))
+        low, high = log(self.low), log(self.high)
+        return NormalShape.model_construct(mean=log(self.median), sd=self.sigma, low=low, high=high)
+
+
+def _check_likely(shape: Part, of_normal: NormalShape) -> None:
+    require(of_normal.low < of_normal.high, (), shape, "low must be below high")
+    below, above = of_normal.shares()
+    right = f"the untruncated distribution must have a probability of at least {LEAST_MASS:g} in [low, high]"
+    require(above - below >= LEAST_MASS, (), shape, right)
 
 
 class LogNormal(Distribution):
@@ -129,55 +144,27 @@ class LogNormal(Distribution):
 
     lognormal: LogNormalShape
 
-    def conditions(self) -> Iterator[Condition]:
-        shape = self.lognormal
-        yield min(shape.median, shape.low, shape.high) > 0.0, "lognormal", "median, low and high must be above 0"
-        yield shape.sigma > 0.0, "lognormal", "sigma must be above 0"
-        yield from _truncation("lognormal", shape.of_logarithm())
-
     def value(self, u: Floats) -> Floats:
         """Return ``exp(x)`` with x from a normal distribution truncated to [log(low), log(high)]."""
-        return np.clip(exp_each(_truncated(self.lognormal.of_logarithm(), u)), *self.support)
-
-
-def _shares(shape: NormalShape) -> tuple[float, float]:
-    """Return the probabilities of a value below ``low`` and below ``high`` before truncation."""
-    low, high = (normal_probability((end - shape.mean) / shape.sd) for end in (shape.low, shape.high))
-    return low, high
-
-
-def _truncation(field: str, shape: NormalShape) -> Iterator[Condition]:
-    yield shape.low < shape.high, field, "low must be below high"
-    below, above = _shares(shape)
-    right = f"the untruncated distribution must have a probability of at least {LEAST_MASS:g} in [low, high]"
-    yield above - below >= LEAST_MASS, field, right
-
-
-def _truncated(shape: NormalShape, u: Floats) -> Floats:
-    """Return ``mean + sd Q(p_low + (p_high - p_low) u)`` with the standard normal quantile function Q."""
-    below, above = _shares(shape)
-    return np.clip(shape.mean + shape.sd * normal_quantile_each(below + (above - below) * u), shape.low, shape.high)
+        return np.clip(exp_each(self.lognormal.of_logarithm().value(u)), *self.support)
 
 
 class Choice(Distribution):
     """``{choice: [a, b, ...]}``: one of the values, equally likely or in proportion to ``weights: [...]``."""
 
-    choice: Numbers
-    weights: Numbers | None = None
+    choice: Annotated[tuple[Number, ...], Field(strict=False, min_length=1)]
+    weights: Annotated[tuple[Weight, ...], Field(strict=False)] | None = None
 
-    def conditions(self) -> Iterator[Condition]:
-        weights, count = self.weights or (1.0,) * len(self.choice), len(self.choice)
-        yield len(weights) == count, "weights", f"must have as many entries as choice ({count})"
-        yield positive(weights), "weights", "every weight must be above 0, and their sum finite"
+    @model_validator(mode="after")
+    def _weighted(self) -> Self:
+        count = len(self.choice)
+        right = f"must have as many entries as choice ({count})"
+        require(self.weights is None or len(self.weights) == count, ("weights",), self.weights, right)
+        return self
 
     def value(self, u: Floats) -> Floats:
         values: Floats = np.asarray(self.choice)[pick(self.weights or (1.0,) * len(self.choice), u)]
         return values
-
-
-def positive(weights: Sequence[float]) -> bool:
-    """Return whether weights can be drawn by: all are above 0, and their sum is finite."""
-    return min(weights) > 0.0 and math.isfinite(sum(weights))
 
 
 DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")

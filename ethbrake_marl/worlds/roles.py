@@ -36,8 +36,8 @@ def check_vehicle(name: str, vehicles: int, at: YamlPath, value: Any) -> None:
     require(name in names_of(vehicles), at, value, f"unknown vehicle; {hint}")
 
 
-def check_role(role: str) -> None:
-    """Raise ``InvalidInput`` unless ``role`` has the form ``name[:argument]`` and names no Python file.
+def check_role(role: str) -> str:
+    """Return ``role``. Raises ``InvalidInput`` unless it has the form ``name[:argument]`` and names no Python file.
 
     Loading somebody else's scenario must not run code.
     """
@@ -60,6 +60,7 @@ def check_role(role: str) -> None:
         raise InvalidInput(
             f"agent {role!r}: constant needs a finite deceleration in m/s2 after the colon, for instance constant:3.5"
         )
+    return role
 
 
 def deceleration_of(role: str) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -13,12 +14,23 @@ from ethbrake_marl.episode.step import at_alert, begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
 from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, FAR_M, GAP, LATENCY, Bools, Floats, Ints
-from ethbrake_marl.worlds.channel import PER_LINK, Equipped
+from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.counters import Channel, Numbers, numbers_of, world_numbers
 from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
-from ethbrake_marl.worlds.quantity import pick, values
+from ethbrake_marl.worlds.quantity import pick
 from ethbrake_marl.worlds.roles import first_command
-from ethbrake_marl.worlds.rules import CAR_ROWS, MIXTURE, NEWS, OF_WORLD, PER_TYPE, ROW, RULES, TYPES, width_of
+from ethbrake_marl.worlds.rules import (
+    CAR_ROWS,
+    MIXTURE,
+    NEWS,
+    OF_WORLD,
+    PER_TYPE,
+    RECORDING,
+    ROW,
+    RULES,
+    TYPES,
+    width_of,
+)
 from ethbrake_marl.worlds.table import TableColumn
 from ethbrake_marl.worlds.vehicle_types import WithLoad
 
@@ -48,7 +60,7 @@ class Drawn(NamedTuple):
         return cls(worlds, np.full(n, np.nan), np.full((n, worlds.vehicles), ""), np.full(n, ""), np.full(n, ""))
 
 
-def draw(scenario: Scenario, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Drawn:
+def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) -> Drawn:
     """Return worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
 
     World k of a mixture is world k of the member that is chosen for it. Raises ``InvalidInput`` for bad arguments, and
@@ -72,14 +84,16 @@ def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     """Return the worlds of these random numbers, early impacts included. The scenario is no mixture."""
-    n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.recordings
-    kind, load = (None, None) if line is None else line.draw(numbers(PER_TYPE * N, TYPES).reshape(n, N, PER_TYPE))
+    n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
+    numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
+    if line is not None:
+        kind, load = line.draw(numbers(PER_TYPE * N, TYPES).reshape(n, N, PER_TYPE))
     declared = _declared_values(scenario, numbers, n, kind, load)
     whole = world_values(scenario, declared)
     if scenario.has_obstacle:
         whole["obstacle_gap_m"] = obstacle_gap(scenario, whole, declared)
     return Drawn(
-        state_of(scenario, whole, numbers, scenario.equipped(kind), index),
+        state_of(scenario, whole, numbers, scenario.unheard(kind), index),
         whole["friction"][:, 0] if "friction" in whole else np.full(n, np.nan),
         np.full((n, N), "") if line is None else np.array(line.names)[kind],
         np.full(n, ""),
@@ -87,35 +101,28 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     )
 
 
-def _declared_values(
-    scenario: Scenario, numbers: Numbers, n: int, kind: Ints | None, load: Floats | None
-) -> Callable[[str], Floats]:
+def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, load: Floats) -> Callable[[str], Floats]:
     """Return a function: key -> values of a declared quantity, [n, entries]. ``kind`` and ``load`` are [n, N]."""
-    streams: dict[tuple[int, ...], Floats] = {}
 
     def declared(key: str) -> Floats:
-        entries = scenario.declarations(key)
+        entries = scenario.sources[key]
         drawn = np.empty((n, len(entries)))
         for i, possible in enumerate(entries):
             for k, quantity in possible.items():
-                rows: Any = slice(None) if kind is None or len(possible) == 1 else kind[:, i] == k
+                rows: Any = slice(None) if len(possible) == 1 else kind[:, i] == k
                 if isinstance(quantity, float):
                     drawn[rows, i] = quantity
                     continue
                 stream, column = ROW if isinstance(quantity, TableColumn) else RULES[key].place(i)
-                if stream not in streams:
-                    streams[stream] = numbers(width_of(stream, scenario.vehicles), stream)
-                u = streams[stream][rows, column]
-                if isinstance(quantity, WithLoad) and load is not None:
-                    drawn[rows, i] = quantity.value(load[rows, i], u)
-                else:
-                    drawn[rows, i] = values(quantity, u)
+                u = numbers(width_of(stream, scenario.vehicles), stream)[rows, column]
+                of = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)
+                drawn[rows, i] = quantity.value(*of)
         return drawn
 
     return declared
 
 
-def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equipped, index: Ints) -> State:
+def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools, index: Ints) -> State:
     """Return worlds at the alert from all their quantities, and the random numbers of their links.
 
     With the channel of the paper a vehicle knows everything once its own latency is over.
@@ -125,7 +132,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equi
     know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))
     latency, known = whole["latency_s"], whole["latency_s"][:, :, np.newaxis]
     if scenario.v2x.by_link:
-        latency, known = scenario.v2x.channel.news(latency, numbers(PER_LINK * N * N, NEWS), equipped)
+        latency, known = scenario.v2x.news(latency, numbers(PER_LINK * N * N, NEWS), unheard)
     obstacle = whole.get("obstacle_gap_m", np.full((n, 1), FAR_M))
     of_car = [(row, whole[key]) for key, row in CAR_ROWS.items() if key in whole and row != LATENCY]
     of_car += [(LATENCY, latency), (layout.OWN_LATENCY, whole["latency_s"])]
@@ -140,7 +147,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, equipped: Equi
         know[rows, 1:, 1:] = known[rows]
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], whole["braking_capacity_mps2"][:, i])
-    memories = {each.name: each.at_alert(scenario, numbers, equipped, n) for each in scenario.v2x.extensions}
+    memories = {each.name: each.at_alert(scenario, numbers, unheard, n) for each in scenario.v2x.extensions}
     return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 
@@ -177,13 +184,10 @@ def has_early_impact(scenario: Scenario, alert: State) -> Bools:
 
 def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
     """Return the worlds of all parts in one, with row i of them in row ``place[i]``."""
+    order = np.argsort(place)
 
     def of_parts(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        whole, begins = np.empty((len(place), *arrays[0].shape[1:]), np.result_type(*arrays)), 0
-        for array in arrays:
-            whole[place[begins : begins + len(array)]] = array
-            begins += len(array)
-        return whole
+        return np.concatenate(arrays)[order]
 
     worlds = State.join([part.worlds for part in parts], of_parts)
     friction, types, scenarios, recordings = map(of_parts, zip(*(part[1:5] for part in parts), strict=True))

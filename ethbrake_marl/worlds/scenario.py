@@ -8,32 +8,62 @@ from operator import not_
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import BaseModel, Field, PrivateAttr, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    Discriminator,
+    Field,
+    Tag,
+    ValidationError,
+    ValidationInfo,
+    WithJsonSchema,
+    field_validator,
+    model_validator,
+)
 
 from ethbrake_marl.episode.features import listed_features
 from ethbrake_marl.episode.objectives import objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, explain, refuse
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, explain
 from ethbrake_marl.files.yaml import Document
-from ethbrake_marl.motion.layout import Floats, Ints
-from ethbrake_marl.worlds.channel import HEARS, V2X, Equipage, Equipped
-from ethbrake_marl.worlds.checks import check_whole
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.worlds.channel import V2X
+from ethbrake_marl.worlds.checks import ScenarioWording, check_whole
 from ethbrake_marl.worlds.counters import Channel
 from ethbrake_marl.worlds.derived import world_values
-from ethbrake_marl.worlds.describe import columns_of
-from ethbrake_marl.worlds.mixture import WORDS, Member, build_members, changed_content
-from ethbrake_marl.worlds.quantity import Part, PerVehicle, Quantity, support
+from ethbrake_marl.worlds.mixture import WORDS, changed_content, with_members
+from ethbrake_marl.worlds.quantity import Part, PerVehicle, Quantity, Weight, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
-from ethbrake_marl.worlds.rules import OF_A_TYPE, OPTIONAL, RECORDING, RULES, USUAL, Entry, check_count, table_columns
+from ethbrake_marl.worlds.rules import OF_A_TYPE, OPTIONAL, RULES, USUAL, check_count, table_columns
 from ethbrake_marl.worlds.sampling import Drawn, draw
 from ethbrake_marl.worlds.table import Table, TableColumn
 from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes
-from ethbrake_marl.worlds.wording import ScenarioWording
 
-Listed = Annotated[tuple[str, ...], Field(strict=False)]
+
+def _check_features(names: tuple[str, ...]) -> tuple[str, ...]:
+    listed_features(names)
+    return names
+
+
+Features = Annotated[tuple[str, ...], Field(strict=False), AfterValidator(_check_features)]
+Observation = Annotated[
+    Annotated[Features, Tag("#all")] | Annotated[dict[str, Features], Field(min_length=1), Tag("#each")],
+    Discriminator(lambda value: "#each" if isinstance(value, dict) else "#all"),
+]
+NAME_OR_CONTENT = {"anyOf": [{"type": "object", "additionalProperties": True}, {"type": "string"}]}
+
+
+class Member(Part):
+    """One scenario of a mixture. In a file ``scenario`` may be a name or path; loading puts the content there."""
+
+    scenario: Annotated[Scenario, WithJsonSchema(NAME_OR_CONTENT)] = Field(
+        description="name of a scenario, path of its file, or the content of such a file"
+    )
+    weight: Weight = Field(
+        default=1.0, description="how likely a world is drawn from this scenario, relative to the other scenarios"
+    )
 
 
 def _quantity(key: str, default: Any = None, **more: Any) -> Any:
@@ -95,7 +125,7 @@ class Scenario(Part):
     latency_s: PerVehicle | None = _quantity("latency_s")
     speed_limit_mps: PerVehicle = _quantity("speed_limit_mps", 40.0)
     restitution: Quantity = _quantity("restitution", 0.1)
-    roles: dict[str, str] = Field(
+    roles: dict[str, Annotated[str, AfterValidator(check_role)]] = Field(
         default_factory=lambda data: Roles.complete({"vehicle_2": LEARNER}, data.get("vehicles", 3)),
         description="role of each vehicle: learner, or the name of a script; a vehicle without an entry brakes fully",
     )
@@ -109,11 +139,11 @@ class Scenario(Part):
     early_impacts: Literal["keep", "reject"] = Field(
         default="keep", description="keep or reject worlds with an impact at or before the first decision of a learner"
     )
-    objective: str | Listed = Field(
+    objective: str | Annotated[tuple[str, ...], Field(strict=False)] = Field(
         default="total",
         description="whose harm a reward counts: one objective for all vehicles, or a list with one per vehicle",
     )
-    observation: Listed | dict[str, Listed] | None = Field(
+    observation: Observation | None = Field(
         default=None,
         exclude_if=not_,
         description="features and groups of features that a vehicle observes, in this order: one list for all"
@@ -124,18 +154,29 @@ class Scenario(Part):
         description="what each vehicle knows, and when: name of a preset, or a mapping with settings of your own",
     )
 
-    _members: tuple[Scenario, ...] = PrivateAttr(default=())
-
     def __init__(self, /, **data: Any) -> None:
         name = data.get("name")
-        _build(self, Document(f"scenario {name!r}" if isinstance(name, str) else "scenario", plain(data), {}))
+        self._build(Document(f"scenario {name!r}" if isinstance(name, str) else "scenario", plain(data), {}))
 
     @classmethod
     def from_document(cls, document: Document) -> Self:
         """Build a scenario from a parsed file, whose name and lines then stand in error messages."""
         scenario = cls.__new__(cls)
-        _build(scenario, document)
+        scenario._build(document)
         return scenario
+
+    def _build(self, document: Document) -> None:
+        if not isinstance(document.content, dict):
+            raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance name: my-scenario")
+        try:
+            BaseModel.__init__(self, **document.content)
+        except ValidationError as error:
+            raise explain(document, error, ScenarioWording(Scenario)) from None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_members(cls, content: dict[str, Any]) -> dict[str, Any]:
+        return with_members(content, cls) if "mixture" in content else content
 
     @field_validator("table")
     @classmethod
@@ -156,32 +197,15 @@ class Scenario(Part):
             rule.check(entry, (index,) if listed else ())
         return value
 
-    @field_validator("roles")
+    @field_validator("roles", "objective", "observation")
     @classmethod
-    def _roles(cls, value: dict[str, str], info: ValidationInfo) -> dict[str, str]:
-        vehicles = info.data.get("vehicles", len(value))
-        for name, role in value.items():
-            check_vehicle(name, vehicles, (name,), role)
-            try:
-                check_role(role)
-            except InvalidInput as error:
-                refuse((name,), role, str(error))
-        return Roles.complete(value, vehicles)
-
-    @field_validator("objective", "observation", mode="before")
-    @classmethod
-    def _names(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse names of objectives, features and vehicles that nobody knows."""
-        vehicles, by_vehicle = info.data.get("vehicles", 64), isinstance(value, dict) and len(value) > 0
-        for name, names in value.items() if by_vehicle else [("", value)]:
-            at = (name,) if by_vehicle else ()
-            if by_vehicle:
-                check_vehicle(name, vehicles, at, UNSHOWN)
-            try:
-                listed_features(names) if info.field_name == "observation" else objectives_of(names, vehicles)
-            except InvalidInput as error:
-                refuse(at, names, str(error).removeprefix(f"{info.field_name}: "))
-        return value
+    def _of_vehicles(cls, value: Any, info: ValidationInfo) -> Any:
+        vehicles = info.data.get("vehicles", 64)
+        for name in value if isinstance(value, dict) else ():
+            check_vehicle(name, vehicles, (name,), UNSHOWN)
+        if info.field_name == "objective":
+            objectives_of(value, vehicles)
+        return Roles.complete(value, vehicles) if info.field_name == "roles" else value
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -208,18 +232,14 @@ class Scenario(Part):
 
     def draw(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Drawn:
         """Return the worlds of ``sample``, their types, members and recordings, and the number of rejected draws."""
-        return draw(self, n, seed, first=first, channel=channel)
-
-    def describe(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> dict[str, NDArray[Any]]:
-        """Return the worlds of ``sample`` as columns [n]: ``world``, ``vehicle_1_type``, ``gap_1_m`` and so on."""
-        return columns_of(self.draw(n, seed, first=first, channel=channel))
+        return draw(self, n, seed, first, channel)
 
     # ---- who is in the line
 
     @property
     def members(self) -> tuple[Scenario, ...]:
         """The scenarios of a mixture, with the keys beside ``mixture``; empty for a scenario that is none."""
-        return self._members
+        return tuple(entry.scenario for entry in self.mixture or ())
 
     @cached_property
     def vehicle_names(self) -> tuple[str, ...]:
@@ -234,20 +254,17 @@ class Scenario(Part):
     @property
     def has_obstacle(self) -> bool:
         """Whether there is an obstacle ahead of Vehicle 1, in some of the worlds at least."""
-        own = self.declares("obstacle_gap_m") or self.obstacle_margin_m is not None
+        own = not {"obstacle_gap_m", "obstacle_margin_m"}.isdisjoint(self.sources)
         return own or any(member.has_obstacle for member in self.members)
 
-    def equipped(self, types: Ints | None = None) -> Equipped:
-        """Return the V2X equipment of vehicles with these types [n, N], or the least that each vehicle may have."""
-        line, own = self.types_of_line, self.v2x.vehicles or {}
-        kinds = [None] if line is None else [kind.v2x for kind in line.kinds]
-        each = [[own.get(name, kind) or Equipage() for kind in kinds] for name in self.vehicle_names]  # [N, types]
-        sends = np.array([[one.sends for one in here] for here in each])
-        hears = np.array([[HEARS.index(one.hears) for one in here] for here in each])
-        if types is not None:
-            return Equipped(*(np.take_along_axis(every, types.T, axis=1).T for every in (sends, hears)))
-        possible = np.ones(sends.shape, bool) if line is None else line.possible
-        return Equipped((sends | ~possible).all(axis=1)[np.newaxis], (hears * possible).max(axis=1)[np.newaxis])
+    def unheard(self, types: Ints | None = None) -> Bools:
+        """Return whether i never gets a message of j, [n, N, N], by the equipment of vehicles of these types [n, N].
+
+        Without types: [1, N, N], whether i may never get a message of j.
+        """
+        if self.types_of_line is None:
+            return np.zeros((1, self.vehicles, self.vehicles), np.bool_)
+        return self.types_of_line.unheard(types)
 
     # ---- its quantities
 
@@ -256,54 +273,31 @@ class Scenario(Part):
         """The vehicle types at each place of the line; None without types."""
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
-    @cached_property
-    def columns(self) -> dict[Entry, TableColumn]:
-        """Columns of the table: ``{("gaps_m", 0): column}``; empty without a table."""
-        known = table_columns((*USUAL, *OPTIONAL), self.vehicles)
-        values = {} if self.table is None else self.table.column_values()
-        return {known[name]: column for name, column in values.items() if name != RECORDING}
+    @property
+    def columns(self) -> dict[str, TableColumn]:
+        """Columns of the table by name, ``recording`` among them; empty without a table."""
+        return {} if self.table is None else self.table.by_name
 
     @cached_property
-    def recordings(self) -> TableColumn | None:
-        """Column of the table that names each row's recording; None without it."""
-        return None if self.table is None else self.table.column_values().get(RECORDING)
+    def sources(self) -> dict[str, list[dict[int, Any]]]:
+        """Where the values of each declared quantity come from, for each vehicle, pair or world.
 
-    @cached_property
-    def _possible(self) -> dict[str, tuple[dict[int, Any], ...]]:
-        """For each quantity what ``declarations`` returns; None where nobody declares it."""
-        possible = {}
+        ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``: vehicle type (0 without types) -> number, distribution
+        or column of the table. A quantity that nobody declares has no entry.
+        """
+        sources = {}
         for key, rule in RULES.items():
             own, line, entries = getattr(self, key), self.types_of_line if key in OF_A_TYPE else None, []
             for i, outside in enumerate(own if isinstance(own, tuple) else (own,) * rule.count(self.vehicles)):
-                here = {0: self.columns.get((key, i), outside)}
-                if line is not None and (key, i) not in self.columns:
+                column = self.columns.get(rule.column_of(i))
+                here = {0: outside if column is None else column}
+                if line is not None and column is None:
                     kinds = {kind: getattr(line.kinds[kind], key) for kind in np.flatnonzero(line.possible[i]).tolist()}
                     here = {kind: outside if inside is None else inside for kind, inside in kinds.items()}
                 entries.append(here)
-            possible[key] = tuple(entries)
-        return possible
-
-    def declares(self, key: str) -> bool:
-        """Return whether the scenario declares a quantity, by its key, in a vehicle type, or by a whole table."""
-        return all(quantity is not None for entry in self._possible[key] for quantity in entry.values())
-
-    def declarations(self, key: str) -> tuple[dict[int, Any], ...]:
-        """Return for each vehicle, pair or world: vehicle type (0 without types) -> number, distribution or column.
-
-        ``declarations("mass_t")`` may be ``({0: 2.0, 1: 9.5}, ...)``. Raises ``InvalidInput`` for a mixture, and for
-        a quantity that is not declared.
-        """
-        if self.members:
-            raise InvalidInput(
-                f"scenario {self.name!r}: is a mixture of scenarios, each of which declares its own {key}; read"
-                f" {key} from a scenario in Scenario.members"
-            )
-        if not self.declares(key):
-            raise InvalidInput(
-                f"scenario {self.name!r}: does not declare {key}; if {key} follows from other quantities,"
-                " Scenario.bounds gives its range"
-            )
-        return self._possible[key]
+            if all(quantity is not None for here in entries for quantity in here.values()):
+                sources[key] = entries
+        return sources
 
     def bounds(self, key: str) -> tuple[tuple[float, float], ...]:
         """Return smallest and largest value of a quantity that every world has, for each vehicle, pair or world.
@@ -317,7 +311,7 @@ class Scenario(Part):
 
     def ends(self, key: str) -> Floats:
         """Return smallest and largest value of a declared quantity, [2, entries]."""
-        supports = [np.array([support(quantity) for quantity in entry.values()]) for entry in self.declarations(key)]
+        supports = [np.array([support(quantity) for quantity in entry.values()]) for entry in self.sources[key]]
         return np.array([(ends[:, 0].min(), ends[:, 1].max()) for ends in supports]).T
 
     # ---- its content, and scenarios like it
@@ -328,10 +322,8 @@ class Scenario(Part):
 
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
         """Return every value, defaults too, as plain data, except the keys ``without``; of members without words."""
-        content = self.model_dump(mode="json", exclude=set(without))
-        for entry, member in zip(content.get("mixture", ()), self.members, strict=False):
-            entry["scenario"] = member.content(WORDS)
-        return content
+        without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*WORDS}}}}
+        return self.model_dump(mode="json", exclude=without_words | dict.fromkeys(without, True))
 
     def replace(self, **changes: Any) -> Scenario:
         """Return the scenario with other values: ``replace(mass_t=2.0)``, in each member if it is a mixture.
@@ -344,31 +336,12 @@ class Scenario(Part):
     def with_learners(self, learners: Iterable[str]) -> Scenario:
         """Return the scenario with exactly these learners, such as ``["vehicle_2"]``.
 
-        A learner that is not listed brakes fully. Raises ``InvalidInput`` for an unknown vehicle, or one listed twice.
+        A learner that is not listed brakes fully. Raises ``InvalidInput`` for an unknown vehicle.
         """
         if isinstance(learners, str) or not isinstance(learners, Iterable):
             raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
-        chosen = list(learners)
-        if unknown := [name for name in chosen if name not in self.vehicle_names]:
-            raise unknown_name("vehicle", unknown[0], self.vehicle_names)
-        if twice := {name for name in chosen if chosen.count(name) > 1}:
-            raise InvalidInput(f"learners: {', '.join(sorted(twice))} is listed twice")
         stay = {name: "full_brake" if role == LEARNER else role for name, role in self.roles.items()}
-        return self.replace(roles={**stay, **dict.fromkeys(chosen, LEARNER)})
-
-
-def _build(scenario: Scenario, document: Document) -> None:
-    """Check the content of a document, and set the fields of a new, empty scenario."""
-    if not isinstance(document.content, dict):
-        raise InvalidInput(f"{document.file}: must be a mapping of keys to values, for instance name: my-scenario")
-    members: tuple[Scenario, ...] = ()
-    if "mixture" in document.content:
-        document, members = build_members(document, tuple(Scenario.model_fields), Scenario.from_document)
-    try:
-        BaseModel.__init__(scenario, **document.content)
-    except ValidationError as error:
-        raise explain(document, error, ScenarioWording(Scenario)) from None
-    scenario._members = members
+        return self.replace(roles={**stay, **dict.fromkeys(learners, LEARNER)})
 
 
 def plain(value: Any) -> Any:

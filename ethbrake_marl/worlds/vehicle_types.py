@@ -16,12 +16,10 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, 
 from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, require, suggestion
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import Equipage
-from ethbrake_marl.worlds.quantity import ONE_OR_EACH, Pair, Part, Quantity, Uniform, pick, support, values
+from ethbrake_marl.worlds.quantity import ONE_OR_EACH, Pair, Part, Quantity, Uniform, Weight, pick, support, values
 from ethbrake_marl.worlds.rules import OF_A_TYPE, RULES, USUAL, check_count
 
 ANY = "any"  # every type, in proportion to its weight
-
-Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 
 
 class WithLoad(Part):
@@ -105,17 +103,15 @@ Types = Annotated[
 
 def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: int) -> None:
     """Raise, in a pydantic validator, the error for an entry of the key ``types`` that names no declared type."""
-    require(
-        kinds is not None, ("types",), types, "can be used only with the key vehicle_types, which declares the types"
-    )
+    right = "can be used only with the key vehicle_types, which declares the types"
+    require(kinds is not None, ("types",), types, right)
     check_count(types, vehicles, "vehicle", ("types",))
-    known = [*(kinds or {}), ANY]
-    for index, entry in enumerate(types if isinstance(types, tuple) else (types,)):
+    known, listed = [*(kinds or {}), ANY], isinstance(types, tuple)
+    for index, entry in enumerate(types if listed else (types,)):
         for name in [entry] if isinstance(entry, str) else entry:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
-            at = ("types", index) if isinstance(types, tuple) else ("types",)
             good = name in known and (name != ANY or isinstance(entry, str))
-            require(good, at, entry, f"unknown vehicle type {name}; {hint}")
+            require(good, ("types", index) if listed else ("types",), entry, f"unknown vehicle type {name}; {hint}")
 
 
 class TypesOfLine:
@@ -123,8 +119,10 @@ class TypesOfLine:
 
     def __init__(self, kinds: Mapping[str, VehicleType], types: Any, vehicles: int) -> None:
         self.names, self.kinds = tuple(kinds), tuple(kinds.values())
-        each = types if isinstance(types, tuple) else (types or ANY,) * vehicles
-        self.weights = np.array([[_weight(kinds, name, here) for name in kinds] for here in each])  # [N, types]
+        every = {name: kind.weight for name, kind in kinds.items()}
+        places = types if isinstance(types, tuple) else (types or ANY,) * vehicles
+        each = [every if here == ANY else {here: 1.0} if isinstance(here, str) else here for here in places]
+        self.weights = np.array([[here.get(name, 0.0) for name in kinds] for here in each])  # [N, types]
         self.possible: Bools = self.weights > 0.0  # [N, types]
 
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
@@ -137,8 +135,15 @@ class TypesOfLine:
                 load[rows, i] = values(self.kinds[kind].load, u[rows, i, 1])
         return types, load
 
-
-def _weight(kinds: Mapping[str, VehicleType], name: str, here: Any) -> float:
-    if isinstance(here, str):
-        return kinds[name].weight if here == ANY else float(here == name)
-    return float(here.get(name, 0.0))
+    def unheard(self, types: Ints | None) -> Bools:
+        """Return ``Scenario.unheard``."""
+        each = [kind.v2x or Equipage() for kind in self.kinds]
+        silent = np.array([not one.sends for one in each])
+        hears = np.array([("all", "front", "none").index(one.hears) for one in each])
+        if types is None:  # of the types that are possible at each place the one with the least equipment
+            silent, hears = (np.max(one * self.possible, axis=1)[np.newaxis] for one in (silent, hears))
+        else:
+            silent, hears = silent[types], hears[types]
+        receiver, sender = np.indices((len(self.weights),) * 2)
+        deaf = (hears == 2)[:, :, np.newaxis] | (hears == 1)[:, :, np.newaxis] & (sender >= receiver)
+        return np.asarray(silent[:, np.newaxis] | deaf)

@@ -48,7 +48,7 @@ def test_scenario_command__is_refused(line: str, message: str, refuse: Refuse) -
 
 EVALUATIONS = [
     ("evaluate --set harm_count=both", "harm_count = 'both': must be 'first' or 'total'"),
-    ("evaluate --episodes 100000000000000", "number of worlds = 100000000000000: must be at most 10,000,000"),
+    ("evaluate --episodes 100000000000000", "number of worlds = 100000000000000: must be a whole number in 1.."),
     ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command uses no recipe; remove this setting"),
     ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; list each agent once"),
     (

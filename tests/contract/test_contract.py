@@ -12,6 +12,7 @@ import pytest
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.stream import UnknownResetOption
 from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.contract.interfaces import (
     BARE,
@@ -289,7 +290,7 @@ DRAWN = load_scenario(
 
 def drawn(seed: int, world: int) -> dict[str, Any]:
     """World ``world`` as its scenario describes it."""
-    columns = DRAWN.describe(1, seed, first=world, channel="training")
+    columns = columns_of(DRAWN.draw(1, seed, first=world, channel="training"))
     assert "scenario" in columns
     return {"world_seed": seed} | {name: column[0].item() for name, column in columns.items()}
 

@@ -190,7 +190,7 @@ def test_preset__is_drawn_like_the_mapping_that_it_stands_for(tmp_path: Path) ->
     (tmp_path / "rural.yaml").write_text(yaml.safe_dump({**rural.declared(), "name": "rural"}))
     assert eb.load_scenario(tmp_path / "rural.yaml").v2x == rural.v2x
     clear = rural.replace(v2x={"preset": "rural", "lost": 0.0})
-    assert (clear.v2x.channel.lost, clear.v2x.channel.link_latency_s) == (0.0, rural.v2x.channel.link_latency_s)
+    assert (clear.v2x.lost, clear.v2x.link_latency_s) == (0.0, rural.v2x.link_latency_s)
 
 
 @pytest.mark.usefixtures("mine")

@@ -58,8 +58,6 @@ def test_table__may_be_a_data_frame() -> None:
     other = {**COLUMNS, "gap_1_m": frame["gap_1_m"], "gap_2_m": frame["gap_2_m"].sort_index()}
     with refused("initial states: columns have different pandas indexes; give them the same"):
         worlds_from_table(PAPER, other)
-    with refused("initial states = 3: must be a mapping from columns to lists of numbers, a data frame or a"):
-        worlds_from_table(PAPER, 3)
 
 
 def test_file__may_hold_any_quantity_in_any_order(empty_folder: Path) -> None:
@@ -70,9 +68,3 @@ def test_file__may_hold_any_quantity_in_any_order(empty_folder: Path) -> None:
     assert worlds.mass_t.tolist() == [[4.5, 5.5, 6.0]]
     assert worlds.speeds_mps.tolist() == [[20.0, 18.0, 20.0]]
     assert [*given_columns(PAPER)][:6] == [*HEADER.split(","), "braking_capacity_1_mps2"]
-
-
-def test_weights__of_a_world_are_not_all_0() -> None:
-    weighted = line(harm_weight=[1, 4, 1])
-    with refused("initial_state: harm_weight[0] = 0: the weight of at least one vehicle must be 1e-06 or more"):
-        worlds_from_state(weighted, {"harm_weight": 0})

@@ -19,7 +19,8 @@ from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.worlds import catalogue, explain
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
 from ethbrake_marl.worlds.counters import numbers_of
-from ethbrake_marl.worlds.describe import clusters_of, columns_of, kinds_of
+from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
+from ethbrake_marl.worlds.game import Pool, views_of
 from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
@@ -49,18 +50,12 @@ def bits(state: Any) -> list[bytes]:
 )
 def test_world_k__is_the_same_alone_and_in_any_batch(name: str) -> None:
     scenario = load_scenario(name)
-    batch = scenario.sample(40, 3, first=10)
-    assert batch.clock[:, NUMBER].tolist() == list(range(10, 50))
+    batch = scenario.sample(40, 3, first=10**15)
+    assert batch.clock[:, NUMBER].tolist() == list(range(10**15, 10**15 + 40))
     for k in (0, 17, 39):
-        assert bits(scenario.sample(1, 3, first=10 + k)) == bits(batch.take([k]))
-    assert bits(scenario.sample(40, 3, first=10, channel="training")) != bits(batch)
-
-
-def test_list__is_endless_and_takes_any_whole_seed() -> None:
-    far = PAPER.sample(3, 0, first=10**15)
-    assert bits(PAPER.sample(1, 0, first=10**15 + 2)) == bits(far.take([2]))
-    assert bits(PAPER.sample(2, np.uint64(5))) == bits(PAPER.sample(np.int64(2), 5))
-    assert PAPER.sample(1, 2**200).n == 1
+        assert bits(scenario.sample(np.int64(1), np.uint64(3), first=10**15 + k)) == bits(batch.take([k]))
+    others = [scenario.sample(40, 3, first=10**15, channel="training"), scenario.sample(40, 2**200, first=10**15)]
+    assert bits(batch) not in [bits(other) for other in others]
 
 
 def test_rejected_draws__are_counted_and_drawn_again() -> None:
@@ -73,10 +68,8 @@ def test_rejected_draws__are_counted_and_drawn_again() -> None:
         pending = pending[numbers_of(7, "list", attempt, pending)(16, ())[:, 0] < 0.5] if len(pending) else pending
         rejected += len(pending)
     assert drawn.rejected == rejected > 100
-    kept = close.draw(200, 7)
-    assert (kept.rejected, set(kept.worlds.gaps_m.ravel())) == (0, {2.0, 4.0})
-    same = kept.worlds.gaps_m[:, 0] == 4.0
-    assert bits(kept.worlds.take(same)) == bits(drawn.worlds.take(same))
+    kept = close.sample(200, 7).take(close.sample(200, 7).gaps_m[:, 0] == 4.0)
+    assert bits(kept) == bits(drawn.worlds.take(kept.clock[:, NUMBER].astype(int)))
 
 
 @pytest.mark.parametrize(
@@ -100,43 +93,48 @@ def test_early_impact__follows_from_the_roles(gap_m: float, roles: dict[str, str
         assert pair.draw(1, 0).rejected == 0
 
 
-def test_roles__are_the_first_commands() -> None:
-    roles = {"vehicle_1": "constant:2", "vehicle_2": "learner", "vehicle_3": "my_agent:x"}
-    assert line(roles=roles).sample(1, 7).wanted.tolist() == [[0.0, -2.0, 0.0, 0.0]]
-    assert line(roles={"vehicle_1": "coast"}).sample(1, 7).wanted.tolist() == [[0.0, 0.0, -7.0, -6.0]]
-    assert line(roles=roles).roles["vehicle_3"] == "my_agent:x"
-
-
 # ---------------------------------------------------------------- quantities that follow from others
+
+ROLES = {"vehicle_1": "constant:2", "vehicle_2": "learner", "vehicle_3": "my_agent:x"}
 
 
 @pytest.mark.parametrize(
-    ("given", "gaps", "speeds"),
+    ("given", "expected"),
     [
-        ({"time_gaps_s": [0.5, 2], "speeds_mps": [30, 20, 10]}, [10.0, 20.0], [30.0, 20.0, 10.0]),
-        ({"line_speed_mps": 20, "speed_deviations_mps": [1, -2, 0.5]}, [7.0, 7.0], [21.0, 18.0, 20.5]),
+        ({"time_gaps_s": [0.5, 2], "speeds_mps": [30, 20, 10]}, {"gaps_m": [10, 20], "speeds_mps": [30, 20, 10]}),
+        (
+            {"line_speed_mps": 20, "speed_deviations_mps": [1, -2, 0.5]},
+            {"gaps_m": [7, 7], "speeds_mps": [21, 18, 20.5]},
+        ),
         (
             {"time_gaps_s": 0.5, "line_speed_mps": 20, "speed_deviations_mps": [0, -2, 2]},
-            [9.0, 11.0],
-            [20.0, 18.0, 22.0],
+            {"gaps_m": [9, 11], "speeds_mps": [20, 18, 22]},
         ),
+        ({"friction": 0.5}, {"braking_capacity_mps2": [0.5 * 9.81] * 3, "driving_capacity_mps2": [0.5 * 9.81] * 3}),
+        ({"friction": 2}, {"braking_capacity_mps2": [6, 7, 6], "obstacle_gap_m": np.inf}),
+        ({"alert_s": 1.5}, {"latency_s": [1.5, 2, 2.3]}),
+        ({"obstacle_gap_m": 42}, {"obstacle_gap_m": 42}),
+        # 20 x 0.5 + 20^2 / (2 x 5) + 1.5, and with brakes of 4 m/s2
+        ({"obstacle_margin_m": 1.5, "braking_capacity_mps2": 5, "latency_s": 0.5}, {"obstacle_gap_m": 51.5}),
+        (
+            {"obstacle_margin_m": 1.5, "braking_capacity_mps2": 5, "latency_s": 0.5, "friction": 4 / 9.81},
+            {"obstacle_gap_m": 61.5},
+        ),
+        # brakes build up for 0.5 s: 10 + (10 - 10 x 0.5^3 / 6) + 18.75^2 / (2 x 5) + 1.5
+        (
+            {"obstacle_margin_m": 1.5, "braking_capacity_mps2": 5, "latency_s": 0.5, "brake_rate_mps3": 10},
+            {"obstacle_gap_m": 56.447916666666664},
+        ),
+        ({"roles": ROLES}, {"wanted": [0, -2, 0, 0]}),
+        ({"roles": {"vehicle_1": "coast"}}, {"wanted": [0, 0, -7, -6]}),
     ],
 )
-def test_time_gaps_and_deviations__by_hand(given: dict[str, Any], gaps: list[float], speeds: list[float]) -> None:
-    worlds = line().replace(**given).sample(1, 7)
-    assert (worlds.gaps_m[0].tolist(), worlds.speeds_mps[0].tolist()) == (gaps, speeds)
-
-
-def test_friction_margin_and_alert__by_hand() -> None:
-    wet = line(friction=0.5).sample(1, 7)
-    assert wet.braking_capacity_mps2[0].tolist() == [0.5 * 9.81] * 3
-    assert line(friction=2).sample(1, 7).braking_capacity_mps2[0].tolist() == [6.0, 7.0, 6.0]
-    margin = line(obstacle_margin_m=1.5, braking_capacity_mps2=5, latency_s=0.5)
-    assert margin.sample(1, 7).obstacle_gap_m.tolist() == [51.5]  # 20 x 0.5 + 20^2 / (2 x 5) + 1.5
-    assert margin.replace(friction=4 / 9.81).sample(1, 7).obstacle_gap_m.tolist() == pytest.approx([61.5])
-    assert line(alert_s=1.5).sample(1, 7).latency_s[0].tolist() == [1.5, 2.0, 2.3]
-    assert line().sample(1, 7).obstacle_gap_m.tolist() == [np.inf]
-    assert [each.has_obstacle for each in (margin, line(obstacle_gap_m=42), line())] == [True, True, False]
+def test_world__by_hand(given: dict[str, Any], expected: dict[str, Any]) -> None:
+    scenario = line().replace(**given)
+    worlds = scenario.sample(1, 7)
+    for name, value in expected.items():
+        assert getattr(worlds, name)[0].tolist() == pytest.approx(value), name
+    assert scenario.has_obstacle == np.isfinite(worlds.obstacle_gap_m[0])
 
 
 def test_bounds__hold_for_every_draw() -> None:
@@ -157,67 +155,35 @@ def test_bounds__hold_for_every_draw() -> None:
 
 
 def test_types_and_loads__are_drawn_first() -> None:
-    kinds = {"car": {"weight": 3, "mass_t": 1.5}, "truck": {"mass_t": {"with_load": [14, 40]}}}
-    content = {key: value for key, value in LINE.items() if key != "mass_t"}
-    drawn = Scenario(**content, vehicle_types=kinds).draw(300, 7)
+    kinds = {"car": {"weight": 3}, "truck": {"mass_t": {"with_load": [14, 40]}}}
+    drawn = line(mass_t=1.5, vehicle_types=kinds).draw(300, 7)
     u = numbers_of(7, "list", 0, np.arange(300))(12, (3,)).reshape(300, 3, 4)
     assert (drawn.types == np.where(u[..., 0] < 0.75, "car", "truck")).all()
     assert (drawn.worlds.mass_t == np.where(u[..., 0] < 0.75, 1.5, 14 + 26 * u[..., 1])).all()
 
 
-TABLE = {
-    "columns": ["gap_1_m", "speed_2_mps", "recording"],
-    "rows": [[5, 11, "a: 1"], [6, 12, "a: 2"], [7, 13, "b: 1"]],
-}
-
-
 def test_table__gives_whole_rows() -> None:
-    scenario = line(table={**TABLE, "weights": [1, 2, 1]})
+    rows = [[5, 11, "a: 1"], [6, 12, "a: 2"], [7, 13, "b: 1"]]
+    scenario = line(table={"columns": ["gap_1_m", "speed_2_mps", "recording"], "rows": rows})
     drawn = scenario.draw(400, 7)
-    u = numbers_of(7, "list", 0, np.arange(400))(4, (6,))[:, 1]
-    row = np.where(u < 0.25, 0, np.where(u < 0.75, 1, 2))
-    assert drawn.worlds.gaps_m[:, 0].tolist() == (5.0 + row).tolist()
-    assert drawn.worlds.speeds_mps[:, 1].tolist() == (11.0 + row).tolist()
-    assert drawn.worlds.gaps_m[:, 1].tolist() == [7.0] * 400
-    assert sorted(set(clusters_of(columns_of(drawn)))) == ["a", "b"]
+    row = np.floor(3 * numbers_of(7, "list", 0, np.arange(400))(4, (6,))[:, 1])
+    assert drawn.worlds.gaps_m.tolist() == np.stack([5 + row, np.full(400, 7)], axis=1).tolist()
+    assert drawn.worlds.speeds_mps[:, 1].tolist() == (11 + row).tolist()
+    assert clusters_of(columns_of(drawn)).tolist() == np.where(row < 2, "a", "b").tolist()
     assert scenario.bounds("gaps_m") == ((5.0, 7.0), (7.0, 7.0))
-
-
-TABLES = {
-    "table.columns = gap_9_m: unknown column; did you mean": {"columns": ["gap_9_m"], "rows": [[1]]},
-    "table.rows[0][0] = -1: gap_1_m must be finite and in [0, 10000] m": {"columns": ["gap_1_m"], "rows": [[-1]]},
-    "table.rows[1]: has 2 values; must have one for each of the 1 columns": {
-        "columns": ["gap_1_m"], "rows": [[1], [1, 2]],
-    },
-    "table.weights: must be 2 numbers, one per row": {"columns": ["gap_1_m"], "rows": [[1], [2]], "weights": [1]},
-    "table.columns = [gap_1_m, gap_1_m]: must not list a column twice": {"columns": ["gap_1_m"] * 2, "rows": [[1, 2]]},
-    "table.rows: must be given as lists here": {"columns": ["gap_1_m"], "file": "x.csv"},
-    "gaps_m = 7: must be left out, because the table has columns of it for all": {
-        "columns": ["gap_1_m", "gap_2_m"], "rows": [[1, 2]],
-    },
-    "must also have a column of numbers": {"columns": ["recording"], "rows": [["a"]]},
-    "table.rows[0][1] = 2: recording must be a printable text, such as drive_1.csv: 2-3-4": {
-        "columns": ["gap_1_m", "recording"], "rows": [[1, 2]],
-    },
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("message", TABLES)
-def test_table__is_refused(message: str) -> None:
-    with refused(message):
-        line(table=TABLES[message])
 
 
 def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> None:
     mixture = load_scenario("mixture-trucks")
     drawn = mixture.draw(60, 7)
-    for k, member in enumerate(mixture.members):
-        rows = np.flatnonzero(drawn.scenarios == member.name)
-        assert len(rows), k
+    parts = [drawn.scenarios == member.name for member in mixture.members]
+    assert np.sum(parts, axis=0).tolist() == [1] * 60
+    for member, rows in zip(mixture.members, parts, strict=True):
         assert bits(member.sample(60, 7).take(rows)) == bits(drawn.worlds.take(rows))
     delays = load_scenario("mixture-delays")
     heavy = delays.replace(mass_t=[40, 1, 1])
     assert np.unique(heavy.sample(20, 7).mass_t[:, 0]).tolist() == [40.0]
+    assert {"title", "source"}.isdisjoint(delays.content()["mixture"][0]["scenario"])
     assert heavy.sample(20, 7).gaps_m.tolist() == delays.sample(20, 7).gaps_m.tolist()
     assert [each.learners for each in delays.with_learners(["vehicle_3"]).members] == [(3,)] * 3
     Path("own.yaml").write_text(json.dumps(PAPER.replace(name="own", title="").declared()))
@@ -268,16 +234,29 @@ def test_new_way_to_declare__takes_the_place_of_the_old_one() -> None:
     assert margin.obstacle_margin_m is None
 
 
-def test_describe__has_a_column_for_all_that_was_drawn() -> None:
-    columns = load_scenario("engineering-loaded-lorries").describe(3, 7, first=5)
-    assert [*columns][:5] == ["world", "vehicle_1_type", "vehicle_2_type", "vehicle_3_type", "gap_1_m"]
-    assert [*load_scenario("mixture-delays").describe(1, 7)][:3] == ["world", "scenario", "gap_1_m"]
-    assert columns["world"].tolist() == [5, 6, 7]
-    assert PAPER.describe(2, 7)["gap_1_m"].round(2).tolist() == [6.62, 5.33]
-    assert "obstacle_gap_m" not in PAPER.describe(2, 7)
-    wet = line(friction={"uniform": [0.2, 0.4]}).describe(2, 7)
-    assert (wet["braking_capacity_1_mps2"] == wet["friction"] * 9.81).all()
-    assert kinds_of(PAPER.draw(2, 7)) == {}
+def test_columns__are_all_that_was_drawn() -> None:
+    wet = line(friction={"uniform": [0.2, 0.4]})
+    of_mixture, of_types, of_wet = (
+        columns_of(scenario.draw(3, 7, first=5))
+        for scenario in (load_scenario("mixture-delays"), load_scenario("engineering-loaded-lorries"), wet)
+    )
+    assert [*of_mixture][:3] == ["world", "scenario", "gap_1_m"]
+    assert [*of_types][:5] == ["world", "vehicle_1_type", "vehicle_2_type", "vehicle_3_type", "gap_1_m"]
+    assert of_types["world"].tolist() == [5, 6, 7]
+    some = load_scenario("mixture-universal").draw(30, 7)
+    assert set(columns_of(some)["obstacle_gap_m"][some.worlds.obstacle_gap_m == np.inf].astype(str)) == {"nan"}
+    assert (of_wet["braking_capacity_1_mps2"] == of_wet["friction"] * 9.81).all()
+    fixed = {f"{name}_{i}_{unit}" for name, unit in (("mass", "t"), ("latency", "s")) for i in (1, 2, 3)}
+    assert fixed_columns(wet) == fixed | {f"speed_limit_{i}_mps" for i in (1, 2, 3)} | {"restitution"}
+    assert fixed_columns(wet) < {*of_wet}
+
+
+def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
+    pool = Pool(PAPER)
+    for seed, first in ((0, 0), (0, 500), (1, 500), (1, 5000), (1, 10)):
+        assert bits(pool(3, seed, first)) == bits(PAPER.sample(3, seed, first=first, channel="training"))
+    assert not any(name.startswith("obstacle") for name in views_of(line())[0].names)
+    assert any(name.startswith("obstacle") for name in views_of(line(obstacle_gap_m=42))[0].names)
 
 
 def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,6 +269,12 @@ def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: 
     monkeypatch.setenv("USERPROFILE", str(empty_folder))
     for path in ("mine.yaml", "mine", "./mine", "~/mine.yaml", "~/mine", empty_folder / "mine.yaml"):
         assert load_scenario(path).name == "mine"
+    Path("paper-random.yaml").touch()
+    assert load_scenario("paper-random") == PAPER
+    Path("paper-random.yaml").unlink()
+    Path("mine.yaml").rename("mine.yml")
+    assert load_scenario("mine").name == "mine"
+    Path("mine.yml").rename("mine.yaml")
     monkeypatch.setattr(catalogue, "FOLDERS", {})
     catalogue.register_scenarios("~")
     catalogue.register_scenarios("~")
@@ -302,13 +287,6 @@ def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: 
         catalogue.register_scenarios("sub")
 
 
-def test_keys__have_ranges_and_defaults() -> None:
-    keys = {key.name: key for key in explain.listed_keys()}
-    assert keys["mass_t"][1:] == ("", "finite and in (0, 1000] t (tonnes)", "mass of each vehicle")
-    assert keys["horizon_s"].default == "8"
-    assert keys["early_impacts"].default == "keep"
-
-
 def test_sentences__say_what_each_key_means() -> None:
     said = [*explain.sentences(line(v2x="congested", roles={"vehicle_3": "coast", "vehicle_2": "learner"}))]
     assert said[1] == "3 vehicles in line, vehicle_1 in front, no obstacle ahead. Learners: vehicle_2."
@@ -318,6 +296,8 @@ def test_sentences__say_what_each_key_means() -> None:
     mixed = [*explain.sentences(load_scenario("mixture-delays"))]
     assert any(each.startswith("mixture: {") for each in mixed)
     assert not any(each.startswith("mass_t: ") for each in mixed)
+    key = next(key for key in explain.listed_keys() if key.name == "time_gaps_s")
+    assert key.comment.endswith("; finite and in (0, 60] s (seconds); give either this key or gaps_m")
 
 
 def test_json_schema__accepts_what_the_reader_accepts() -> None:

@@ -103,9 +103,9 @@ class Lines(NamedTuple):
         for other, (name, role) in enumerate(scenario.roles.items(), 1):
             if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
                 raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
-        N, channel, of = scenario.vehicles, scenario.v2x.channel, scenario.equipped()
+        N, channel, of = scenario.vehicles, scenario.v2x, scenario.unheard()
         median = draw_once(scenario, lambda width, stream: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
-        late = np.array([channel.latest_reaction_s([0.0] * N, of)])
+        late = channel.latest_reaction_s(np.zeros((1, N)), of)
         usual = channel.news(np.zeros((1, N)), np.full((1, PER_LINK * N * N), 0.5), of)[0] if late.any() else late
         sides = [("gaps_m", p, *ends) for p, ends in enumerate(scenario.bounds("gaps_m"), 1)]
         sides += [(key, j, *ends) for key in RANGES for j, ends in enumerate(scenario.bounds(key), 1) if j != body]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.messages.game import GameWithMessages
 from ethbrake_marl.extensions.messages.links import (
     CHANNEL_COLUMNS,
@@ -24,7 +23,7 @@ from ethbrake_marl.extensions.messages.links import (
 )
 from ethbrake_marl.files.model import UNSHOWN, require, suggestion
 from ethbrake_marl.motion.layout import Bools, Floats
-from ethbrake_marl.worlds.channel import PER_LINK, V2X, Equipped
+from ethbrake_marl.worlds.channel import PER_LINK, V2X
 from ethbrake_marl.worlds.counters import Numbers
 from ethbrake_marl.worlds.rules import NEWS, OF_WORLD
 from ethbrake_marl.worlds.scenario import Scenario
@@ -39,7 +38,6 @@ class Messages:
     """The extension that the keys declare."""
 
     name = "messages"
-    keys = ("persistence", "tells")
     schemas: Mapping[str, dict[str, Any]] = {
         "persistence": {
             "description": "what a receiver knows after the first message: first: always the present state of the"
@@ -74,27 +72,24 @@ class Messages:
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
         """Return the keys that later messages use; refuse keys that have no effect."""
-        channel, tells = v2x.channel, _value(v2x, "tells")
+        tells = _value(v2x, "tells")
         right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
-        sent = channel.hears != "none" and channel.timing != "latency"
+        sent = v2x.hears != "none" and v2x.timing != "latency"
         require(sent or not _is_periodic(v2x), ("persistence",), "periodic", right)
         right = "has no effect, because hears: none means that no vehicle gets messages; leave it out"
-        require(tells is None or channel.hears != "none", ("tells",), tells, right)
+        require(tells is None or v2x.hears != "none", ("tells",), tells, right)
         return ("message_period_s", "loss_begins", "loss_ends") if _is_periodic(v2x) else ()
 
     def is_random(self, v2x: V2X) -> bool:
         """Return whether messages after the first may be lost."""
-        return _is_periodic(v2x) and v2x.channel.loss_begins > 0.0
+        return _is_periodic(v2x) and v2x.loss_begins > 0.0
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse contents of unknown or silent vehicles, and a delay of too many time steps."""
+        """Refuse contents of unknown vehicles, and a delay of too many time steps."""
         v2x, tells = scenario.v2x, _value(scenario.v2x, "tells")
         for name in tells if isinstance(tells, Mapping) else ():
             right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
             require(name in scenario.vehicle_names, ("v2x", "tells", name), UNSHOWN, right)
-            equipage = (v2x.vehicles or {}).get(name)
-            right = f"has no effect, because {name} sends no messages (v2x.vehicles); leave it out"
-            require(equipage is None or equipage.sends, ("v2x", "tells", name), UNSHOWN, right)
         kept = _kept(scenario)
         right = (
             f"a message takes {kept - 3} time steps; at most {MOST_SAMPLES - 3} are possible, so shorten the delay of"
@@ -102,23 +97,14 @@ class Messages:
         )
         require(kept <= MOST_SAMPLES, ("v2x",), v2x, right)
 
-    def check_alike(self, where: str, first: Scenario, other: Scenario) -> None:
-        """Raise ``InvalidInput`` unless both scenarios keep as many samples."""
-        if _kept(first) != _kept(other):
-            raise InvalidInput(
-                f"{where}: v2x.persistence, and the delay of periodic messages, must be the same in all scenarios of"
-                f" the mixture, but {first.name} and {other.name} differ; to use one v2x for all, write it next to the"
-                " key mixture"
-            )
-
-    def at_alert(self, scenario: Scenario, numbers: Numbers, equipped: Equipped, n: int) -> Memory:
+    def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Memory:
         """Return the memory of n worlds at the alert."""
-        N, v2x, of = scenario.vehicles, scenario.v2x, scenario.v2x.channel
-        heard, seen = of.heard_and_seen(numbers(PER_LINK * N * N, NEWS), equipped)
+        N, v2x = scenario.vehicles, scenario.v2x
+        heard, seen = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
         channel: Floats = np.zeros((n, CHANNEL_COLUMNS))
         if _is_periodic(v2x):
-            channel[:, PERIOD], channel[:, DELAY] = of.message_period_s, _delay_s(v2x)
-            channel[:, LOSS_BEGINS], channel[:, LOSS_ENDS] = of.loss_begins, of.loss_ends
+            channel[:, PERIOD], channel[:, DELAY] = v2x.message_period_s, _delay_s(v2x)
+            channel[:, LOSS_BEGINS], channel[:, LOSS_ENDS] = v2x.loss_begins, v2x.loss_ends
             channel[:, KEY] = numbers(OF_WORLD, LATER_LOSSES)[:, 0] * 2.0**53
         return silent(_contents(scenario), heard, seen, channel, _kept(scenario))
 
@@ -136,9 +122,8 @@ def _is_periodic(v2x: V2X) -> bool:
 
 
 def _delay_s(v2x: V2X) -> float:
-    channel = v2x.channel
-    on_the_way = channel.radio_s + channel.processing_s + channel.actuation_s
-    return channel.link_latency_s if channel.timing == "fixed" else on_the_way
+    on_the_way = v2x.radio_s + v2x.processing_s + v2x.actuation_s
+    return on_the_way if v2x.link_latency_s is None else v2x.link_latency_s
 
 
 def _kept(scenario: Scenario) -> int:

@@ -126,8 +126,8 @@ def test_intent__of_who_waits_for_news_is_0() -> None:
     # Vehicle 2 hears Vehicle 3 from the alert on. Vehicle 3 hears nobody: it sees Vehicle 2 brake after 1 s, and has
     # chosen nothing before, though it brakes fully by its script, and its own latency is 0.
     v2x = {"link_latency_s": 0.0, "sensing_s": [1.0, 1.0], "senses": "both", "tells": [*PIECES]}
-    v2x["vehicles"] = {"vehicle_3": {"hears": "none"}}
-    game, state = played(v2x, SEEN, scenario=LINE.replace(latency_s=[0, 0, 0]))
+    types = {"vehicle_types": {"usual": {}, "deaf": {"v2x": {"hears": "none"}}}, "types": ["usual", "usual", "deaf"]}
+    game, state = played(v2x, SEEN, scenario=LINE.replace(latency_s=[0, 0, 0], v2x=v2x, **types))
     assert state.latency_s.tolist() == [[0.0, 0.0, 1.0]]
     intents = []
     for _ in range(11):

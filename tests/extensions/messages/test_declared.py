@@ -43,9 +43,6 @@ REFUSED = {
     "v2x.tells = [mass]: has no effect, because hears: none means that no": given(
         {"preset": "sensors-only", "tells": ["mass"]}
     ),
-    "v2x.tells.vehicle_3: has no effect, because vehicle_3 sends no messages": given(
-        {"preset": "nominal", "tells": {"vehicle_3": []}, "vehicles": {"vehicle_3": {"sends": False}}}
-    ),
     "v2x.loss_begins = 0.1: has no effect, because link_latency_s fixes the delay of messages": given(
         {"link_latency_s": 0.2, "loss_begins": 0.1, "senses": "none", "tells": ["mass"]}
     ),
@@ -55,14 +52,8 @@ REFUSED = {
     "a message takes 1020 time steps; at most 997 are possible, so shorten the delay": given(
         {**PERIODIC, "radio_s": 0.72}, time_step_s=0.001
     ),
-    "scenario m0 has the key v2x.persistence or v2x.tells, but scenario m1 does not; write one": mixed(
-        {"tells": ["mass"]}, "paper"
-    ),
-    "scenario m1 has the key v2x.persistence or v2x.tells, but scenario m0 does not; write one": mixed(
+    "mixture: v2x must be the same in all scenarios of the mixture, but m0 has {preset: nominal} and m1 has": mixed(
         "nominal", PERIODIC
-    ),
-    "v2x.persistence, and the delay of periodic messages, must be the same in all scenarios": mixed(
-        PERIODIC, {**PERIODIC, "radio_s": 0.3}
     ),
     "it is random what the vehicles learn about each other": lambda: worlds_from_state(
         LINE.replace(v2x={"link_latency_s": 0.2, "senses": "none", "loss_begins": 0.1, "persistence": "periodic"}), {}
@@ -106,16 +97,6 @@ def test_given_worlds__have_messages_if_no_message_can_be_lost() -> None:
     given_memory, drawn = (w.memories["messages"] for w in (worlds_from_state(sure, {}), sure.sample(1, 7)))
     for one, other, name in zip(given_memory, drawn, drawn._fields, strict=True):
         assert name == "channel" or one.tobytes() == other.tobytes()
-
-
-def test_mixture__has_the_contents_of_each_member() -> None:
-    scenario = mixed({"tells": ["mass"]}, {"tells": ["place"]}, {"tells": ["place"]})()
-    assert isinstance(scenario, Scenario)
-    drawn = scenario.draw(50, 7)
-    contents = drawn.worlds.memories["messages"].contents[:, 2]
-    assert drawn.scenarios is not None and len(set(drawn.scenarios)) == 3
-    for k, name in enumerate(drawn.scenarios):
-        assert contents[k].tolist() == [name != "m0", False, False, False, False, name == "m0", False]
 
 
 def test_worlds__that_are_drawn_again_have_their_own_memory() -> None:
