@@ -18,7 +18,6 @@ from ethbrake_marl.agents.drive import MESSAGES, MODEL, SENSORS, STATE as TRUE_S
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
-from ethbrake_marl.evaluation.familiar import warn_unfamiliar
 from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
 from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, look, measured
 from ethbrake_marl.motion.digest import physics_digest
@@ -144,7 +143,6 @@ def evaluate(
         check_whole_number("jobs", jobs, 1)
     drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
     _check(drawn.worlds, agents, game)
-    warn_unfamiliar(agents, drawn.worlds)
     chosen = (*DEFAULT, *measures)
     alert, n, of_worlds = drawn.worlds, drawn.worlds.n, columns_of(drawn)
     for measure in chosen:

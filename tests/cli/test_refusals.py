@@ -154,7 +154,7 @@ def test_path_of_a_policy__that_is_too_long_is_refused(refuse: Refuse) -> None:
         (
             "import ethbrake_marl as eb\neb.make_agent('bad.py:make')\n",
             "--agents bad.py:make",
-            "file 'bad.py', line 2: file 'bad.py': loads itself",
+            "file 'bad.py', line 2: file 'bad.py': does not define 'make'",
         ),
         (
             "worst = 3\n",

@@ -258,8 +258,8 @@ def test_result__says_who_knows_what_and_what_was_evaluated() -> None:
     table = summarise(result)
     assert 0.0 < share < 1.0 and [row.sees_through for row in table] == [False, False, True]
     text = " ".join(str(table).split())
-    assert f"In {100 * share:.1f} % of these worlds the V2X channel hides something" in text
-    assert "† both: reads hidden values nevertheless" in text and "do not state what they know: careless." in text
+    assert f"† In {100 * share:.1f} % of these worlds the V2X channel hides something" in text
+    assert "both: reads hidden values nevertheless" in text
     assert not evaluated("paper-random", 12).worlds["hidden"].any()
 
 
