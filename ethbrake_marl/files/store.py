@@ -104,7 +104,10 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """
     if not replace:
         _refuse_existing(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise InvalidInput(f"{path}: {path.parent} is not a folder; give a new folder") from None
     partial = _temporary(path.parent)
     partial.mkdir()
     try:

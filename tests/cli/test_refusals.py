@@ -134,7 +134,7 @@ def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refus
     ("line", "message"),
     [
         ("evaluate --output file/x", "file/x"),
-        ("run --output file/x", "file: Not a directory"),
+        ("run --output file/x", "file/x: file is not a folder; give a new folder"),
         ("train --output . --force", ".: already exists and is not the folder of a run; choose another name"),
     ],
 )
