@@ -47,17 +47,26 @@ def run_each(calls: Iterable[Call], jobs: int | None = None, ray: str | None = N
 
     Raises the error that a call raised, or ``WorkerLost`` if a worker process of joblib is killed (Ray repeats the call
     instead). Raises ``MissingExtra`` if joblib or Ray is not installed, and ``InvalidInput`` if no cluster answers at
-    the address ``ray``.
+    the address ``ray``, or if a call cannot be pickled.
 
     """
     if ray is None and jobs in (None, 1):
         for function, *arguments in calls:
             yield function(*arguments)
         return
+    from cloudpickle import dumps
+
     with naming_extras():
         from joblib import Parallel, delayed, parallel_config
         from joblib.externals.loky.process_executor import BrokenProcessPool
-    work = (delayed(_answer)(pickle.dumps(call)) for call in calls)
+
+    def pickled(call: Call) -> bytes:
+        try:
+            return bytes(dumps(call))
+        except Exception as error:
+            raise InvalidInput(f"this cannot be sent to another process ({error}); use one process (jobs=1)") from error
+
+    work = (delayed(_answer)(pickled(call)) for call in calls)
     with _backend(ray, jobs) as (backend, at_once), _sigterm_as_ctrl_c():
         with parallel_config(**backend):
             parallel = Parallel(at_once, batch_size=1, return_as="generator" if ray is None else "list")

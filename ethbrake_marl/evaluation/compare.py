@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -25,34 +25,23 @@ SAME = {  # what two results must have in common -> what differs otherwise
     "time_step_s": "their time steps differ",
     "horizon_s": "their horizons differ",
 }
-NOTED = ("agent_settings", "versions")  # mappings whose differences are notes
-POLICIES = {"same": "the same", "other": "another", "none": ""}
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Mean harm of one team in the second result minus that in the first (m2/s2)."""
-
-    agent: str
-    policy: Literal["same", "other", "none"]  # whether its trained policies are the same in both; none in either
-    harms: Mapping[str, Estimate]  # count of harm -> difference
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Second result minus first, for every team that both have."""
 
-    differences: tuple[Difference, ...]
+    differences: Mapping[str, Mapping[str, Estimate]]  # team -> count of harm -> difference of the means (m2/s2)
     unpaired_because: str  # why worlds cannot be paired; "": intervals are paired
     recordings: int  # number of recordings; 0: all worlds are independent
     left_over: tuple[tuple[str, ...], tuple[str, ...]]  # teams of the first result only, and of the second
-    changed: Mapping[str, tuple[Any, Any]]  # setting, package or digest -> its values, where they differ
+    changed: Mapping[str, tuple[Any, Any]]  # setting, package, policy or digest -> its values, where they differ
 
     def sheet(self) -> Sheet:
         """Return the table, with the notes below it."""
-        rows = [(each.agent, POLICIES[each.policy], *each.harms.values()) for each in self.differences]
+        rows = [(agent, *harms.values()) for agent, harms in self.differences.items()]
         heads = [Column("First-impact harm", HARMS[0]), Column("Total harm", HARMS[1])]
-        return Sheet("", ["Agent", "Policy", *heads], rows, "\n".join(self.notes()))
+        return Sheet("", ["Agent", *heads], rows, "\n".join(self.notes()))
 
     def notes(self) -> Iterator[str]:
         """Yield what to say below the table."""
@@ -74,9 +63,8 @@ class Comparison:
             "unpaired_because": self.unpaired_because or None,
             "recordings": self.recordings,
             "agents": [
-                {"agent": each.agent, "policy": each.policy}
-                | Estimate.side_by_side({f"{name}_difference": harm for name, harm in each.harms.items()})
-                for each in self.differences
+                {"agent": agent} | Estimate.side_by_side({f"{name}_difference": each for name, each in harms.items()})
+                for agent, harms in self.differences.items()
             ],
             "only_in_first": list(self.left_over[0]),
             "only_in_second": list(self.left_over[1]),
@@ -105,27 +93,23 @@ def compare_results(first: Saved | Result, second: Saved | Result) -> Comparison
     because = one.no_rows_because or other.no_rows_because
     if because:
         because = f"both results need a file with one row per world; {because}"
-    before, after = _noted(one), _noted(other)
+    before, after = _noted(one, common), _noted(other, common)
     changed = {
         name: (before.get(name), after.get(name))
         for name in dict.fromkeys([*before, *after])
         if before.get(name) != after.get(name)
     }
-    differences = tuple(_difference(one, other, agent) for agent in common)
+    differences = {agent: _difference(one, other, agent) for agent in common}
     return Comparison(differences, because, int(_recorded(one, "recordings") or 0), (mine, theirs), changed)
 
 
-def _difference(one: Saved, other: Saved, agent: str) -> Difference:
+def _difference(one: Saved, other: Saved, agent: str) -> dict[str, Estimate]:
     if one.rows is not None and other.rows is not None:
         before, after = _of(one.rows, agent), _of(other.rows, agent)
         if not np.array_equal(before["world"], after["world"]):  # parts of results
             raise InvalidInput(f"{other.path} and {one.path} cannot be compared: they do not list the same worlds")
-        harms = {name: difference(after[name], before[name], clusters_of(before)) for name in HARMS}
-    else:
-        harms = {name: unpaired(other.estimate(agent, name), one.estimate(agent, name)) for name in HARMS}
-    policies = [each.agents[agent]["policy_sha256"] for each in (one, other)]
-    same: Literal["same", "other"] = "same" if policies[0] == policies[1] else "other"
-    return Difference(agent, same if any(policies) else "none", harms)
+        return {name: difference(after[name], before[name], clusters_of(before)) for name in HARMS}
+    return {name: unpaired(other.estimate(agent, name), one.estimate(agent, name)) for name in HARMS}
 
 
 def _of(rows: Columns, agent: str) -> Columns:
@@ -142,6 +126,9 @@ def _recorded(saved: Saved, key: str) -> Any:
     return saved.about.get(key, saved.about["parameters"].get(key))
 
 
-def _noted(saved: Saved) -> dict[str, Any]:
-    parts = [_recorded(saved, key) or {} for key in NOTED]
+def _noted(saved: Saved, agents: list[str]) -> dict[str, Any]:
+    parts = [_recorded(saved, key) or {} for key in ("agent_settings", "versions")]
+    for agent in agents:
+        policies = saved.agents[agent]["policy_sha256"]
+        parts.append({f"policy of {vehicle} in {agent}": sha256 for vehicle, sha256 in policies.items()})
     return {"physics_digest": saved.about["physics_digest"], **{k: v for part in parts for k, v in part.items()}}

@@ -67,7 +67,7 @@ def _run_file(path: Path, what: str) -> ModuleType:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> None:
-    """Run the content of a Python file as a new module, in ``sys.modules`` so that its classes can be pickled."""
+    """Run the content of a Python file as a new module, whose classes and functions other processes get by value."""
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     _RUN[path] = sys.modules[module.__name__] = module
@@ -78,3 +78,6 @@ def _run(content: bytes, path: Path, sha256: str, what: str) -> None:
     except (Exception, SystemExit) as error:
         del _RUN[path], sys.modules[module.__name__]
         raise InvalidInput(f"{what}, {describe_error(error, str(path))}") from error
+    from cloudpickle import register_pickle_by_value  # slow to import
+
+    register_pickle_by_value(module)

@@ -45,7 +45,7 @@ def test_result__comes_back_as_it_was(rows: str, tmp_path: Path) -> None:
     own = {name: {k: v for k, v in each.items() if k != "per_world"} for name, each in saved.agents.items()}
     assert own == {each["agent"]: each for each in table.to_json()}
     assert saved.estimate("foreteller", "predicted_harm") == table[1]["predicted_harm"]
-    assert compare_results(saved, result).differences[0].harms["total_harm"].interval == (0.0, 0.0)
+    assert compare_results(saved, result).differences["full_brake"]["total_harm"].interval == (0.0, 0.0)
 
 
 def test_rows__have_empty_cells_and_numbers_for_truths(tmp_path: Path) -> None:
@@ -122,8 +122,8 @@ def test_comparison__is_paired_by_world_where_both_have_rows(tmp_path: Path) -> 
     mine = {"full_brake": other["constant:4"], "constant:4": other["full_brake"]}
     other = replace(other, columns=mine)
     found = compare_results(*(read_result(written(tmp_path / name, each)) for name, each in (("1", one), ("2", other))))
-    (each,) = found.differences
-    assert each.harms["total_harm"] == difference(other["full_brake"]["total_harm"], one["full_brake"]["total_harm"])
+    (harms,) = found.differences.values()
+    assert harms["total_harm"] == difference(other["full_brake"]["total_harm"], one["full_brake"]["total_harm"])
     assert found.left_over == (("coast",), ("constant:4",)) and found.unpaired_because == ""
     assert found.to_json()["intervals"] == "paired" and json.dumps(found.to_json(), allow_nan=False)
     assert found == compare_results(one, other)
@@ -135,7 +135,7 @@ def test_comparison__is_by_recording(tmp_path: Path) -> None:
     one, other = (renamed(recorded(8), 100, agent) for agent in (FULL_BRAKE, GENTLE))
     found = compare_results(read_result(written(tmp_path / "one", one)), other)
     expected = difference(other["mine"]["total_harm"], one["mine"]["total_harm"], one.clusters)
-    assert found.recordings == 8 and found.differences[0].harms["total_harm"] == expected
+    assert found.recordings == 8 and found.differences["mine"]["total_harm"] == expected
     assert "95 % intervals by 8 recordings" in " ".join(found.notes())
 
 
@@ -146,7 +146,7 @@ def test_comparison__without_rows_uses_the_stored_errors(n: int, tmp_path: Path)
     found = compare_results(*saved)
     x, y = (each["mine"]["total_harm"] for each in (other, one))
     welch = stats.ttest_ind(x, y, equal_var=False).confidence_interval()
-    assert found.differences[0].harms["total_harm"].interval == pytest.approx((welch.low, welch.high), rel=1e-9)
+    assert found.differences["mine"]["total_harm"].interval == pytest.approx((welch.low, welch.high), rel=1e-9)
     assert "NOT paired by world" in next(found.notes()) and "evaluate again with --per-world" in found.unpaired_because
 
 
@@ -160,7 +160,7 @@ def test_comparison__notes_other_policies_settings_versions_and_physics() -> Non
     assert "Note: harm_count: None in the first result, total in the second." in notes
     assert any(note.startswith("Note: physics_digest: ") for note in notes)
     assert any(note.startswith("Note: numpy: ") and note.endswith("1.0 in the second.") for note in notes)
-    assert [each.policy for each in found.differences] == ["other", "none"] and "another" in found.sheet().markdown()
+    assert "Note: policy of vehicle_2 in full_brake: None in the first result, a in the second." in notes
 
 
 def changed(**settings: Any) -> Callable[[], Result]:

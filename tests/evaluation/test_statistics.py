@@ -133,14 +133,7 @@ def drawn(rng: np.random.Generator, groups: int, spread: float, few: bool) -> tu
 
 
 @pytest.mark.parametrize(
-    ("groups", "spread", "few", "least"),
-    [
-        (3, 1.2, False, 0.90),
-        (5, 1.2, False, 0.92),
-        (10, 0.3, False, 0.91),
-        (30, 1.2, False, 0.92),
-        (66, 0.8, True, 0.91),
-    ],
+    ("groups", "spread", "few", "least"), [(3, 1.2, False, 0.90), (10, 0.3, False, 0.91), (66, 0.8, True, 0.91)]
 )
 def test_interval__by_few_unequal_recordings_covers_the_truth(
     groups: int, spread: float, few: bool, least: float
