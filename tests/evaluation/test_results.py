@@ -29,8 +29,9 @@ def written(folder: Path, result: Result, rows: Any = "csv", **more: Any) -> Pat
     return folder / "results.json"
 
 
-def renamed(scenario: Any, n: int, agent: Any) -> Result:
-    return evaluated(scenario, n, [agent._replace(name="mine")])
+def called_mine(scenario: Any, n: int, agent: Any) -> Result:
+    found = evaluated(scenario, n, [agent])
+    return replace(found, columns={"mine": found[agent.name]}, knows={"mine": ""}, policies={"mine": {}})
 
 
 @pytest.mark.parametrize("rows", ["csv", "parquet"])
@@ -132,7 +133,7 @@ def test_comparison__is_paired_by_world_where_both_have_rows(tmp_path: Path) -> 
 
 
 def test_comparison__is_by_recording(tmp_path: Path) -> None:
-    one, other = (renamed(recorded(8), 100, agent) for agent in (FULL_BRAKE, GENTLE))
+    one, other = (called_mine(recorded(8), 100, agent) for agent in (FULL_BRAKE, GENTLE))
     found = compare_results(read_result(written(tmp_path / "one", one)), other)
     expected = difference(other["mine"]["total_harm"], one["mine"]["total_harm"], one.clusters)
     assert found.recordings == 8 and found.differences["mine"]["total_harm"] == expected
@@ -141,7 +142,7 @@ def test_comparison__is_by_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("n", [3, 60])
 def test_comparison__without_rows_uses_the_stored_errors(n: int, tmp_path: Path) -> None:
-    one, other = (renamed("realistic-motorway", n, agent) for agent in (FULL_BRAKE, COAST))  # intervals cut at 0
+    one, other = (called_mine("realistic-motorway", n, agent) for agent in (FULL_BRAKE, COAST))  # intervals cut at 0
     saved = [read_result(written(tmp_path / name, each, None)) for name, each in (("one", one), ("two", other))]
     found = compare_results(*saved)
     x, y = (each["mine"]["total_harm"] for each in (other, one))
