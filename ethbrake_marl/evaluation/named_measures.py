@@ -141,9 +141,8 @@ class SummedTerm:
         """Add the step's term, 0 in episodes that had ended."""
         if step is not None:
             value = self.term(before, step, after)
-            self.sum = (self.sum if self.sum.shape == value.shape else np.zeros(value.shape)) + np.where(
-                before.ended if value.ndim == 1 else before.ended[:, np.newaxis], 0.0, value
-            )
+            ended = before.ended if value.ndim == 1 else before.ended[:, np.newaxis]
+            self.sum = np.where(ended, 0.0, value) + (self.sum if self.sum.shape == value.shape else 0.0)
 
     def result(self, last: State) -> Given:
         """Return the sum."""

@@ -202,6 +202,10 @@ def test_terms_of_ones_own__are_summed_and_names_are_used_once(monkeypatch: pyte
         monkeypatch.setattr(registry, "loaded", dict(registry.loaded))
     register_term("moving", doc(lambda before, step, after: (after.speeds_mps > 0.0) * step.time_step_s), unit="s")
     assert 3.0 < evaluated(PAIR, 2, [FULL_BRAKE], ["moving"])["full_brake"]["moving_1"][0] <= 3.8
+    register_term("decisions", doc(lambda before, step, after: np.ones(after.n)))
+    counted = evaluated("paper-random", 9, [FULL_BRAKE], ["decisions"])["full_brake"]
+    assert counted["decisions"].tolist() == np.round((counted["end_s"] - 0.5) / 0.1).tolist()
+    assert np.ptp(counted["end_s"]) > 0.0
     with refused("already in use", AlreadyExists):
         register_measure("moving", doc(lambda game, alert, last: last.time_s))
     register_measure("still", doc(lambda game, alert, last: last.time_s))

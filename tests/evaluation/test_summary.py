@@ -182,7 +182,9 @@ def test_notes__of_rejected_draws_and_recordings() -> None:
     rejecting = {**recorded(8).declared(), "early_impacts": "reject", "latency_s": [0.0, {"uniform": [0.3, 1.5]}, 1.6]}
     table = summarise(evaluated(rejecting, 60))
     text = " ".join(str(table).split())
-    assert table.parameters["rejected_draws"] > 0 and "drawn worlds (" in text
+    rejected = table.parameters["rejected_draws"]
+    share = f"{100 * rejected / (60 + rejected):.1f} %"
+    assert rejected > 0 and f"{rejected} of {60 + rejected} drawn worlds ({share}) were rejected" in text
     assert "60 worlds, seed 7; 95 % intervals by 8 recordings; d = " in text
     single = summarise(evaluated(recorded(1), 20))
     assert "no 95 % intervals: all worlds come from one recording" in " ".join(str(single).split())

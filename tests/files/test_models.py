@@ -24,7 +24,7 @@ class Content(FileModel):
 
 MISTAKES = {
     "my.yaml, line 2: nam: unknown key; did you mean name?": "sizes: [x]\nnam: x",
-    "my.yaml, line 3: inner.gap_km: unknown key; did you mean gap_m (metres)?": "name: x\ninner:\n  gap_km: 3",
+    "my.yaml, line 2: inner.gap_furlongs: unknown key; did you mean gap_m (metres)?": "inner:\n  gap_furlongs: 3",
     "my.yaml, line 1: inner.gap: unknown key; did you mean gap_m (metres)?": "inner: {gap: 3}",
     "my.yaml, line 2: colour: unknown key; known: name, inner, sizes": "name: x\ncolour: red",
     "my.yaml: name: missing; write name: x": "sizes: [1]",
