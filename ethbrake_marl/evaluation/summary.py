@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, Statistic, Values
 from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet, terminal_text
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat, terminal_text
 
 BASELINE = "full_brake"
 IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
@@ -151,15 +151,10 @@ class SummaryTable(list[SummaryRow]):
         A missing number is NaN. Raises ``MissingExtra`` without pandas.
         """
         with naming_extras():
-            from pandas import DataFrame, Index
+            from pandas import DataFrame
 
-        table: dict[str, list[float | None]] = {}
-        for key in self.shown:
-            each = [row.estimates[key] for row in self]
-            ends = [(None, None) if e is None or e.interval is None else e.interval for e in each]
-            table |= {key: [None if e is None else e.value for e in each]}
-            table |= {f"{key}_low": [low for low, _ in ends], f"{key}_high": [high for _, high in ends]}
-        return DataFrame(table, index=Index([row.agent for row in self], name="agent"), dtype=float)
+        rows = [{"agent": row.agent, **flat(Estimate.side_by_side(row.estimates))} for row in self]
+        return DataFrame(rows).set_index("agent").astype(float)
 
     def _below(self) -> str:
         worlds = (

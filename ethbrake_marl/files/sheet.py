@@ -306,27 +306,29 @@ def terminal_text(*shown: RenderableType) -> str:
     return text.getvalue()
 
 
-def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return rows as CSV text with a header line: all columns, in order of appearance.
+def flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row with two entries, ``x_low`` and ``x_high``, in place of a pair ``x_interval``."""
+    line: dict[str, Any] = {}
+    for name, value in row.items():
+        if name.endswith("_interval"):
+            stem = name.removesuffix("_interval")
+            line[f"{stem}_low"], line[f"{stem}_high"] = value or (None, None)
+        else:
+            line[name] = value
+    return line
 
-    A column ``x_interval`` of pairs (low, high) is written as two columns, ``x_low`` and ``x_high``. None and missing
-    values are written as empty cells.
+
+def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return ``flat`` rows as CSV text with a header line: all columns, in order of appearance.
+
+    None and missing values are written as empty cells.
     """
-    flat: list[dict[str, Any]] = []
-    for row in rows:
-        line: dict[str, Any] = {}
-        for name, value in row.items():
-            if name.endswith("_interval"):
-                stem = name.removesuffix("_interval")
-                line[f"{stem}_low"], line[f"{stem}_high"] = value or (None, None)
-            else:
-                line[name] = value
-        flat.append(line)
+    lines = [flat(row) for row in rows]
     text = io.StringIO(newline="")
-    names = dict.fromkeys(name for line in flat for name in line)
+    names = dict.fromkeys(name for line in lines for name in line)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(flat)
+    writer.writerows(lines)
     return text.getvalue()
 
 
