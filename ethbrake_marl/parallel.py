@@ -14,7 +14,7 @@ from functools import cache
 from itertools import islice
 from typing import Any
 
-from ethbrake_marl.errors import EthBrakeError, naming_extras
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 
 WATCH_S = 1.0
 PER_PROCESS = 16  # calls in one batch for a backend that returns the results of a batch all at once
@@ -36,13 +36,15 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
             shortly before the call starts.
         jobs: number of calls that run at once; None or 1: one after the other, in this process.
 
-    Raises the error that a call raised, ``WorkerLost`` if a process is killed, and ``MissingExtra`` without joblib.
+    Raises the error that a call raised, ``WorkerLost`` if a process is killed, ``InvalidInput`` if a call cannot be
+    pickled, and ``MissingExtra`` without joblib.
 
     """
     if jobs in (None, 1):
         for function, *arguments in calls:
             yield function(*arguments)
         return
+
     with naming_extras():
         from joblib import Parallel, delayed, parallel_config
         from joblib.externals.loky.process_executor import BrokenProcessPool
@@ -52,7 +54,7 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     local = type(backend).__name__.lower().startswith(DEFAULT_BACKEND)
     with parallel_config(**({"backend": DEFAULT_BACKEND, "inner_max_num_threads": 1} if local else {})):
         parallel = Parallel(jobs, batch_size=1, return_as="generator" if streams else "list")
-    work = (delayed(_answer)(pickle.dumps(call)) for call in calls)
+    work = (delayed(_answer)(_pickled(call)) for call in calls)
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:
         results = parallel(batch)
@@ -66,6 +68,15 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
         finally:
             with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
                 getattr(results, "close", list)()
+
+
+def _pickled(call: Call) -> bytes:
+    from cloudpickle import dumps  # which also takes what a user's file or a notebook defines
+
+    try:
+        return bytes(dumps(call))
+    except Exception as error:
+        raise InvalidInput(f"this cannot be sent to another process ({error}); use one process (jobs=1)") from error
 
 
 def _answer(call: bytes) -> Any:

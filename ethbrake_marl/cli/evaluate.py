@@ -137,7 +137,7 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
     check_folder(output, FILES, force=out.force)
 
 
-FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of `evaluate`, or output of --json.")
+FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of `evaluate --output`.")
 
 
 def compare_command(first: Annotated[Path, FILE], second: Annotated[Path, FILE], as_json: JsonOption = False) -> None:

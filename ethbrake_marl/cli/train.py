@@ -150,7 +150,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     brake = Team("full_brake", {body: Held("full_brake") for body in loaded.learners})
     worlds = loaded.sample(plan.evaluation.worlds, plan.evaluation.seed)
     columns = [
-        Column("Agent", "agent", text=True, whole=True),
+        Column("Agent", "agent", text=True),
         Column("First-impact harm", "first_impact_harm"),
         Column("Total harm", "total_harm"),
         Column("Collisions", "collision_rate", digits=1, scale=100.0, unit=" %"),

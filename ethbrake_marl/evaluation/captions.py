@@ -1,14 +1,13 @@
-"""Texts below a table of results: the worlds, and what a reader should know before believing the numbers."""
+"""One line that says in which worlds results were found."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
 from ethbrake_marl.worlds.rules import RULES
 
 SYMBOLS = {
@@ -55,68 +54,3 @@ def by_recording(recordings: int) -> str:
     if recordings == 1:
         return "; no 95 % intervals: all worlds come from one recording"
     return f"; 95 % intervals by {recordings:,} recordings" if recordings else ""
-
-
-def notes_of(rows: Sequence[SummaryRow], parameters: Mapping[str, Any]) -> list[str]:
-    """Return what to say below a table: rejected draws, ends at the horizon, exploits, no impact, hidden values."""
-    notes = [_rejected(parameters), _cut_off(rows, parameters), exploits_of({row.agent: row for row in rows})]
-    return [*filter(None, [*notes, _no_impact(rows, parameters), _knowledge(rows)])]
-
-
-def exploits_of(rows: Mapping[str, SummaryRow]) -> str:
-    """Return a sentence about agents that do damage which harm does not count; "" if there are none."""
-    each = "; ".join(f"{agent} {' and '.join(row.exploits.values())}" for agent, row in rows.items() if row.exploits)
-    return f"{EXPLOITS} Harm does not count this: {each} (docs/train.md)." if each else ""
-
-
-def _rejected(parameters: Mapping[str, Any]) -> str:
-    rejected = parameters.get("rejected_draws", 0)
-    draws = rejected + parameters["count"]
-    text = (
-        f"{rejected:,} of {draws:,} drawn worlds ({100.0 * rejected / draws:.1f} %) were rejected and drawn again,"
-        " because an impact happened before a learner could act (early_impacts: reject). These results do not apply to"
-        " such worlds."
-    )
-    return text if rejected else ""
-
-
-def _cut_off(rows: Sequence[SummaryRow], parameters: Mapping[str, Any]) -> str:
-    moving = ", ".join(f"{row.agent} {row.horizon_ends:,}" for row in rows if row.horizon_ends)
-    text = (
-        f"In some of the {parameters['count']:,} worlds a vehicle still moved at the horizon"
-        f" ({parameters['horizon_s']:g} s): {moving}. Harm after the horizon is not counted."
-    )
-    return text if moving else ""
-
-
-def _no_impact(rows: Sequence[SummaryRow], parameters: Mapping[str, Any]) -> str:
-    unhurt = [row for row in rows if not row.collisions]
-    if not unhurt:
-        return ""
-    where = f"No impact in {count_of(parameters['count'], 'world')}: {', '.join(row.agent for row in unhurt)}."
-    rate = unhurt[0]["collision_rate"]
-    if rate is None or rate.interval is None:
-        return f"{where} All worlds come from one recording, so nothing is known about other recordings."
-    return (
-        f"{where} With 95 % confidence, at most {100 * rate.interval[1]:.2g} % of all such worlds have an impact. The"
-        " harm of those impacts is not known."
-    )
-
-
-def _knowledge(rows: Sequence[SummaryRow]) -> str:
-    hidden = rows[0].hidden_share
-    if not hidden:
-        return ""
-    text = (
-        f"In {100 * hidden:.1f} % of these worlds the V2X channel hides something from a controlled vehicle at its"
-        " first decision: messages have not arrived, are old or lack something, or another vehicle reacts later than"
-        " its message says."
-    )
-    through = ", ".join(row.agent for row in rows if row.sees_through)
-    if through:
-        text += (
-            f" {SEES_THROUGH} {through}: reads hidden values nevertheless (omniscient). No vehicle with this channel"
-            " could do so; use the result as a limit to compare with."
-        )
-    silent = ", ".join(row.agent for row in rows if "not stated" in row.knows)
-    return text + (f" These agents do not state what they know: {silent}." if silent else "")

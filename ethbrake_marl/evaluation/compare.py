@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.captions import by_recording
-from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.evaluation.evaluate import Columns, Result
 from ethbrake_marl.evaluation.results import HARMS, Saved
 from ethbrake_marl.evaluation.statistics import difference, unpaired
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.evaluation.summary_row import EXPLOITS
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
+from ethbrake_marl.worlds.describe import clusters_of
 
 SAME = {  # what two results must have in common -> what differs otherwise
     "worlds_sha256": "their worlds differ",
@@ -25,74 +25,36 @@ SAME = {  # what two results must have in common -> what differs otherwise
     "time_step_s": "their time steps differ",
     "horizon_s": "their horizons differ",
 }
-NOTED = ("agent_settings", "versions")  # mappings whose differences are notes
-POLICIES = {"same": "the same", "other": "another", "none": ""}
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Mean harm of one team in the second result minus that in the first (m2/s2)."""
-
-    agent: str
-    policy: Literal["same", "other", "none"]  # whether its trained policies are the same in both; none in either
-    harms: Mapping[str, Estimate]  # count of harm -> difference
-    exploits: tuple[list[str], list[str]]  # damage that harm does not count, in either result
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain data."""
-        harms = {f"{name}_difference": each for name, each in self.harms.items()}
-        both = [list(each) for each in self.exploits]
-        return {"agent": self.agent, "policy": self.policy, **Estimate.side_by_side(harms), "exploits": both}
 
 
 @dataclass(frozen=True)
 class Comparison:
     """Second result minus first, for every team that both have."""
 
-    differences: tuple[Difference, ...]
+    differences: Mapping[str, Mapping[str, Estimate]]  # team -> count of harm -> difference of the means (m2/s2)
     unpaired_because: str  # why worlds cannot be paired; "": intervals are paired
     recordings: int  # number of recordings; 0: all worlds are independent
     left_over: tuple[tuple[str, ...], tuple[str, ...]]  # teams of the first result only, and of the second
-    changed: Mapping[str, tuple[Any, Any]]  # setting, package or digest -> its values, where they differ
+    changed: Mapping[str, tuple[Any, Any]]  # setting, package, policy or digest -> its values, where they differ
 
     def sheet(self) -> Sheet:
-        """Return the table."""
+        """Return the table, with the notes below it."""
+        rows = [(agent, *harms.values()) for agent, harms in self.differences.items()]
         heads = [Column("First-impact harm", HARMS[0]), Column("Total harm", HARMS[1])]
-        rows = [
-            (
-                f"{each.agent} {EXPLOITS}" if any(each.exploits) else each.agent,
-                POLICIES[each.policy],
-                *each.harms.values(),
-            )
-            for each in self.differences
-        ]
-        columns = [Column("Agent", text=True, whole=True), Column("Policy", text=True), *heads]
-        return Sheet("", columns, rows, "\n".join(self.notes()))
+        return Sheet("", ["Agent", *heads], rows, "\n".join(self.notes()))
 
-    def notes(self) -> list[str]:
-        """Return what to say below the table."""
+    def notes(self) -> Iterator[str]:
+        """Yield what to say below the table."""
         how = "paired by world"
         if self.unpaired_because:
             how = f"NOT paired by world, so wider than paired intervals: {self.unpaired_because}"
         by = by_recording(self.recordings)
-        notes = [f"Second minus first, mean per world in m²/s²; in brackets: 95 % intervals, {how}{by}."]
-        damage = [
-            f"{each.agent} ({' and '.join(exploits)}, {which} result)"
-            for each in self.differences
-            for which, exploits in zip(("first", "second"), each.exploits, strict=True)
-            if exploits
-        ]
-        if damage:
-            notes.append(f"{EXPLOITS} Harm does not count what these do: {', '.join(damage)} (docs/train.md).")
+        yield f"Second minus first, mean per world in m²/s²; in brackets: 95 % intervals, {how}{by}."
         for which, agents in zip(("first", "second"), self.left_over, strict=True):
             if agents:
-                notes.append(f"Only in the {which} result: {', '.join(agents)}.")
+                yield f"Only in the {which} result: {', '.join(agents)}."
         for name, (one, other) in self.changed.items():
-            if "SHA-256" in f"{one}{other}" or name == "physics_digest":
-                notes.append(f"Note: {name} differs.")
-            else:
-                notes.append(f"Note: {name}: {one} in the first result, {other} in the second.")
-        return notes
+            yield f"Note: {name}: {one!s:.20} in the first result, {other!s:.20} in the second."
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data."""
@@ -100,7 +62,10 @@ class Comparison:
             "intervals": "unpaired" if self.unpaired_because else "paired",
             "unpaired_because": self.unpaired_because or None,
             "recordings": self.recordings,
-            "agents": [each.to_json() for each in self.differences],
+            "agents": [
+                {"agent": agent} | Estimate.side_by_side({f"{name}_difference": each for name, each in harms.items()})
+                for agent, harms in self.differences.items()
+            ],
             "only_in_first": list(self.left_over[0]),
             "only_in_second": list(self.left_over[1]),
             "changed": {name: list(both) for name, both in self.changed.items()},
@@ -121,53 +86,49 @@ def compare_results(first: Saved | Result, second: Saved | Result) -> Comparison
                 f" {values[1]!s:.20})"
             )
     common = [agent for agent in one.agents if agent in other.agents]
-    left_over = [tuple(agent for agent in each.agents if agent not in common) for each in (one, other)]
+    mine, theirs = (tuple(agent for agent in each.agents if agent not in common) for each in (one, other))
     if not common:
-        names = [", ".join(each) for each in left_over]
-        raise InvalidInput(f"{one.path} ({names[0]}) and {other.path} ({names[1]}) have no agent in common")
-    because = _why_unpaired(one, other)
+        names = f"{one.path} ({', '.join(mine)}) and {other.path} ({', '.join(theirs)})"
+        raise InvalidInput(f"{names} have no agent in common")
+    because = one.no_rows_because or other.no_rows_because
+    if because:
+        because = f"both results need a file with one row per world; {because}"
+    before, after = _noted(one, common), _noted(other, common)
     changed = {
         name: (before.get(name), after.get(name))
-        for before, after in ((_noted(one), _noted(other)),)
         for name in dict.fromkeys([*before, *after])
         if before.get(name) != after.get(name)
     }
-    differences = tuple(_difference(one, other, agent, paired=not because) for agent in common)
-    recordings = int(_recorded(one, "recordings") or 0)
-    return Comparison(differences, because, recordings, (left_over[0], left_over[1]), changed)
+    differences = {agent: _difference(one, other, agent) for agent in common}
+    return Comparison(differences, because, int(_recorded(one, "recordings") or 0), (mine, theirs), changed)
 
 
-def _difference(one: Saved, other: Saved, agent: str, *, paired: bool) -> Difference:
-    if paired and one.result is not None and other.result is not None:
-        before, after, by = one.result[agent], other.result[agent], one.result.clusters
-        harms = {name: difference(after[name], before[name], by) for name in HARMS}
-    else:
-        harms = {name: unpaired(other.estimate(agent, name), one.estimate(agent, name)) for name in HARMS}
-    policies = [each.agents[agent]["policy_sha256"] for each in (one, other)]
-    same: Literal["same", "other"] = "same" if policies[0] == policies[1] else "other"
-    exploits = one.agents[agent]["exploits"], other.agents[agent]["exploits"]
-    return Difference(agent, same if any(policies) else "none", harms, exploits)
+def _difference(one: Saved, other: Saved, agent: str) -> dict[str, Estimate]:
+    if one.rows is not None and other.rows is not None:
+        before, after = _of(one.rows, agent), _of(other.rows, agent)
+        if not np.array_equal(before["world"], after["world"]):  # parts of results
+            raise InvalidInput(f"{other.path} and {one.path} cannot be compared: they do not list the same worlds")
+        return {name: difference(after[name], before[name], clusters_of(before)) for name in HARMS}
+    return {name: unpaired(other.estimate(agent, name), one.estimate(agent, name)) for name in HARMS}
 
 
-def _why_unpaired(one: Saved, other: Saved) -> str:
-    for each in (one, other):
-        if each.result is None:
-            return f"both results need a file with one row per world; {each.no_rows_because}"
-    assert one.result is not None and other.result is not None
-    if not np.array_equal(one.result.worlds["world"], other.result.worlds["world"]):
-        return "the two results do not list the same worlds"
-    return ""
+def _of(rows: Columns, agent: str) -> Columns:
+    mine = rows["agent"] == agent
+    return {name: column[mine] for name, column in rows.items()}
 
 
 def _in_memory(result: Result) -> Saved:
     agents = {each["agent"]: each for each in summarise(result).to_json()}
-    return Saved(Path("result"), agents, result, "")
+    return Saved(Path("result"), agents, result.arrays(), "")
 
 
 def _recorded(saved: Saved, key: str) -> Any:
     return saved.about.get(key, saved.about["parameters"].get(key))
 
 
-def _noted(saved: Saved) -> dict[str, Any]:
-    parts = [each for key in NOTED if isinstance(each := _recorded(saved, key), dict)]
-    return {"physics_digest": saved.about.get("physics_digest"), **{k: v for part in parts for k, v in part.items()}}
+def _noted(saved: Saved, agents: list[str]) -> dict[str, Any]:
+    parts = [_recorded(saved, key) or {} for key in ("agent_settings", "versions")]
+    for agent in agents:
+        policies = saved.agents[agent]["policy_sha256"]
+        parts.append({f"policy of {vehicle} in {agent}": sha256 for vehicle, sha256 in policies.items()})
+    return {"physics_digest": saved.about["physics_digest"], **{k: v for part in parts for k, v in part.items()}}

@@ -6,7 +6,6 @@ many short ones are crashes.
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,9 +17,8 @@ from ethbrake_marl.agents.drive import MESSAGES, MODEL, SENSORS, STATE as TRUE_S
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
-from ethbrake_marl.evaluation.familiar import warn_unfamiliar
 from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
-from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, look, measured
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, Watch, flat, naming
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
@@ -142,7 +140,6 @@ def evaluate(
         check_whole_number("jobs", jobs, 1)
     drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
     _check(drawn.worlds, agents, game)
-    warn_unfamiliar(agents, drawn.worlds)
     chosen = (*DEFAULT, *measures)
     alert, n, of_worlds = drawn.worlds, drawn.worlds.n, columns_of(drawn)
     for measure in chosen:
@@ -152,8 +149,6 @@ def evaluate(
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
     )
-    if jobs not in (None, 1):
-        _check_can_be_sent(agents, chosen)
     parts: list[dict[str, Columns]] = []
     for part in run_each(calls, jobs):
         parts.append(part)
@@ -193,18 +188,29 @@ def drive_chunk(
 
 
 def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Columns:
-    whole = team.game(game)
-    watches = {each.name: each.watch(whole, alert.read_only()) for each in measures if each.watch is not None}
-    seen = {each: watch for each, watch in watches.items() if watch is not None}
+    whole, start = team.game(game), alert.read_only()
+    watches: list[tuple[Measure, Watch]] = []
+    for measure in measures:
+        with naming(measure):
+            watch = None if measure.watch is None else measure.watch(whole, start)
+        if watch is not None:
+            watches.append((measure, watch))
     before = alert
     with AgentFailed.naming(name, [script.name for script in game.scripts.values() if hasattr(script, "name")]):
-        for step, state in play(game, alert, team, donate=not seen):
-            for each, watch in seen.items():
-                look(each, watch, before.read_only(), step, state.read_only())
+        for step, state in play(game, alert, team, donate=not watches):
+            for measure, watch in watches:
+                with naming(measure):
+                    watch.see(before.read_only(), step, state.read_only())
             before = state
+    last, watched = before.read_only(), {measure.name: watch for measure, watch in watches}
     columns: Columns = {}
     for measure in measures:
-        columns |= measured(measure, watches.get(measure.name), whole, alert, before)
+        with naming(measure):
+            if measure.of is not None:
+                given = measure.of(whole, start, last)
+            else:
+                given = watched[measure.name].result(last) if measure.name in watched else None
+        columns |= flat(measure, given, last)
     return columns
 
 
@@ -231,17 +237,6 @@ def known_by(team: Team) -> str:
     each = {getattr(agent, "knows", UNSTATED) for agent in team.drivers.values()}
     each |= {getattr(team.shield, "knows", MODEL)} if team.shield is not None else set()
     return " + ".join(sorted(each, key=lambda word: (*KNOWLEDGE, word).index(word)))
-
-
-def _check_can_be_sent(agents: Mapping[str, Team], measures: Sequence[Measure]) -> None:
-    for name, part in (*agents.items(), *((measure.name, measure) for measure in measures)):
-        try:
-            pickle.dumps(part)
-        except Exception as error:
-            raise InvalidInput(
-                f"evaluate: {name!r:.60} cannot be sent to another process ({error}); define its classes and functions"
-                " in a module, or use jobs=1"
-            ) from error
 
 
 def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:

@@ -31,7 +31,8 @@ Every evaluation has DEFAULT. Other measures, which cost something, are named: `
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, Literal, NamedTuple, Protocol
 
@@ -192,25 +193,12 @@ DEFAULT = (
 )  # fmt: skip
 
 
-def look(name: str, watch: Watch, before: State, step: Step | None, after: State) -> None:
-    """Let a watch see a step. Raises ``InvalidInput``, which names the measure, if its function fails."""
+@contextmanager
+def naming(measure: Measure) -> Iterator[None]:
+    """Context manager: raise ``InvalidInput``, which names the measure, if its function fails."""
     try:
-        watch.see(before, step, after)
-    except EthBrakeError:
-        raise
-    except Exception as error:
-        raise InvalidInput(f"measure {name!r}: its function fails: {describe_error(error)}") from error
-
-
-def measured(measure: Measure, watch: Watch | None, game: Game, alert: State, last: State) -> dict[str, Values]:
-    """Return the columns of one measure. Raises ``InvalidInput``, which names the measure, if its function fails."""
-    try:
-        if measure.of is not None:
-            given = measure.of(game, alert.read_only(), last.read_only())
-        else:
-            given = None if watch is None else watch.result(last.read_only())
+        yield
     except EthBrakeError:
         raise
     except Exception as error:
         raise InvalidInput(f"measure {measure.name!r}: its function fails: {describe_error(error)}") from error
-    return flat(measure, given, last)

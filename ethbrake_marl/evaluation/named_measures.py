@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -103,36 +102,18 @@ def _called(name: str) -> list[Measure]:
         return [_summed(name, TERMS[name].value, TERMS[name].unit)]
     file, _, own = str(name).rpartition(":")
     if file.endswith(".py"):
-        part = _part(file, own)
+        value = load_from_file(file, own)
+        part = value if isinstance(value, Part) else Part(value)
         try:
             register_measure(own, *part.given, **part.settings)
         except EthBrakeError as error:
             raise type(error)(f"file {file!r}: {error}") from None
-        measure, called = MEASURES[own], cast(Any, FromFile(file, own))
-        return [measure._replace(of=called) if measure.watch is None else measure._replace(watch=called)]
+        return [MEASURES[own]]
     kind = str(name).partition(":")[0]
     if kind in OBJECTIVES:
         meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
         return [Measure(name, partial(_objective, name), meaning, "m2/s2")]
     raise unknown_name("measure", name, (*MEASURES, *_REWARDED, *TERMS, *OBJECTIVES), may_be_own=True)
-
-
-class FromFile(NamedTuple):
-    """A function of a user's Python file, which every process runs for itself."""
-
-    file: str
-    name: str
-
-    def __call__(self, *given: Any) -> Any:
-        """Call the function."""
-        part = _part(self.file, self.name)
-        function = part.given[0] if part.given else part.settings.get("of") or part.settings["watch"]
-        return function(*given)
-
-
-def _part(file: str, name: str) -> Part:
-    part = load_from_file(file, name)
-    return part if isinstance(part, Part) else Part(part)
 
 
 def _summed(name: str, term: TermFunction, unit: str) -> Measure:
@@ -160,9 +141,8 @@ class SummedTerm:
         """Add the step's term, 0 in episodes that had ended."""
         if step is not None:
             value = self.term(before, step, after)
-            self.sum = (self.sum if self.sum.shape == value.shape else np.zeros(value.shape)) + np.where(
-                before.ended if value.ndim == 1 else before.ended[:, np.newaxis], 0.0, value
-            )
+            ended = before.ended if value.ndim == 1 else before.ended[:, np.newaxis]
+            self.sum = np.where(ended, 0.0, value) + (self.sum if self.sum.shape == value.shape else 0.0)
 
     def result(self, last: State) -> Given:
         """Return the sum."""

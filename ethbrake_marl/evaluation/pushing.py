@@ -38,6 +38,13 @@ def alone(alert: State, body: int, until_s: Floats) -> tuple[Floats, Floats]:
     return line[:, SPEED, 1], POST_M - line[:, GAP, 0]
 
 
+def with_post(state: State) -> Floats:
+    """Return a copy of the lines, with a far post where there is no obstacle, whose gap shows Vehicle 1's way."""
+    line = state.line.copy()
+    line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
+    return line
+
+
 class Shoved:
     """Way of Vehicle 1 minus the way that it would drive until the horizon if nobody touched it.
 
@@ -50,8 +57,7 @@ class Shoved:
 
     def see(self, before: State, step: Step | None, after: State) -> None:
         """Add the way of a step: with a post where there is no obstacle, the step is driven again."""
-        line = before.line.copy()
-        line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
+        line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         times = np.ascontiguousarray(before.time_s), np.ascontiguousarray(after.time_s)
         advance_worlds(line, before.car, *times, after.wanted, scratch_for(line.shape[2]))

@@ -17,11 +17,9 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import advance_worlds
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.evaluation.measures import AT_REST, ended
-from ethbrake_marl.evaluation.pushing import POST_M
+from ethbrake_marl.evaluation.pushing import with_post
 from ethbrake_marl.motion.layout import (
     COUNT,
-    FAR_M,
     FIRST,
     FORCE,
     GAP,
@@ -130,12 +128,11 @@ def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> E
     behind_m = np.cumsum(line[:, GAP, 1:-1], axis=1)
     in_force = world.car[:, LATENCY, 1:] <= time_s[:, np.newaxis]
     commands = np.concatenate([wanted, wanted[-1:]])[:, 1:]
-    last = states[-1]
     return EpisodeRecord(
         team.name, game.name, tuple(team.drivers), tuple(states), time_s, line[:, GAP, 1:-1], line[:, SPEED, 1:],
         np.column_stack([front_m, front_m[:, np.newaxis] - behind_m]),
         np.where(in_force, commands, 0.0), line[:, FORCE, 1:], _impacts(times, lines, world.car, wanted),
-        bool(np.asarray(ended(game, world, last))[0] == AT_REST),
+        bool(states[-1].at_rest[0]),
     )  # fmt: skip
 
 
@@ -147,8 +144,7 @@ def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floa
     start, end = float(before.time_s[0]), float(after.time_s[0])
     count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
     ends = np.linspace(start, end, count + 1)
-    line = before.line.copy()
-    line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
+    line = with_post(before)
     every = np.zeros(count, np.int64)
     lines, wanted = line[every], after.wanted[every]
     advance_worlds(lines, before.car[every], np.full(count, start), ends[1:], wanted, scratch_for(line.shape[2]))

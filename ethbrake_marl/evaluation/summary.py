@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.errors import InvalidInput, naming_extras, unknown_name
 from ethbrake_marl.evaluation import statistics
-from ethbrake_marl.evaluation.captions import caption, notes_of, ranges_of
+from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, Statistic, Values
-from ethbrake_marl.evaluation.summary_row import SEES_THROUGH, SummaryRow
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet, terminal_text
+from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat, terminal_text
 
 BASELINE = "full_brake"
+IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
+COMPARE = {"difference": statistics.difference, "decrease": statistics.decrease}
+_PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
+_FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 FIRST_COLUMNS = ("collision_rate", "first_impact_harm", "total_harm")  # their intervals stand below the values
 
 HEAD = {
@@ -61,17 +65,13 @@ class SummaryTable(list[SummaryRow]):
         names = {"Agent", *FIRST_COLUMNS, "harm_decrease_first"}
         return sheet.only(k for k, name in enumerate(sheet.names) if name in names).html()
 
-    def columns(self) -> list[Column]:
-        """Return the columns of the estimates that have a heading."""
-        return [
+    def sheet(self) -> Sheet:
+        """Return the table with all columns that have a heading."""
+        columns = [
             Column(each.heading, key, short=each.short, **_FORMATS.get(each.kind, {}))
             for key, (_, each) in self.shown.items()
             if each.heading
         ]
-
-    def sheet(self) -> Sheet:
-        """Return the table with all columns that have a heading."""
-        columns = self.columns()
         rows = [
             (row.marked, f"{SEES_THROUGH} " * row.sees_through + row.knows, *(row.estimates[c.name] for c in columns))
             for row in self
@@ -79,40 +79,52 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal: one that is too narrow leaves columns out, but no harm, and breaks no name.
-
-        What was asked for stays longer than comparisons and predictions.
-        """
-        columns = []
-        for place, column in enumerate(self.columns()):
-            measure = self.shown[column.name][0]
-            gives_way = 1 if column.name == "collision_rate" else 2 + place + 100 * (measure in DEFAULT)
-            below = column.name in FIRST_COLUMNS
-            never = below and column.name != "collision_rate"
-            columns.append(
-                replace(column, interval="below" if below else "hidden", gives_way=0 if never else gives_way)
-            )
-        rows = [(f"{row[0]}\n{row[1]}", *row[2:]) for row in self.sheet().rows]
-        return Sheet("", [Column("Agent,\nwhat it knows", text=True, whole=True), *columns], rows, self._below(), gap=1)
+        """Return the table for a terminal: intervals of the first columns below their values, of others nowhere."""
+        sheet, agent = self.sheet(), Column("Agent,\nwhat it knows", text=True)
+        columns = [
+            replace(each, interval="below" if each.name in FIRST_COLUMNS else "hidden")
+            for each in sheet.columns[2:]
+            if isinstance(each, Column)
+        ]
+        rows = [(f"{name}\n{knows}", *cells) for name, knows, *cells in map(list, sheet.rows)]
+        return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(FIRST_COLUMNS))
 
     def measures(self) -> Sheet | None:
         """Return the table of what was asked for and has no column of its own; None without any."""
         asked = {
-            key: _in_words(key, measure, "" if each.kind == "decrease" else measure.unit)
+            key: f"{key} ({measure.unit})" if measure.unit and each.kind != "decrease" else key
             for key, (measure, each) in self.shown.items()
             if not each.heading and measure not in DEFAULT
         }
         rows = [(row.agent, words, row.estimates[key]) for row in self for key, words in asked.items()]
-        columns = [Column("Agent", text=True, whole=True), Column("Measure", text=True), Column("Mean or rate")]
-        return Sheet("Measures", columns, rows, gap=1) if rows else None
+        return Sheet("Measures", ["Agent", "Measure", Column("Mean or rate")], rows, gap=1) if rows else None
 
     def tables(self) -> list[Sheet]:
         """Return the tables to print."""
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Return the notes below the table."""
-        return notes_of(self, self.parameters)
+        """Return what a reader should know before believing the numbers: rejected worlds, exploits, hidden values."""
+        notes, rejected = [], self.parameters.get("rejected_draws", 0)
+        if rejected:
+            drawn = rejected + self.parameters["count"]
+            notes.append(
+                f"{rejected:,} of {drawn:,} drawn worlds ({100.0 * rejected / drawn:.1f} %) were rejected and drawn"
+                " again, because an impact happened before a learner could act (early_impacts: reject). These results"
+                " do not apply to such worlds."
+            )
+        exploits = [f"{row.agent} {' and '.join(row.exploits.values())}" for row in self if row.exploits]
+        if exploits:
+            notes.append(f"{EXPLOITS} Harm does not count this: {'; '.join(exploits)} (docs/train.md).")
+        through = [row.agent for row in self if row.sees_through]
+        if through:
+            notes.append(
+                f"{SEES_THROUGH} In {100 * self[0].hidden_share:.1f} % of these worlds the V2X channel hides something"
+                f" from a controlled vehicle at its first decision. {', '.join(through)}: reads hidden values"
+                " nevertheless (omniscient). No vehicle with this channel could do so; use the result as a limit to"
+                " compare with."
+            )
+        return notes
 
     def meanings(self) -> dict[str, str]:
         """Return what the columns mean: heading -> text."""
@@ -139,15 +151,10 @@ class SummaryTable(list[SummaryRow]):
         A missing number is NaN. Raises ``MissingExtra`` without pandas.
         """
         with naming_extras():
-            from pandas import DataFrame, Index
+            from pandas import DataFrame
 
-        table: dict[str, list[float | None]] = {}
-        for key in self.shown:
-            each = [row.estimates[key] for row in self]
-            ends = [(None, None) if e is None or e.interval is None else e.interval for e in each]
-            table |= {key: [None if e is None else e.value for e in each]}
-            table |= {f"{key}_low": [low for low, _ in ends], f"{key}_high": [high for _, high in ends]}
-        return DataFrame(table, index=Index([row.agent for row in self], name="agent"), dtype=float)
+        rows = [{"agent": row.agent, **flat(Estimate.side_by_side(row.estimates))} for row in self]
+        return DataFrame(rows).set_index("agent").astype(float)
 
     def _below(self) -> str:
         worlds = (
@@ -155,17 +162,6 @@ class SummaryTable(list[SummaryRow]):
             " in brackets or below the value. A decrease is relative to the baseline, by default full braking."
         )
         return "\n\n".join([worlds, *self.notes()])
-
-
-IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
-_PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
-_FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
-
-
-def _in_words(key: str, measure: Measure, unit: str) -> str:
-    stem, _, number = key.rpartition("_")
-    name = f"{stem}, vehicle {number}" if number.isdecimal() and key != measure.name else key
-    return f"{name} ({unit})" if unit else name
 
 
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
@@ -176,52 +172,60 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
     """
     if baseline != BASELINE and baseline not in result:
         raise unknown_name("baseline", baseline, result)
-    names = dict.fromkeys(name for own in result.columns.values() for name in own)
-    shown: dict[str, tuple[Measure, Statistic]] = {}
-    column_of: dict[str, str] = {}
-    for name in names:
-        measure = result.measure_of(name)
-        kinds = {own[name].dtype.kind for own in result.columns.values() if name in own}
-        ending = name.removeprefix(measure.name).removeprefix("_")
-        usual = Statistic(name, "rate" if kinds == {"b"} else "mean", ending=ending)
-        for each in [each for each in measure.shown if each.ending == ending] or [usual]:
-            if "U" not in kinds:
-                shown[each.key], column_of[each.key] = (measure, each), name
-    shown = dict(sorted(shown.items(), key=_place))
     named = result.clusters
     clusters = None if named is None else np.unique(named, return_inverse=True)[1]
-    rows = []
-    for team, own in result.columns.items():
-        other = result.columns.get(baseline, {})
-        estimates = {
-            key: _estimate(each, own.get(column_of[key]), other.get(column_of[key]), clusters)
-            for key, (_, each) in shown.items()
-        }
-        collisions, horizon_ends = int(own["collided"].sum()), int((own["ended"] == HORIZON).sum())
-        hidden = float(result.worlds["hidden"].mean())
-        knows, policies = result.knows[team], result.policies[team]
-        rows.append(SummaryRow(team, knows, estimates, collisions, horizon_ends, result.n, hidden, policies))
+    shown, columns = _shown(result), result.columns
+    rows = [
+        SummaryRow(
+            team,
+            result.knows[team],
+            {
+                key: _estimate(each, own.get(column), columns.get(baseline, {}).get(column), clusters)
+                for key, (column, _, each) in shown.items()
+            },
+            collisions=int(own["collided"].sum()),
+            horizon_ends=int((own["ended"] == HORIZON).sum()),
+            episodes=result.n,
+            hidden_share=float(result.worlds["hidden"].mean()),
+            policies=result.policies[team],
+        )
+        for team, own in columns.items()
+    ]
     recordings: dict[str, int] = {} if clusters is None else {"recordings": int(clusters.max()) + 1}
-    return SummaryTable(rows, shown, {**result.about, **recordings, **ranges_of(result.worlds)})
+    meant = {key: (measure, each) for key, (_, measure, each) in shown.items()}
+    return SummaryTable(rows, meant, {**result.about, **recordings, **ranges_of(result.worlds)})
 
 
-def _place(shown: tuple[str, tuple[Measure, Statistic]]) -> int:
-    measure, each = shown[1]
-    return 2 if measure.name == "predicted_harm" else int(each.kind in ("difference", "decrease"))
+def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
+    """Return key of an estimate -> its column, measure and statistic; comparisons and predictions last."""
+    shown: dict[str, tuple[str, Measure, Statistic]] = {}
+    kinds = {name: column.dtype.kind for own in result.columns.values() for name, column in own.items()}
+    for name, kind in kinds.items():
+        measure = result.measure_of(name)
+        ending = name.removeprefix(measure.name).removeprefix("_")
+        own = [each for each in measure.shown if each.ending == ending]
+        for each in own or [Statistic(name, "rate" if kind == "b" else "mean")]:
+            if kind != "U":
+                shown[each.key] = name, measure, each
+    return dict(sorted(shown.items(), key=_place))
+
+
+def _place(shown: tuple[str, tuple[str, Measure, Statistic]]) -> int:
+    _, measure, each = shown[1]
+    return 2 if measure.name == "predicted_harm" else int(each.kind in COMPARE)
 
 
 def _estimate(
     each: Statistic, values: Values | None, baseline: Values | None, clusters: NDArray[Any] | None
 ) -> Estimate | None:
-    if values is None or (baseline is None and each.kind in ("difference", "decrease")):
+    if values is None or (each.kind in COMPARE and baseline is None):
         return None
     if each.kind == "rate":
         return statistics.rate(values, clusters)
     numbers = values.astype(np.float64, copy=False)
     if each.kind == "mean" or baseline is None:
         return statistics.mean(numbers, clusters)
-    compare = statistics.difference if each.kind == "difference" else statistics.decrease
-    return compare(numbers, baseline.astype(np.float64, copy=False), clusters)
+    return COMPARE[each.kind](numbers, baseline.astype(np.float64, copy=False), clusters)
 
 
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
@@ -249,7 +253,7 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
     A team has passed if no vehicle collides in any world.
     """
     columns: list[Column | str] = [
-        Column("Agent", "agent", text=True, whole=True), Column("Result", "result"),
+        Column("Agent", "agent", text=True), Column("Result", "result"),
         Column("Collisions", "collision_rate", **_PERCENT),
         Column("Hardest, km/h", "hardest_impact_kmh", digits=1, short="Hardest,\nkm/h"),
         Column("First-impact harm", "first_impact_harm", short="First-impact\nharm"),

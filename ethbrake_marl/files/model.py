@@ -108,21 +108,14 @@ class Wording:
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
     """Return the ``InvalidInput`` for a document that does not match its pydantic model.
 
-    The message shows one mistake (an unknown key, if there is one) and counts the others: "(and k more mistakes)". If
-    an unknown key is probably the misspelt name of a missing key, the missing key is not counted.
+    The message shows one mistake: an unknown key, if there is one.
     """
-    # A default that depends on an invalid field is not counted as a mistake.
+    # A default that depends on an invalid field is no mistake of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
-    unknown = [d for d in details if d["type"] == "extra_forbidden"]
-    meant = " ".join(suggestion(str(d["loc"][-1]), wording.known(path_of(d))) for d in unknown)
-    rest = [d for d in details if d not in unknown and not (d["type"] == "missing" and f" {path_of(d)[-1]}" in meant)]
-    shown = (unknown + rest)[0]
-    more = len(unknown) + len(rest) - 1
+    shown = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
     path = path_of(shown)
     absent = shown["type"] == "missing" and len(path) == 1
-    where = document.file if absent else document.where(path)
-    more_mistakes = f" (and {more} more mistake{'s' * (more > 1)})" if more else ""
-    return InvalidInput(f"{where}: {_describe(shown, path, wording)}{more_mistakes}")
+    return InvalidInput(f"{document.file if absent else document.where(path)}: {_describe(shown, path, wording)}")
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:

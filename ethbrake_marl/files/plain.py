@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
-from ethbrake_marl.files.store import LARGEST_OBJECT_BYTES
 
-_FLAGS = ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")  # flags, if the system has them
+LARGEST_OBJECT_BYTES = 16 << 20  # largest accepted size of a JSON file of a training run
 
 
 def read_plain(
@@ -25,12 +24,9 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """Return the content of a plain file; raise ``refusal`` in the cases that ``open_plain`` lists.
-
-    The limit on the size also applies to a file that grows while it is read.
-    """
+    """Return the content of a plain file; raise ``refusal`` in the cases that ``open_plain`` lists."""
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
-        data = _read(stream.fileno(), limit_bytes + 1)
+        data = stream.read(limit_bytes + 1)  # files of /proc say that they are empty, and a file may grow
     if len(data) > limit_bytes:
         raise _too_large(Path(path), limit_bytes, refusal)
     return data
@@ -46,48 +42,28 @@ def open_plain(
 ) -> Iterator[BufferedReader]:
     """Open a plain file of at most ``limit_bytes`` for reading, as a context manager.
 
-    Kind and size of the file are checked before it is opened, so a pipe or device is not opened. Kind and size are
-    checked again after opening, in case another process has replaced the file. The function does not wait if the file
-    cannot be opened at once. Raises ``refusal`` with path and reason if the file does not exist, is not a plain file
-    (or is a symbolic link and ``follow_links`` is False), is too large, or cannot be read (also inside the block).
+    Kind and size of the file are checked before it is opened, so a pipe or device is not opened. Raises ``refusal``
+    with path and reason if the file does not exist, is not a plain file (or is a symbolic link and ``follow_links`` is
+    False), is too large, or cannot be opened.
     """
     file = Path(path)
     try:
-        _check_kind(file, (os.stat if follow_links else os.lstat)(file), limit_bytes, refusal)
-        flags = os.O_RDONLY | (0 if follow_links else getattr(os, "O_NOFOLLOW", 0))
-        for name in _FLAGS:
-            flags |= getattr(os, name, 0)
-        with os.fdopen(os.open(file, flags), "rb") as stream:
-            _check_kind(file, os.fstat(stream.fileno()), limit_bytes, refusal)
-            yield stream
-    except FileNotFoundError:
-        raise refusal(f"{file}: the file does not exist") from None
-    except OSError as error:
-        raise refusal(f"{file}: cannot be read ({error.strerror})") from None
-    except ValueError as error:
-        if isinstance(error, EthBrakeError):
-            raise
-        raise refusal(f"{file}: cannot be read ({error})") from None
-
-
-def _read(descriptor: int, most_bytes: int) -> bytes:
-    """Read at most ``most_bytes`` bytes from a file descriptor; raise ``OSError`` if reading would have to wait."""
-    parts: list[bytes] = []
-    while most_bytes > 0 and (part := os.read(descriptor, min(most_bytes, 1 << 20))):
-        parts.append(part)
-        most_bytes -= len(part)
-    return b"".join(parts)
-
-
-def _check_kind(file: Path, found: os.stat_result, limit_bytes: int, refusal: type[EthBrakeError]) -> None:
-    if stat.S_ISLNK(found.st_mode):
-        raise refusal(f"{file}: is a symbolic link; give the path of the file to which it points")
-    if stat.S_ISDIR(found.st_mode):
-        raise refusal(f"{file}: is a folder; must be a plain file")
-    if not stat.S_ISREG(found.st_mode):
-        raise refusal(f"{file}: is a device, a pipe or a socket; must be a plain file")
-    if found.st_size > limit_bytes:
-        raise _too_large(file, limit_bytes, refusal)
+        found = file.stat(follow_symlinks=follow_links)
+        opened = file.open("rb") if stat.S_ISREG(found.st_mode) else None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        raise refusal(
+            f"{file}: {'the file does not exist' if isinstance(error, FileNotFoundError) else reason}"
+        ) from None
+    if opened is None:
+        if stat.S_ISLNK(found.st_mode):
+            raise refusal(f"{file}: is a symbolic link; give the path of the file to which it points")
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
+        raise refusal(f"{file}: is {kind}; must be a plain file")
+    with opened as stream:
+        if found.st_size > limit_bytes:
+            raise _too_large(file, limit_bytes, refusal)
+        yield stream
 
 
 def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> EthBrakeError:
@@ -107,8 +83,6 @@ def parse_strict_json(data: bytes) -> Any:
 
 def read_object(file: Path) -> dict[str, Any]:
     """Return the JSON object in a file of a training run; raise ``InvalidInput`` if the file is missing or damaged."""
-    if not os.path.lexists(file):
-        raise InvalidInput(f"{file}: is missing, but the run cannot be used without it")
     data = read_plain(file, LARGEST_OBJECT_BYTES)
     try:
         content = parse_strict_json(data)

@@ -6,21 +6,17 @@ import csv
 import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from html import escape
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from ethbrake_marl.errors import naming_extras, plain_text
-from ethbrake_marl.files.store import new_file
+from ethbrake_marl.errors import plain_text
 
 if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
 DASH = "–"  # shown for a missing value
 _AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
-WIDE = 120  # smallest width of a terminal (characters) in which every column is shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +44,11 @@ class Estimate:
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Convert estimates to a dictionary for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``.
-
-        If the estimate ``x`` is None, both values are None.
-        """
+        """Convert estimates to a dictionary for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; null if unknown."""
         cells: dict[str, Any] = {}
-        for name, estimate in estimates.items():
-            cell = {"value": None, "interval": None} if estimate is None else estimate.to_json()
-            cells |= {name: cell["value"], f"{name}_interval": cell["interval"]}
+        for name, each in estimates.items():
+            cells[name] = None if each is None else each.value
+            cells[f"{name}_interval"] = None if each is None or each.interval is None else list(each.interval)
         return cells
 
 
@@ -86,12 +79,7 @@ class Column:
     sign: Literal["z", "+"] = "z"  # format option: "z" never shows -0.00, "+" always shows a sign
     text: bool = False  # whether the cells are left-aligned texts, which a narrow terminal wraps
     short: str = ""  # heading in a terminal; "": the heading
-    wide: bool = False  # whether only terminals of at least ``WIDE`` characters show the column
     interval: Literal["beside", "below", "hidden"] = "beside"  # where a terminal shows the interval of an estimate
-    whole: bool = (
-        False  # whether a terminal never breaks the texts: those that do not fit are numbered and listed below
-    )
-    gives_way: int = 0  # terminals that are too narrow leave out the columns with the largest numbers first; 0: never
 
     @property
     def name(self) -> str:
@@ -142,6 +130,7 @@ class Sheet:
     rows: Sequence[Row]
     note: str = ""  # text below the table
     gap: Literal[1, 2, 3] = 3  # spaces between two columns in a terminal
+    keep: int | None = None  # number of first columns that every terminal shows, others only if they fit; None: all
 
     def _columns(self) -> list[Column]:
         return [column if isinstance(column, Column) else Column(column, text=True) for column in self.columns]
@@ -179,13 +168,13 @@ class Sheet:
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
         ]
 
-    def rich(self, width: int = WIDE) -> RenderableType:
-        """Return the table, with the note below, as an object of ``rich`` for a terminal of ``width`` characters.
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield the table, with the note below, for a terminal.
 
-        In a cell with several lines of text, all but the first line are dim.
+        In a cell with several lines of text, all but the first line are dim. Names in the first column are never
+        broken: those that do not fit are numbered and listed below the table.
         """
         from rich import box
-        from rich.console import Group
         from rich.table import Table
         from rich.text import Text
 
@@ -193,53 +182,46 @@ class Sheet:
             box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(self.gap > 1), 0, int(self.gap > 2)),
             title=Text(self.title, "table.title") if self.title else None, title_justify="left",
         )  # fmt: skip
-        columns, lines = self._columns(), [*self.shown()]
-        shown, listed = self._fitted(width, [row for row in lines if not isinstance(row, str)])
-        for column in (columns[k] for k in shown):
+        columns = self._columns()
+        rows = [
+            row if isinstance(row, str) else [each.in_terminal(cell) for each, cell in zip(columns, row, strict=True)]
+            for row in self.shown()
+        ]
+        shown, numbers = self._fitted(options.max_width, [row for row in rows if not isinstance(row, str)])
+        for k, column in enumerate(columns[:shown]):
             heading = Text(plain_text(column.short or column.heading, keep="\n"))
-            if column.text:
-                table.add_column(heading, overflow="fold", no_wrap=column.whole)
-            else:
-                table.add_column(heading, justify="right", no_wrap=True)
-        for row in lines:
+            justify: Literal["left", "right"] = "left" if column.text else "right"
+            table.add_column(heading, justify=justify, overflow="fold", no_wrap=k == 0 or not column.text)
+        for row in rows:
             if isinstance(row, str):
                 table.add_section()
                 table.add_row(Text(plain_text(row), style="dim"))
                 continue
-            cells = []
-            for k in shown:
-                first, line, rest = columns[k].in_terminal(row[k]).partition("\n")
-                first = listed.get(first, first) if columns[k].whole else first
+            cells: list[Text] = []
+            for text in row[:shown]:
+                first, line, rest = text.partition("\n")
+                first = first if cells else numbers.get(first, first)
                 cells.append(Text(plain_text(first)).append(plain_text(line + rest, keep="\n"), style="dim"))
             table.add_row(*cells)
-        note = "\n\n".join(
-            filter(None, ["\n".join(f"{number} {plain_text(text)}" for text, number in listed.items()), self.note])
-        )
-        return Group(table, Text(), Text(note, "dim")) if note else table
+        yield table
+        listed = "\n".join(f"{number} {plain_text(name)}" for name, number in numbers.items())
+        for note in filter(None, (listed, self.note)):
+            yield Text(f"\n{note}", "dim")
 
-    def _fitted(self, width: int, rows: Sequence[tuple[Shown, ...]]) -> tuple[list[int], dict[str, str]]:
-        """Return the columns that a terminal of ``width`` characters shows, and texts that do not fit -> numbers."""
+    def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
+        """Return how many columns a terminal of ``width`` characters shows, and names that do not fit -> numbers."""
         columns = self._columns()
-        heads = [column.short or column.heading for column in columns]
-        texts = [
-            [head, *(column.in_terminal(row[k]) for row in rows)]
-            for k, (head, column) in enumerate(zip(heads, columns, strict=True))
-        ]
-        wide = [max((len(line) for text in cells for line in text.split("\n")), default=0) for cells in texts]
-        shown = [k for k, column in enumerate(columns) if width >= WIDE or not column.wide]
-        least = [min(room, width // 2) if column.whole else room for room, column in zip(wide, columns, strict=True)]
-        while sum(least[k] for k in shown) + self.gap * (len(shown) - 1) > width:
-            last = max(shown, key=lambda k: (columns[k].gives_way, k))
-            if not columns[last].gives_way:
-                break
-            shown.remove(last)
-        room = width - sum(wide[k] for k in shown if not columns[k].whole) - self.gap * (len(shown) - 1)
-        names = [text.partition("\n")[0] for k in shown if columns[k].whole for text in texts[k][1:]]
-        long = dict.fromkeys(name for name in names if len(name) > room)
+        texts = [[each.short or each.heading, *(row[k] for row in rows)] for k, each in enumerate(columns)]
+        wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
+        wide[0] = min(wide[0], width // 2)
+        shown, keep = len(columns), self.keep or len(columns)
+        while shown > keep and sum(wide[:shown]) + self.gap * (shown - 1) > width:
+            shown -= 1
+        numeric = sum(wide[k] for k in range(1, shown) if not columns[k].text)
+        room = width - numeric - self.gap * (shown - 1)
+        names = [text.partition("\n")[0] for text in texts[0][1:]]
+        long = dict.fromkeys(name for name in names if len(name) > room and columns[0].text)
         return shown, {name: f"[{number}]" for number, name in enumerate(long, 1)}
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        yield self.rich(options.max_width)
 
     def markdown(self) -> str:
         """Return the table as Markdown, without title and note.
@@ -300,14 +282,13 @@ class Sheet:
 
         Sections are omitted.
         """
-        columns, rows = self._columns(), []
+        rows = []
         for row in self.rows:
-            cells = {} if isinstance(row, str) else dict(zip(columns, row, strict=False))
-            values: dict[str, Any] = {}
-            for column, cell in cells.items():
-                estimate = isinstance(cell, Estimate)
-                values |= Estimate.side_by_side({column.name: cell}) if estimate else {column.name: cell}
-            rows += [values] if cells else []
+            if not isinstance(row, str):
+                values: dict[str, Any] = {}
+                for name, cell in zip(self.names, row, strict=False):
+                    values |= Estimate.side_by_side({name: cell}) if isinstance(cell, Estimate) else {name: cell}
+                rows.append(values)
         return rows
 
     def csv(self) -> str:
@@ -315,81 +296,40 @@ class Sheet:
         return csv_text(self.json())
 
 
-def terminal_text(*shown: RenderableType, whole_rows: bool = False) -> str:
-    """Return tables and texts as plain text, as wide as this terminal: in a script, a notebook and a file alike.
-
-    With ``whole_rows``, the cells of tables are not wrapped, and the text may be wider than the terminal.
-    """
+def terminal_text(*shown: RenderableType) -> str:
+    """Return tables and texts as plain text, as wide as this terminal: in a script, a notebook and a file alike."""
     from rich.console import Console
-    from rich.measure import measure_renderables
 
     text = io.StringIO()
     console = Console(file=text, highlight=False, color_system=None, force_jupyter=False, force_terminal=False)
-    if whole_rows:
-        tables = [replace(each, note="").rich(console.width) for each in shown if isinstance(each, Sheet)]
-        needed = measure_renderables(console, console.options.update_width(10_000), tables).maximum
-        console.width = max(console.width, needed)
     console.print(*shown)
     return text.getvalue()
 
 
-def csv_text(rows: Iterable[Mapping[str, Any]], columns: Sequence[str] | None = None) -> str:
-    """Return rows as CSV text with a header line.
+def flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row with two entries, ``x_low`` and ``x_high``, in place of a pair ``x_interval``."""
+    line: dict[str, Any] = {}
+    for name, value in row.items():
+        if name.endswith("_interval"):
+            stem = name.removesuffix("_interval")
+            line[f"{stem}_low"], line[f"{stem}_high"] = value or (None, None)
+        else:
+            line[name] = value
+    return line
 
-    A column ``x_interval`` of pairs (low, high) is written as two columns, ``x_low`` and ``x_high``. None and missing
-    values are written as empty cells. ``columns`` are the columns to write, in order, such as ``x_low``; None: all, in
-    order of appearance.
+
+def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
+    """Return ``flat`` rows as CSV text with a header line: all columns, in order of appearance.
+
+    None and missing values are written as empty cells.
     """
-    flat: list[dict[str, Any]] = []
-    for row in rows:
-        line: dict[str, Any] = {}
-        for name, value in row.items():
-            if name.endswith("_interval"):
-                stem = name.removesuffix("_interval")
-                line[f"{stem}_low"], line[f"{stem}_high"] = value or (None, None)
-            else:
-                line[name] = value
-        flat.append(line)
+    lines = [flat(row) for row in rows]
     text = io.StringIO(newline="")
-    names = list(dict.fromkeys(name for line in flat for name in line)) if columns is None else list(columns)
+    names = dict.fromkeys(name for line in lines for name in line)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(flat)
+    writer.writerows(lines)
     return text.getvalue()
-
-
-@contextmanager
-def parquet_file(
-    path: Path, *, told: Callable[[], Mapping[str, str]] | None = None, **options: Any
-) -> Iterator[Callable[..., None]]:
-    """Context manager: yield a function ``add(columns)`` that appends rows to a new Parquet file.
-
-    ``columns`` maps column names to arrays of equal length. With ``add(columns, together=True)`` the appended rows form
-    one row group. The file is created only if the block ends without error. ``told`` is called at the end of the block
-    and returns the file's metadata (key -> text). ``options`` are options of ``pyarrow.parquet.ParquetWriter``. Raises
-    ``MissingExtra`` if pyarrow is not installed.
-    """
-    with naming_extras():
-        import pyarrow
-        from pyarrow.parquet import ParquetWriter
-
-    writer = None
-    with new_file(path) as partial:
-
-        def add(columns: Mapping[str, Any], *, together: bool = False) -> None:
-            nonlocal writer
-            table = pyarrow.table(dict(columns))
-            if writer is None:
-                writer = ParquetWriter(partial, table.schema, **options)
-            writer.write_table(table, row_group_size=max(table.num_rows, 1) if together else None)
-
-        try:
-            yield add
-        finally:
-            if writer is not None:
-                if told is not None:
-                    writer.add_key_value_metadata(told())
-                writer.close()
 
 
 _LATEX = {

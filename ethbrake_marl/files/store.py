@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
-import tempfile
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
+from uuid import uuid4
 
 from filelock import FileLock, Timeout
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
-
-LARGEST_OBJECT_BYTES = 16 << 20  # largest accepted size of a JSON file of a training run
+from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput
 
 # beginning and end of a temporary name; it does not contain the target's name, because names have a maximum length
 _HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"
@@ -32,26 +30,15 @@ def new_file(path: Path) -> Iterator[Path]:
 
     If the ``with`` block raises an error, the temporary file is deleted.
     """
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED)
-    os.close(descriptor)
-    partial = Path(name)
+    partial = _temporary(path.parent)
     try:
         yield partial
         with partial.open("rb") as file:
             os.fsync(file.fileno())
-        partial.chmod(0o666 & ~_umask())
         os.replace(partial, path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
-    _folder_to_disk(path.parent)
-
-
-def check_writable(folder: Path) -> None:
-    """Raise ``OSError`` unless a file can be created in ``folder``; creates and deletes a temporary file."""
-    descriptor, name = tempfile.mkstemp(dir=folder, prefix=_HIDDEN, suffix=_UNFINISHED)
-    os.close(descriptor)
-    Path(name).unlink()
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
@@ -74,10 +61,10 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
             raise AlreadyExists(
                 f"{target}: already exists; give another name, or pass force=True (--force) to overwrite the file"
             )
-        check_writable(target.parent)
-    except (InvalidInput, AlreadyExists):
-        raise
+        TemporaryFile(dir=target.parent).close()
     except (OSError, ValueError) as error:
+        if isinstance(error, EthBrakeError):
+            raise
         reason = getattr(error, "strerror", None) or error
         raise InvalidInput(f"{target!s:.200}: cannot be written ({reason})") from None
     return target
@@ -93,11 +80,10 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
         places = (path, *path.absolute().parents)
         there = next(each for each in places if os.access(each, os.F_OK) or each.is_symlink())
         if there.is_dir():
-            check_writable(there)
+            TemporaryFile(dir=there).close()
     except (OSError, ValueError) as error:
-        raise InvalidInput(
-            f"{path!s:.200}: cannot be written to ({getattr(error, 'strerror', None) or error})"
-        ) from None
+        reason = getattr(error, "strerror", None) or error
+        raise InvalidInput(f"{path!s:.200}: cannot be written to ({reason})") from None
     if not there.is_dir():
         raise InvalidInput(f"{path}: {there} is not a folder; give a new folder (--output)")
     for name in files if there == path else ():
@@ -121,16 +107,11 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
-        raise NotADirectoryError(errno.ENOTDIR, "Not a directory", str(path.parent)) from None
-    try:
-        partial = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
-    except OSError as error:
-        error.filename = str(path)  # report the requested name, not the temporary one
-        raise
+        raise InvalidInput(f"{path}: {path.parent} is not a folder; give a new folder") from None
+    partial = _temporary(path.parent)
+    partial.mkdir()
     try:
         yield partial
-        partial.chmod(0o777 & ~_umask())
-        _folder_to_disk(partial)
         if replace and path.is_dir() and not path.is_symlink():
             remove_folder(path)
         _refuse_existing(path)
@@ -138,13 +119,12 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
-    _folder_to_disk(path.parent)
 
 
 def remove_folder(path: Path) -> None:
     """Delete the folder ``path``. The folder is renamed first, so an interruption leaves no half-deleted ``path``."""
-    aside = Path(tempfile.mkdtemp(dir=path.parent, prefix=_HIDDEN, suffix=_UNFINISHED))
-    path.rename(aside / path.name)
+    aside = _temporary(path.parent)
+    path.rename(aside)
     shutil.rmtree(aside)
 
 
@@ -182,18 +162,6 @@ def _refuse_existing(path: Path) -> None:
         raise AlreadyExists(f"{path}: already exists; give another name")
 
 
-def _folder_to_disk(path: Path) -> None:
-    """Write the file list of the folder ``path`` to disk, so that new names survive a power failure (POSIX only)."""
-    if os.name == "posix":
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-
-
-def _umask() -> int:
-    """Return the permission bits that this process removes from new files."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _temporary(folder: Path) -> Path:
+    """Return the path of a new temporary file or folder in ``folder``."""
+    return folder / f"{_HIDDEN}{uuid4().hex}{_UNFINISHED}"

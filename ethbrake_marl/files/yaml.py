@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import yaml
 from pydantic import BaseModel
@@ -70,19 +70,17 @@ DEPTH_LIMIT = 16  # largest accepted depth of nested mappings and lists
 # Keys and indices that lead to a value, such as ("roles", "vehicle_2"); () leads to the whole content.
 YamlPath = tuple[str | int, ...]
 
-_PLAIN_VALUES: dict[str, bool | None] = {
-    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
-    **dict.fromkeys(("true", "True", "TRUE"), True),
-    **dict.fromkeys(("false", "False", "FALSE"), False),
-}
-
-_INTEGER = re.compile(r"(?P<decimal>[-+]?[0-9]+)|0o(?P<octal>[0-7]+)|0x(?P<hexadecimal>[0-9a-fA-F]+)")
-
-_BASES = {"decimal": 10, "octal": 8, "hexadecimal": 16}
-
-_NOT_FINITE = re.compile(r"(?P<sign>[-+]?)\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
-
 _LARGEST_INTEGER = 2**63
+
+# Core schema of YAML 1.2: a plain scalar is the first of these that matches all of it, otherwise a text.
+_PLAIN_VALUES: tuple[tuple[re.Pattern[str], Callable[[str], Any]], ...] = (
+    (re.compile(r"~|null|Null|NULL|"), lambda text: None),
+    (re.compile(r"true|True|TRUE|false|False|FALSE"), lambda text: text.lower() == "true"),
+    (re.compile(r"[-+]?[0-9]+"), int),
+    (re.compile(r"0o[0-7]+|0x[0-9a-fA-F]+"), lambda text: int(text, 0)),
+    (_NUMERAL, float),
+    (re.compile(r"[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"), lambda text: float(text.replace(".", ""))),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,20 +91,15 @@ class Document:
     content: Any  # dict, list, str, int, float, bool or None, nested
     lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
-    def line_of(self, path: YamlPath) -> int | None:
-        """Return the line number (from 1) of the value at ``path``; None if no line is known.
+    def where(self, path: YamlPath) -> str:
+        """Return file and line number of the value at ``path``, such as ``my.yaml, line 7``.
 
-        If the value does not exist, return the line of the innermost mapping or list around the path.
+        If the value does not exist, the line is that of the innermost mapping or list around the path.
         """
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
-                return self.lines[path[:length]]
-        return None
-
-    def where(self, path: YamlPath) -> str:
-        """Return file and line number of the value at ``path``, such as ``my.yaml, line 7``."""
-        line = self.line_of(path)
-        return self.file if line is None else f"{self.file}, line {line}"
+                return f"{self.file}, line {self.lines[path[:length]]}"
+        return self.file
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
@@ -132,134 +125,92 @@ def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT)
     """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     if len(data) > limit:
-        _fail(file, None, f"is larger than {limit // 1024} KiB, the limit for this kind of file")
+        raise InvalidInput(f"{file}: is larger than {limit // 1024} KiB, the limit for this kind of file")
     try:
         decoded = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        before = data[: error.start]
-        at = (before.count(b"\n"), error.start - before.rfind(b"\n") - 1)
-        _fail(file, at, f"byte 0x{data[error.start]:02x} is not valid UTF-8 text")
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InvalidInput(f"{file}, line {line}: byte 0x{data[error.start]:02x} is not valid UTF-8 text") from None
     return _parse(decoded, file)
 
 
 def _parse(text: str, file: str) -> Document:
-    reader = _Reader(file, text)
+    lines: dict[YamlPath, int] = {}
     try:
-        content = reader.read()
+        node = yaml.compose(text, Loader=_Loader)
+        content = None if node is None else _value(node, (), lines)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
-        at = (mark.line, mark.column) if mark is not None else None
-        _fail(file, at, f"not valid YAML: {error.problem or error.context}")
+        where = "" if mark is None else f", line {mark.line + 1}, column {mark.column + 1}"
+        what = "" if isinstance(error, _Refused) else "not valid YAML: "
+        raise InvalidInput(f"{file}{where}: {what}{error.problem or error.context}") from None
     except yaml.reader.ReaderError as error:
-        before = text[: error.position]
-        at = (before.count("\n"), error.position - before.rfind("\n") - 1)
-        _fail(file, at, f"not valid YAML: character #x{ord(text[error.position]):04x} is not allowed")
-    except InvalidInput:
-        raise
-    except (yaml.YAMLError, RecursionError, ValueError, LookupError, AttributeError, TypeError) as error:
-        _fail(file, reader.at, f"not valid YAML: {error}")
-    return Document(file, content, reader.lines)
+        line = text.count("\n", 0, error.position) + 1
+        character = f"character #x{ord(text[error.position]):04x}"
+        raise InvalidInput(f"{file}, line {line}: not valid YAML: {character} is not allowed") from None
+    except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError) as error:
+        raise InvalidInput(f"{file}: not valid YAML: {error}") from None
+    return Document(file, content, lines)
 
 
-def _fail(file: str, at: tuple[int, int] | None, reason: str) -> NoReturn:
-    where = file if at is None else f"{file}, line {at[0] + 1}, column {at[1] + 1}"
-    raise InvalidInput(f"{where}: {reason}") from None
+class _Refused(yaml.MarkedYAMLError):
+    """Valid YAML that this reader does not accept."""
 
 
-class _Reader:
-    """Reader that builds the content of a document from YAML events."""
+class _Loader(yaml.SafeLoader):
+    """Loader that refuses aliases, anchors, tags and deep nesting."""
 
-    def __init__(self, file: str, text: str) -> None:
-        self.file, self.lines, self.at = file, dict[YamlPath, int](), (0, 0)  # line and column of the current event
-        self._events = yaml.parse(text, Loader=yaml.SafeLoader)
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  # PyYAML's own are those of YAML 1.1
+    depth = 0
 
-    def read(self) -> Any:
-        """Return the content of the whole document; None if it is empty."""
-        content, documents = None, 0
-        for event in iter(self._next, None):
-            if isinstance(event, yaml.DocumentStartEvent):
-                documents += 1
-                if documents > 1:
-                    self._fail("a second document starts here; a file must contain only one document")
-                if event.tags or (event.version or (1, 2)) != (1, 2):
-                    self._fail("YAML directives are not supported; remove them")
-            elif isinstance(event, yaml.NodeEvent):
-                content = self._value(event, ())
-        return content
-
-    def _next(self) -> Any:
-        event = next(self._events, None)
-        if event is not None and event.start_mark is not None:
-            self.at = (event.start_mark.line, event.start_mark.column)
-        return event
-
-    def _fail(self, reason: str) -> NoReturn:
-        _fail(self.file, self.at, reason)
-
-    def _value(self, event: Any, path: YamlPath) -> Any:
-        """Return the value at ``path``, whose first YAML event is ``event``."""
-        self._check_plain(event)
-        self.lines.setdefault(path, self.at[0] + 1)
-        if isinstance(event, yaml.ScalarEvent):
-            return self._scalar(event)
-        if len(path) >= DEPTH_LIMIT:
-            self._fail(f"mappings and lists must not be nested more than {DEPTH_LIMIT} deep")
-        if isinstance(event, yaml.SequenceStartEvent):
-            entries: list[Any] = []
-            while not isinstance(inner := self._next(), yaml.SequenceEndEvent):
-                entries.append(self._value(inner, (*path, len(entries))))
-            return entries
-        values: dict[str, Any] = {}
-        while not isinstance(inner := self._next(), yaml.MappingEndEvent):
-            self._check_plain(inner)
-            key = self._key(inner, values, path)
-            self.lines[(*path, key)] = self.at[0] + 1
-            values[key] = self._value(self._next(), (*path, key))
-        return values
-
-    def _check_plain(self, event: Any) -> None:
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Compose the next node. PyYAML calls this method."""
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        problem = ""
         if isinstance(event, yaml.AliasEvent):
-            self._fail(f"alias *{event.anchor} is not supported; write the value itself")
-        if event.anchor is not None:
-            self._fail(f"anchor &{event.anchor} is not supported; write the value wherever it is needed")
-        if event.tag is not None:
-            self._fail(f"tag {event.tag} is not supported; write the value without a tag")
+            problem = f"alias *{event.anchor} is not supported; write the value itself"
+        elif event.anchor is not None:
+            problem = f"anchor &{event.anchor} is not supported; write the value wherever it is needed"
+        elif event.tag is not None:
+            problem = f"tag {event.tag} is not supported; write the value without a tag"
+        elif self.depth >= DEPTH_LIMIT and not isinstance(event, yaml.ScalarEvent):
+            problem = f"mappings and lists must not be nested more than {DEPTH_LIMIT} deep"
+        if problem:
+            raise _Refused(problem=problem, problem_mark=event.start_mark)
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
-    def _key(self, event: Any, before: Collection[str], path: YamlPath) -> str:
-        if not isinstance(event, yaml.ScalarEvent):
-            self._fail("a key must be text, not a list or a mapping")
-        key = self._scalar(event)
-        if event.implicit[0] and event.value == "<<":
-            self._fail("merge key << is not supported; write the keys and values themselves")
+
+def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
+    """Return the value of a node, and add the line numbers of all its values to ``lines``."""
+    lines.setdefault(path, node.start_mark.line + 1)
+    if isinstance(node, yaml.ScalarNode):
+        return _scalar(node)
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(entry, (*path, k), lines) for k, entry in enumerate(node.value)]
+    values: dict[str, Any] = {}
+    for head, entry in node.value:
+        key = _scalar(head) if isinstance(head, yaml.ScalarNode) else None
         if not isinstance(key, str):
-            self._fail(f"key {event.value!r} must be text; if it is meant as text, put it in quotes")
-        if key in before:
-            self._fail(f"key {key!r} occurs twice; the first is on line {self.lines[(*path, key)]}")
-        return key
+            problem = "a key must be text; if it is meant as text, put it in quotes"
+            raise _Refused(problem=problem, problem_mark=head.start_mark)
+        if key in values:
+            problem = f"key {key!r} occurs twice; the first is on line {lines[(*path, key)]}"
+            raise _Refused(problem=problem, problem_mark=head.start_mark)
+        lines[(*path, key)] = head.start_mark.line + 1
+        values[key] = _value(entry, (*path, key), lines)
+    return values
 
-    def _scalar(self, event: yaml.ScalarEvent) -> str | int | float | bool | None:
-        """Convert a YAML scalar to a Python value by the core schema of YAML 1.2.
 
-        A quoted or block scalar always becomes text.
-        """
-        text = str(event.value)
-        if not event.implicit[0]:
-            return text
-        if text in _PLAIN_VALUES:
-            return _PLAIN_VALUES[text]
-        if integer := _INTEGER.fullmatch(text):
-            return self._integer(integer)
-        if (number := parse_numeral(text)) is not None:
-            return number
-        if special := _NOT_FINITE.fullmatch(text):
-            sign = special["sign"]
-            return float("nan") if sign is None else float(f"{sign}inf")
-        return text
-
-    def _integer(self, match: re.Match[str]) -> int:
-        base = str(match.lastgroup)
-        digits = match[base]
-        value = int(digits, _BASES[base]) if len(digits) <= 64 else _LARGEST_INTEGER
-        if not -_LARGEST_INTEGER < value < _LARGEST_INTEGER:
-            self._fail(f"integer {digits[:24]}{'...' if len(digits) > 24 else ''} does not fit into 64 bits")
-        return value
+def _scalar(node: yaml.ScalarNode) -> Any:
+    """Return a scalar's value. A quoted or block scalar is always text."""
+    if node.style is not None:
+        return str(node.value)
+    value = next(
+        (convert(node.value) for pattern, convert in _PLAIN_VALUES if pattern.fullmatch(node.value)), node.value
+    )
+    if isinstance(value, int) and not -_LARGEST_INTEGER < value < _LARGEST_INTEGER:
+        raise _Refused(problem=f"integer {node.value:.24} does not fit into 64 bits", problem_mark=node.start_mark)
+    return value

@@ -134,7 +134,7 @@ def test_file_that_is_there__is_not_replaced_unasked(file: str, line: str, refus
     ("line", "message"),
     [
         ("evaluate --output file/x", "file/x"),
-        ("run --output file/x", "file: Not a directory"),
+        ("run --output file/x", "file/x: file is not a folder; give a new folder"),
         ("train --output . --force", ".: already exists and is not the folder of a run; choose another name"),
     ],
 )
@@ -150,7 +150,7 @@ def test_output__is_a_folder_of_its_own(line: str, message: str, refuse: Refuse)
         (
             "import ethbrake_marl as eb\neb.make_agent('bad.py:make')\n",
             "--agents bad.py:make",
-            "file 'bad.py', line 2: file 'bad.py': loads itself",
+            "file 'bad.py', line 2: file 'bad.py': does not define 'make'",
         ),
         (
             "worst = 3\n",

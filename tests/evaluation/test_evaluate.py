@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import threading
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +19,9 @@ from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
-from ethbrake_marl.evaluation import door, evaluate as evaluating
+from ethbrake_marl.evaluation import evaluate as evaluating
 from ethbrake_marl.evaluation.evaluate import evaluate
-from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Statistic
+from ethbrake_marl.evaluation.measures import Measure, Statistic
 from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, register_measure
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import summarise
@@ -28,7 +31,7 @@ from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import game_of
-from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, recorded, teams
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, teams
 from tests.refused import refused
 
 # ---- measures
@@ -54,19 +57,6 @@ def test_measures__of_one_impact_by_hand() -> None:
     assert result["full_brake"]["ended"].tolist() == ["at_rest", "at_rest"]
 
 
-def test_measures__that_cost_are_not_computed_unless_they_are_named() -> None:
-    columns = evaluated(PAIR, 2)["full_brake"]
-    assert not [name for name in columns if name.startswith(("sampled", "vehicle_1_shoved", "injury"))]
-    assert {each.name for each in DEFAULT if each.name not in columns} == {"predicted_harm", "replaced"}
-
-
-def test_measures__that_are_not_defined_have_no_column() -> None:
-    obstacle = evaluated("paper-random-obstacle", 3, measures=["sampled_harm", "vehicle_1_shoved_m"])["full_brake"]
-    assert "sampled_harm" not in obstacle and "vehicle_1_shoved_m" in obstacle
-    leads = {**PAIR, "roles": {"vehicle_1": "learner"}, "obstacle_gap_m": 60.0}
-    assert "vehicle_1_shoved_m" not in evaluated(leads, 2, measures=["vehicle_1_shoved_m"])["full_brake"]
-
-
 def test_shoving__is_where_vehicle_1_ends_minus_where_it_would() -> None:
     result = evaluated("paper-random-obstacle", 40, [COAST], ["vehicle_1_shoved_m"])
     scenario, game = game_of("paper-random-obstacle")
@@ -83,12 +73,6 @@ def test_sums_of_terms__are_what_is_rewarded() -> None:
     assert result["collision"] == pytest.approx(-harm, rel=1e-12) and harm.any()
     # at 0.5 s Vehicle 2 reaches -4 m/s2 within a step of 0.1 s, Vehicle 3 -6 m/s2 at 0.8 s; Vehicle 1 has braked before
     assert result["jerk_2"].tolist() == pytest.approx([-1600.0] * 5) and not result["jerk_1"].any()
-
-
-def test_prediction__is_the_field_of_the_agents_memory() -> None:
-    result = evaluated("paper-random", 6, [Foreteller(), FULL_BRAKE])
-    assert result["foreteller"]["predicted_harm"].tolist() == result.worlds["gap_1_m"].tolist()
-    assert "predicted_harm" not in result["full_brake"]
 
 
 def test_measure_of_ones_own__is_a_column_with_its_statistic(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,30 +119,6 @@ def test_measure__that_cannot_be_used(message: str, monkeypatch: pytest.MonkeyPa
         evaluated(PAIR, 2, measures=[name])
 
 
-def test_term_of_ones_own__is_summed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(TERMS, "loaded", dict(TERMS.loaded))
-    register_term("moving", doc(lambda before, step, after: (after.speeds_mps > 0.0) * step.time_step_s), unit="s")
-    result = evaluated(PAIR, 2, [FULL_BRAKE], ["moving"])["full_brake"]
-    assert 3.0 < result["moving_1"][0] <= 3.8
-    with refused("already in use", AlreadyExists):
-        register_measure("moving", doc(lambda game, alert, last: last.time_s))
-    monkeypatch.setattr(MEASURES, "loaded", dict(MEASURES.loaded))
-    register_measure("still", doc(lambda game, alert, last: last.time_s))
-    register_term("still", doc(lambda before, step, after: step.time_step_s * ~after.collided))
-    with refused("measure 'still': a measure and a term of the reward have this name", AlreadyExists):
-        measures_called("still")
-
-
-def test_names_of_measures() -> None:
-    assert [each.name for each in measures_called(["injury", "injury_gidas", "total_harm"])] == [
-        "injury_lr4s", "injury_reference", "injury_gidas", "total_harm",
-    ]  # fmt: skip
-    with refused("unknown measure 'sampled_ham'; did you mean 'sampled_harm'?", UnknownName):
-        measures_called(["sampled_ham"])
-    with refused("social needs an angle from 0 to 90"):
-        evaluated(PAIR, 2, measures=["social:99"])
-
-
 FILE = """
 from ethbrake_marl import Part
 
@@ -185,19 +145,32 @@ def pushes(game, alert):
     return Pushes(game, alert)
 
 
+class Mild:
+    name, knows = "mild", "own sensors"
+
+    def begin(self, alert, body):
+        return None
+
+    def act(self, state, memory, body):
+        return -2.0 + 0.0 * state.time_s, memory
+
+
 steps = Part(watch=pushes, unit="steps")
 number = 3
 """
 
 
-def test_measures_of_a_python_file__run_in_every_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_agents_and_measures_of_a_python_file__run_in_every_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(MEASURES, "loaded", dict(MEASURES.loaded))
     monkeypatch.setattr(evaluating, "CHUNK", 5)
     file = tmp_path / "mine.py"
     file.write_text(FILE)
-    one, two = (evaluated("paper-random", 10, measures=f"{file}:gap,{file}:steps", jobs=jobs) for jobs in (1, 2))
+    names, agents = f"{file}:gap,{file}:steps", {"mild": f"{file}:Mild", "constant": "constant:2"}
+    one, two = (eb.evaluate("paper-random", agents, episodes=10, measures=names, jobs=jobs) for jobs in (1, 2))
     for name in ("gap", "steps"):
-        assert one["full_brake"][name].tolist() == two["full_brake"][name].tolist()
+        assert one["mild"][name].tolist() == two["mild"][name].tolist() == two["constant"][name].tolist()
     assert {each.name: each.unit for each in one.measures[-2:]} == {"gap": "1", "steps": "steps"}
     assert "mine.py" in one.about["versions"]
     with refused("does not define 'gap_m'"):
@@ -206,7 +179,117 @@ def test_measures_of_a_python_file__run_in_every_process(tmp_path: Path, monkeyp
         measures_called([f"{file}:number"])
 
 
+@pytest.mark.parametrize(
+    ("scenario", "missing"),
+    [
+        (PAIR, {"predicted_harm", "replaced"}),
+        ("paper-random-obstacle", {"predicted_harm", "replaced", "sampled_harm"}),
+        (
+            {**PAIR, "roles": {"vehicle_1": "learner"}, "obstacle_gap_m": 60.0},
+            {"predicted_harm", "replaced", "sampled_harm", "vehicle_1_shoved_m"},
+        ),
+    ],
+)
+def test_measures__that_are_not_asked_for_or_not_defined_have_no_column(scenario: Any, missing: set[str]) -> None:
+    asked = ["injury_lr4s", "sampled_harm", "vehicle_1_shoved_m"]
+    result = evaluated(scenario, 2, measures=asked)
+    assert {each.name for each in result.measures if each.name not in result["full_brake"]} == missing
+    assert not any(column.startswith(tuple(asked)) for column in evaluated(scenario, 2)["full_brake"])
+
+
+def test_terms_of_ones_own__are_summed_and_names_are_used_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    for registry in (TERMS, MEASURES):
+        monkeypatch.setattr(registry, "loaded", dict(registry.loaded))
+    register_term("moving", doc(lambda before, step, after: (after.speeds_mps > 0.0) * step.time_step_s), unit="s")
+    assert 3.0 < evaluated(PAIR, 2, [FULL_BRAKE], ["moving"])["full_brake"]["moving_1"][0] <= 3.8
+    register_term("decisions", doc(lambda before, step, after: np.ones(after.n)))
+    counted = evaluated("paper-random", 9, [FULL_BRAKE], ["decisions"])["full_brake"]
+    assert counted["decisions"].tolist() == np.round((counted["end_s"] - 0.5) / 0.1).tolist()
+    assert np.ptp(counted["end_s"]) > 0.0
+    with refused("already in use", AlreadyExists):
+        register_measure("moving", doc(lambda game, alert, last: last.time_s))
+    register_measure("still", doc(lambda game, alert, last: last.time_s))
+    register_term("still", doc(lambda before, step, after: step.time_step_s * ~after.collided))
+    with refused("measure 'still': a measure and a term of the reward have this name", AlreadyExists):
+        measures_called("still")
+    assert [each.name for each in measures_called("injury,injury_gidas,total_harm")] == [
+        "injury_lr4s", "injury_reference", "injury_gidas", "total_harm",
+    ]  # fmt: skip
+    with refused("unknown measure 'sampled_ham'; did you mean 'sampled_harm'?", UnknownName):
+        measures_called(["sampled_ham"])
+    with refused("social needs an angle from 0 to 90"):
+        evaluated(PAIR, 2, measures=["social:99"])
+
+
 # ---- evaluations
+
+
+def test_result__is_the_same_in_chunks_of_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    measures, done = ["sampled_harm", "vehicle_1_shoved_m", "risk"], list[int]()
+    whole = evaluated("paper-random", 50, measures=measures)
+    monkeypatch.setattr(evaluating, "CHUNK", 17)
+    parts = evaluated("paper-random", 50, measures=measures, on_done=done.append)
+    assert done == [17, 34, 50] and parts.about == whole.about
+    for agent, columns in whole.columns.items():
+        for name, column in columns.items():
+            assert parts[agent][name].dtype == column.dtype and (parts[agent][name] == column).all(), name
+
+
+def test_identity__changes_with_worlds_and_scenario_alone() -> None:
+    scenario, game = game_of("paper-random")
+    about = evaluated("paper-random", 5, [FULL_BRAKE]).about
+    assert evaluated("paper-random", 5, [GENTLE]).about == about
+    assert {"python", "ethbrake-marl", "numba", "numpy"} <= about["versions"].keys() and len(
+        about["physics_digest"]
+    ) == 16
+    drawn = scenario.draw(5, 7)
+    given = drawn.worlds._replace(clock=0 * drawn.worlds.clock)  # without their numbers
+    assert evaluate(given, teams(GENTLE), game).about["worlds_sha256"] == about["worlds_sha256"]
+    for other in (evaluated("paper-random", 6), evaluated(scenario.replace(restitution=0.2).declared(), 5)):
+        assert other.about["worlds_sha256"] != about["worlds_sha256"]
+    for key, value, same in (("horizon_s", 5.0, False), ("title", "Mine", True)):
+        other = evaluated(scenario.replace(**{key: value}).declared(), 5)
+        assert (other.about["scenario_sha256"] == about["scenario_sha256"]) == same
+
+
+def test_table_and_parts__of_a_result() -> None:
+    result = evaluated("paper-random", 30, [Foreteller(), FULL_BRAKE])
+    table = result.arrays()
+    assert {len(column) for column in table.values()} == {60}
+    assert table["world"].tolist() == [*range(30)] * 2 and np.isnan(table["predicted_harm"][30:]).all()
+    assert table["total_harm"][30:].tolist() == result["full_brake"]["total_harm"].tolist()
+    some = result.take(result.worlds["gap_1_m"] > 7.5)
+    assert some.n == int((result.worlds["gap_1_m"] > 7.5).sum()) and (some.worlds["gap_1_m"] > 7.5).all()
+    assert some["full_brake"]["total_harm"].tolist() == table["total_harm"][30:][table["gap_1_m"][30:] > 7.5].tolist()
+    frame = pytest.importorskip("pandas") and result.to_pandas()
+    assert frame.groupby("agent").total_harm.mean()["full_brake"] == pytest.approx(table["total_harm"][30:].mean())
+
+
+def test_door__takes_worlds_or_a_scenario() -> None:
+    worlds = load_scenario("paper-random").sample(3, 7)
+    given = eb.evaluate(worlds, "coast,full_brake", scenario="paper-random")
+    drawn = eb.evaluate("paper-random", "coast,full_brake", episodes=3)
+    assert (given.about["seed"], drawn.about["seed"]) == (None, 7) and "coast" in given and "ppo" not in given
+    assert [*given] == ["coast", "full_brake"] == [*drawn]
+    assert given["coast"]["total_harm"].tolist() == drawn["coast"]["total_harm"].tolist()
+
+
+COAST_TWICE = partial(eb.evaluate, agents="coast", episodes=2)
+DOOR: dict[str, Callable[[], Any]] = {
+    "unknown agent in this result 'cost'; did you mean 'coast'": lambda: COAST_TWICE()["cost"],
+    "there is no world among these rows": lambda: COAST_TWICE().take([]),
+    "jobs = 0": lambda: COAST_TWICE(jobs=0),
+    "episodes = 0": lambda: COAST_TWICE(episodes=0),
+    "scenario: is given twice": lambda: COAST_TWICE("paper-random", scenario="paper-random"),
+    "worlds need their scenario": lambda: COAST_TWICE(load_scenario("paper-random").sample(3, 7)),
+    **{f"the name {name!r}": partial(COAST_TWICE, agents={name: "coast"}) for name in ("a\nb", "\u2028", 5)},
+}
+
+
+@pytest.mark.parametrize("message", DOOR, ids=ascii)
+def test_door__refuses(message: str) -> None:
+    with refused(message, UnknownName if message.startswith("unknown") else InvalidInput):
+        DOOR[message]()
 
 
 def test_our_agents__are_sent_to_processes_and_report_what_they_predict(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -237,18 +320,6 @@ def test_golden_rows() -> None:
         assert [f"{shown[0]:.2f}", f"{shown[1]:.2f}", f"{shown[2]:.1%}"] == [first, total, "85.5%"]
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_result__is_the_same_in_chunks_of_any_size_and_in_processes(jobs: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    measures, done = ["sampled_harm", "vehicle_1_shoved_m", "risk"], list[int]()
-    whole = evaluated("paper-random", 50, measures=measures)
-    monkeypatch.setattr(evaluating, "CHUNK", 17)
-    parts = evaluated("paper-random", 50, measures=measures, jobs=jobs, on_done=done.append)
-    assert done == [17, 34, 50] and parts.about == whole.about
-    for agent, columns in whole.columns.items():
-        for name, column in columns.items():
-            assert parts[agent][name].dtype == column.dtype and (parts[agent][name] == column).all(), name
-
-
 def test_result__says_who_knows_what_and_what_was_evaluated() -> None:
     scenario, game = game_of("cooperation-2-blocked")
     agents = {**teams(FULL_BRAKE, Careless()), "both": Team("both", {2: FULL_BRAKE._replace(knows="true model")})}
@@ -258,47 +329,9 @@ def test_result__says_who_knows_what_and_what_was_evaluated() -> None:
     table = summarise(result)
     assert 0.0 < share < 1.0 and [row.sees_through for row in table] == [False, False, True]
     text = " ".join(str(table).split())
-    assert f"In {100 * share:.1f} % of these worlds the V2X channel hides something" in text
-    assert "† both: reads hidden values nevertheless" in text and "do not state what they know: careless." in text
+    assert f"† In {100 * share:.1f} % of these worlds the V2X channel hides something" in text
+    assert "both: reads hidden values nevertheless" in text
     assert not evaluated("paper-random", 12).worlds["hidden"].any()
-
-
-def test_identity__changes_with_worlds_and_scenario_alone() -> None:
-    one, again, other = (
-        evaluated("paper-random", n, [agent]).about for n, agent in ((5, FULL_BRAKE), (5, GENTLE), (6, GENTLE))
-    )
-    assert one == again and one["worlds_sha256"] != other["worlds_sha256"]
-    assert one["scenario_sha256"] == other["scenario_sha256"] and len(one["physics_digest"]) == 16
-    assert {"python", "ethbrake-marl", "numba", "numpy"} <= one["versions"].keys()
-    scenario, game = game_of("paper-random")
-    drawn = scenario.draw(5, 7)
-    listed, given = (
-        evaluate(each, teams(GENTLE), game).about
-        for each in (drawn, drawn.worlds._replace(clock=0 * drawn.worlds.clock))
-    )
-    assert listed["worlds_sha256"] == given["worlds_sha256"]
-    slow = scenario.replace(horizon_s=5.0)
-    assert evaluated(slow.declared(), 5).about["scenario_sha256"] != one["scenario_sha256"]
-
-
-def test_take_and_table__have_one_row_per_team_and_world() -> None:
-    result = evaluated("paper-random", 30, [Foreteller(), FULL_BRAKE])
-    table = result.arrays()
-    assert {len(column) for column in table.values()} == {60}
-    assert table["world"].tolist() == [*range(30)] * 2 and np.isnan(table["predicted_harm"][30:]).all()
-    assert table["total_harm"][30:].tolist() == result["full_brake"]["total_harm"].tolist()
-    some = result.take(result.worlds["gap_1_m"] > 7.5)
-    assert some.n == int((result.worlds["gap_1_m"] > 7.5).sum()) and (some.worlds["gap_1_m"] > 7.5).all()
-    frame = pytest.importorskip("pandas") and result.to_pandas()
-    assert frame.groupby("agent").total_harm.mean()["full_brake"] == pytest.approx(table["total_harm"][30:].mean())
-    with refused("unknown agent in this result 'fullbrake'; did you mean 'full_brake'?", UnknownName):
-        result["fullbrake"]
-
-
-def test_clusters__are_recordings() -> None:
-    result = evaluated(recorded(8), 60)
-    assert result.clusters is not None and len(set(result.clusters)) == 8
-    assert evaluated("paper-random", 3).clusters is None
 
 
 class Wild(Careless):
@@ -314,7 +347,7 @@ def refusals() -> dict[str, Any]:
     begun = game.begin(drawn.worlds)
     pair = game_of(game_of("cooperation-2-five")[0])[0].draw(2, 7)
     local, wrong = Careless(), Team("x", {1: FULL_BRAKE})
-    local.act = lambda state, memory, body: (np.zeros(state.n), memory)  # type: ignore[method-assign]
+    local.lock = threading.Lock()  # type: ignore[attr-defined]
     return {
         "agents = {}: must be a mapping from names to teams": lambda: evaluate(drawn, {}, game),
         "must be a mapping from names to teams, for instance": lambda: evaluate(drawn, {"a": FULL_BRAKE}, game),  # type: ignore[dict-item]
@@ -324,7 +357,7 @@ def refusals() -> dict[str, Any]:
         "2 worlds of 5 vehicles; must be": lambda: evaluate(pair, mine, game),
         "team 'x': drives vehicle_1; must drive exactly vehicle_2": lambda: evaluate(drawn, {"a": wrong}, game),
         "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan m/s2": lambda: evaluate(drawn, teams(Wild()), game),
-        "'careless' cannot be sent to another process": lambda: evaluate(drawn, teams(local), game, jobs=2),
+        "this cannot be sent to another process (cannot": lambda: evaluate(drawn, teams(local), game, jobs=2),
     }  # fmt: skip
 
 
@@ -350,28 +383,17 @@ def test_sampled_harm__needs_an_overlap_and_a_closing_speed(gap_m: float, gap_af
     assert evaluated(far, 1, [FULL_BRAKE], ["sampled_harm"])["full_brake"]["sampled_harm"].tolist() == [harm]
 
 
-def test_seed__is_recorded_of_drawn_worlds_and_not_of_given_ones() -> None:
-    worlds = load_scenario("paper-random").sample(3, 7)
-    given = door.evaluate(worlds, "full_brake", scenario="paper-random")
-    drawn = door.evaluate("paper-random", "full_brake", episodes=3, seed=9)
-    assert (given.about["seed"], drawn.about["seed"]) == (None, 9)
-
-
-class Touching:
-    """Adds 1 to its memory, in place or not."""
+class Touching(Careless):
+    """Changes its memory in place."""
 
     name, knows = "touching", "own sensors"
-
-    def __init__(self, in_place: bool) -> None:
-        self.in_place = in_place
 
     def begin(self, alert: State, body: int) -> Any:
         return np.zeros(alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> Any:
-        if self.in_place:
-            memory += 1.0
-        return np.minimum(memory - 6.0, 0.0), memory + 1.0
+        memory += 1.0
+        return np.minimum(memory - 6.0, 0.0), memory
 
 
 def test_what_others_bring__cannot_change_what_happens() -> None:
@@ -379,8 +401,7 @@ def test_what_others_bring__cannot_change_what_happens() -> None:
     scenario, game = game_of("paper-random")
     worlds = scenario.draw(3, 7)
     with refused("agent 'touching', vehicle_2: act fails: ValueError"):
-        evaluate(worlds, teams(Touching(in_place=True)), game)
-    evaluate(worlds, teams(Touching(in_place=False)), game)
+        evaluate(worlds, teams(Touching()), game)
 
     def heavier(game: Any, alert: State, last: State) -> Any:
         """Mass."""
@@ -405,20 +426,3 @@ def test_what_others_bring__cannot_change_what_happens() -> None:
     for name in ("world", "gap_1_m"):
         with refused(f"measure '{name}': is the name of a column of the worlds"):
             evaluate(worlds, teams(GENTLE), game, [Measure(name, lambda game, alert, last: last.time_s)])
-
-
-@pytest.mark.parametrize("name", ["", "a\nb", "a\x00b", "\u2028", 5])
-def test_name_of_an_agent__is_a_printable_text(name: Any) -> None:
-    with refused("the name"):
-        eb.evaluate("paper-random", {name: "coast"}, episodes=2)
-
-
-def test_result__has_teams_and_worlds() -> None:
-    result = eb.evaluate("paper-random", "coast,full_brake", episodes=3)
-    assert "coast" in result and "ppo" not in result and list(result) == ["coast", "full_brake"]
-    with refused("there is no world among these rows"):
-        result.take([])
-    with refused("jobs = 0"):
-        eb.evaluate("paper-random", "coast", episodes=2, jobs=0)
-    with refused("'coast': is a name; pass make_agent('coast')"):
-        eb.shield("coast", scenario="paper-random")

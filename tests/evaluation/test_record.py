@@ -29,10 +29,9 @@ def test_record__of_one_impact_by_hand() -> None:
     at = {time: int(np.argmin(abs(record.time_s - time))) for time in (0.0, 0.4, 0.5)}
     assert record.positions_m[at[0.0]].tolist() == [0.0, -1.0]
     assert record.positions_m[at[0.4]] == pytest.approx([8.0 - 0.48, 8.0 - 1.0])  # 3 t^2 = 0.48
-    assert record.command_mps2[at[0.4]].tolist() == [-6.0, 0.0] and record.command_mps2[at[0.5]].tolist() == [
-        -6.0,
-        -6.0,
-    ]
+    assert record.command_mps2[[at[0.4], at[0.5]]].tolist() == [[-6.0, 0.0], [-6.0, -6.0]]
+    late = recorded(Scenario(**{**PAIR, "latency_s": [0.3, 0.5]}))
+    assert [late.command_mps2[late.time_s < 0.299, 0].min(), late.command_mps2[late.time_s > 0.301, 0].max()] == [0, -6]
     assert record.speeds_mps[at[0.5]] == pytest.approx([17.0, 20.0])
     assert record.positions_m[-1, 0] == pytest.approx(10.6458333 + 27.95327, abs=1e-4) and record.at_rest
     assert "1 impact, harm 9.00 first-impact, 9.00 total" in repr(record)

@@ -1,10 +1,10 @@
-"""Results in files and back, hostile and edited files, and comparisons of two results."""
+"""Results in files and back, edited files, and comparisons of two results."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput
+from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.evaluation.compare import compare_results
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.results import _digest, read_result, write_results, write_rows
+from ethbrake_marl.evaluation.results import read_result, write_results, write_rows
 from ethbrake_marl.evaluation.statistics import difference
 from ethbrake_marl.evaluation.summary import summarise
+from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Foreteller, evaluated, recorded
 from tests.refused import refused
-
-ROWS = ["csv", "parquet", "json"]
 
 
 def written(folder: Path, result: Result, rows: Any = "csv", **more: Any) -> Path:
@@ -30,28 +29,24 @@ def written(folder: Path, result: Result, rows: Any = "csv", **more: Any) -> Pat
     return folder / "results.json"
 
 
-def same(one: Result, other: Result) -> None:
-    for mine, theirs in ((one.worlds, other.worlds), *((one[team], other[team]) for team in one.columns)):
-        assert mine.keys() == theirs.keys()
-        for name, column in mine.items():
-            assert column.dtype.kind == theirs[name].dtype.kind, name
-            assert np.array_equal(column, theirs[name], equal_nan=column.dtype.kind == "f"), name
+def called_mine(scenario: Any, n: int, agent: Any) -> Result:
+    found = evaluated(scenario, n, [agent])
+    return replace(found, columns={"mine": found[agent.name]}, knows={"mine": ""}, policies={"mine": {}})
 
 
-@pytest.mark.parametrize("rows", ROWS)
-@pytest.mark.parametrize("scenario", ["paper-random", "mixture-obstacle", "recorded", "engineering-loaded-lorries"])
-def test_result__comes_back_as_it_was(scenario: str, rows: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("rows", ["csv", "parquet"])
+def test_result__comes_back_as_it_was(rows: str, tmp_path: Path) -> None:
     if rows == "parquet":
         pytest.importorskip("pyarrow")
-    declared = recorded(4).declared() if scenario == "recorded" else scenario
-    result = evaluated(declared, 30, [FULL_BRAKE, Foreteller()], ["sampled_harm", "jerk", "own"])
-    saved = read_result(written(tmp_path / "out", result, rows))
-    assert saved.result is not None and saved.no_rows_because == ""
-    same(saved.result, result)
-    assert summarise(saved.result).to_json() == summarise(result).to_json()
-    assert {
-        (c.unpaired_because, c.differences[0].harms["total_harm"].value) for c in [compare_results(saved, result)]
-    } == {("", 0.0)}
+    result = evaluated(recorded(4), 30, [FULL_BRAKE, Foreteller()])
+    saved, table = read_result(written(tmp_path / "out", result, rows)), summarise(result)
+    assert saved.rows is not None and saved.no_rows_because == ""
+    for name in ("agent", "world", "recording", "first_impact_harm", "total_harm"):
+        assert saved.rows[name].tolist() == result.arrays()[name].tolist()
+    own = {name: {k: v for k, v in each.items() if k != "per_world"} for name, each in saved.agents.items()}
+    assert own == {each["agent"]: each for each in table.to_json()}
+    assert saved.estimate("foreteller", "predicted_harm") == table[1]["predicted_harm"]
+    assert compare_results(saved, result).differences["full_brake"]["total_harm"].interval == (0.0, 0.0)
 
 
 def test_rows__have_empty_cells_and_numbers_for_truths(tmp_path: Path) -> None:
@@ -69,19 +64,17 @@ def test_files__are_not_overwritten_unless_forced(tmp_path: Path) -> None:
     before = path.read_bytes()
     with refused("already exists", AlreadyExists):
         written(tmp_path / "out", result)
-    written(tmp_path / "out", evaluated(PAIR, 3), force=True, more={"agent_settings": {"harm_count": "total"}})
-    assert path.read_bytes() != before and read_result(path).about["agent_settings"] == {"harm_count": "total"}
-    with refused("must end in .csv, .parquet or .json"):
+    written(tmp_path / "out", evaluated(PAIR, 3), force=True)
+    assert path.read_bytes() != before and read_result(path).about["episodes"] == 3
+    with refused("must end in .csv or .parquet"):
         write_rows(tmp_path / "w.txt", result)
 
 
 EDITS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "episodes": lambda row: row.update(episodes=2),
     "interval": lambda row: row.update(total_harm_interval=[0.0, 1e30]),
-    "mean": lambda row: row.update(total_harm=1.0),
     "error": lambda row: row.update(total_harm_error=1e-9),
     "name": lambda row: row.update(agent="mine"),
-    "digest of the worlds": lambda row: row.update(worlds_sha256="0" * 64),
     "one key less": lambda row: row.pop("collisions"),
     "one key more": lambda row: row.update(extra=1),
     "another digest": lambda row: row.update(results_sha256="0" * 64),
@@ -99,74 +92,26 @@ def test_edited_file__is_refused_in_one_line(edit: str, tmp_path: Path) -> None:
         read_result(path)
 
 
-HOSTILE: dict[str, Callable[[dict[str, Any]], Any]] = {
-    "episodes is missing or not of type int": lambda row: row.update(episodes=True),
-    "must be numbers of worlds": lambda row: row.update(episodes=0),
-    "episodes, collisions, horizon_ends must be": lambda row: row.update(collisions=21),
-    "total_harm = -1.0": lambda row: row.update(total_harm=-1.0),
-    "total_harm = 1e+300": lambda row: row.update(total_harm=1e300, total_harm_interval=None),
-    "total_harm_interval = [0.0, 0.1]": lambda row: row.update(total_harm_interval=[0.0, 0.1]),
-    "total_harm_interval = [1]": lambda row: row.update(total_harm_interval=[1]),
-    "must be a mean harm": lambda row: row.update(total_harm="12"),
-    "and an interval [low, high] that contains it": lambda row: row.update(total_harm_freedom=None),
-    "policy_sha256 is missing or not of type dict": lambda row: row.update(policy_sha256=[]),
-    "its rows per world cannot be read": lambda row: row.update(per_world={"file": ["x"], "sha256": 1}),
-}
+OTHER = {
+    "": "must contain complete JSON", "[]": "is not a results file", '{"kind": "shield"}': "is not a results file",
+    '[{"kind": "evaluate"}, 3]': "is not a results file", '{"a": NaN}': "NaN is not a JSON number",
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("message", HOSTILE)
-def test_hostile_file__with_a_digest_of_its_own_is_refused(message: str, tmp_path: Path) -> None:
-    path = written(tmp_path / "out", evaluated("paper-random", 20), None)
-    rows = [
-        {key: value for key, value in row.items() if key != "results_sha256"} for row in json.loads(path.read_text())
-    ]
-    HOSTILE[message](rows[0])
-    path.write_text(json.dumps([{**row, "results_sha256": _digest(rows)} for row in rows]))
-    with refused(message):
-        read_result(path)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("", "must contain complete JSON"),
-        ("[]", "is not a results file"),
-        ('{"kind": "shield"}', "is not a results file"),
-        ('[{"kind": "evaluate"}, 3]', "is not a results file"),
-        ('{"a": NaN}', "NaN is not a JSON number"),
-        ("[" * 100_000, "must contain complete JSON"),
-    ],
-)
-def test_other_file__is_refused(content: str, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("content", OTHER)
+def test_other_file__is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "results.json").write_text(content)
-    with refused(message):
+    with refused(OTHER[content]):
         read_result(tmp_path / "results.json")
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda text: text.replace("full_brake", "full_break"),
-        lambda text: text[: len(text) // 2],
-        lambda text: "agent\n",
-        lambda text: text.replace("at_rest", "1e999"),
-    ],
-)
-def test_changed_rows__are_not_paired_and_damaged_ones_are_refused(
-    change: Callable[[str], str], tmp_path: Path
-) -> None:
+def test_rows__that_were_changed_or_removed_are_not_paired(tmp_path: Path) -> None:
     path, rows = written(tmp_path / "out", evaluated("paper-random", 20)), tmp_path / "out" / "worlds.csv"
-    text = change(rows.read_text())
-    rows.write_text(text)
+    rows.write_text(rows.read_text().replace("full_brake,1,", "full_brake,2,"))
     assert "was changed after" in read_result(path).no_rows_because
-    objects = [{k: v for k, v in row.items() if k != "results_sha256"} for row in json.loads(path.read_text())]
-
-    for row in objects:
-        row["per_world"]["sha256"] = hashlib.sha256(rows.read_bytes()).hexdigest()
-    path.write_text(json.dumps([{**row, "results_sha256": _digest(objects)} for row in objects]))
-    if "1e999" not in text:
-        with refused("its rows per world cannot be read"):
-            read_result(path)
+    rows.unlink()
+    found = compare_results(read_result(path), evaluated("paper-random", 20))
+    assert "does not exist" in found.unpaired_because and found.to_json()["intervals"] == "unpaired"
 
 
 # ---- comparisons
@@ -176,12 +121,10 @@ def test_comparison__is_paired_by_world_where_both_have_rows(tmp_path: Path) -> 
     one = evaluated("paper-random", 60, [FULL_BRAKE, COAST])
     other = evaluated("paper-random", 60, [GENTLE._replace(name="constant:4"), FULL_BRAKE])
     mine = {"full_brake": other["constant:4"], "constant:4": other["full_brake"]}
-    other = Result(mine, other.worlds, other.measures, other.knows, other.policies, other.about)
-    found = compare_results(
-        read_result(written(tmp_path / "one", one, "csv")), read_result(written(tmp_path / "two", other, "json"))
-    )
-    (each,) = found.differences
-    assert each.harms["total_harm"] == difference(other["full_brake"]["total_harm"], one["full_brake"]["total_harm"])
+    other = replace(other, columns=mine)
+    found = compare_results(*(read_result(written(tmp_path / name, each)) for name, each in (("1", one), ("2", other))))
+    (harms,) = found.differences.values()
+    assert harms["total_harm"] == difference(other["full_brake"]["total_harm"], one["full_brake"]["total_harm"])
     assert found.left_over == (("coast",), ("constant:4",)) and found.unpaired_because == ""
     assert found.to_json()["intervals"] == "paired" and json.dumps(found.to_json(), allow_nan=False)
     assert found == compare_results(one, other)
@@ -190,35 +133,39 @@ def test_comparison__is_paired_by_world_where_both_have_rows(tmp_path: Path) -> 
 
 
 def test_comparison__is_by_recording(tmp_path: Path) -> None:
-    one, other = (evaluated(recorded(8), 100, [agent._replace(name="mine")]) for agent in (FULL_BRAKE, GENTLE))
+    one, other = (called_mine(recorded(8), 100, agent) for agent in (FULL_BRAKE, GENTLE))
     found = compare_results(read_result(written(tmp_path / "one", one)), other)
     expected = difference(other["mine"]["total_harm"], one["mine"]["total_harm"], one.clusters)
-    assert found.recordings == 8 and found.differences[0].harms["total_harm"] == expected
+    assert found.recordings == 8 and found.differences["mine"]["total_harm"] == expected
     assert "95 % intervals by 8 recordings" in " ".join(found.notes())
 
 
-@pytest.mark.parametrize("n", [3, 12, 60])
+@pytest.mark.parametrize("n", [3, 60])
 def test_comparison__without_rows_uses_the_stored_errors(n: int, tmp_path: Path) -> None:
-    scenario = "realistic-motorway"  # rare harm: intervals are cut at 0
-    one, other = (evaluated(scenario, n, [agent._replace(name="mine")]) for agent in (FULL_BRAKE, COAST))
+    one, other = (called_mine("realistic-motorway", n, agent) for agent in (FULL_BRAKE, COAST))  # intervals cut at 0
     saved = [read_result(written(tmp_path / name, each, None)) for name, each in (("one", one), ("two", other))]
     found = compare_results(*saved)
     x, y = (each["mine"]["total_harm"] for each in (other, one))
     welch = stats.ttest_ind(x, y, equal_var=False).confidence_interval()
-    assert found.differences[0].harms["total_harm"].interval == pytest.approx((welch.low, welch.high), rel=1e-9)
-    assert "NOT paired by world" in found.notes()[0] and "evaluate again with --per-world" in found.unpaired_because
+    assert found.differences["mine"]["total_harm"].interval == pytest.approx((welch.low, welch.high), rel=1e-9)
+    assert "NOT paired by world" in next(found.notes()) and "evaluate again with --per-world" in found.unpaired_because
 
 
-def test_comparison__notes_other_settings_versions_and_physics(tmp_path: Path) -> None:
+def test_comparison__notes_other_policies_settings_versions_and_physics() -> None:
     result = evaluated(PAIR, 4)
-    about = {**result.about, "physics_digest": "0" * 64, "versions": {**result.about["versions"], "numpy": "1.0"}}
-    other = Result(result.columns, result.worlds, result.measures, result.knows, result.policies, about)
-    one = written(tmp_path / "one", result, more={"agent_settings": {"harm_count": "first"}})
-    two = written(tmp_path / "two", other, more={"agent_settings": {"harm_count": "total"}})
-    notes = compare_results(read_result(one), read_result(two)).notes()
-    assert "Note: physics_digest differs." in notes
-    assert "Note: harm_count: first in the first result, total in the second." in notes
+    versions = {**result.about["versions"], "numpy": "1.0"}
+    about = {"physics_digest": "0" * 64, "versions": versions, "agent_settings": {"harm_count": "total"}}
+    policies = {"full_brake": {"vehicle_2": "a"}, "constant:4.0": {}}
+    found = compare_results(result, replace(result, about={**result.about, **about}, policies=policies))
+    notes = [*found.notes()]
+    assert "Note: harm_count: None in the first result, total in the second." in notes
+    assert any(note.startswith("Note: physics_digest: ") for note in notes)
     assert any(note.startswith("Note: numpy: ") and note.endswith("1.0 in the second.") for note in notes)
+    assert "Note: policy of vehicle_2 in full_brake: None in the first result, a in the second." in notes
+
+
+def changed(**settings: Any) -> Callable[[], Result]:
+    return lambda: evaluated(load_scenario("paper-random").replace(**settings).declared(), 20)
 
 
 @pytest.mark.parametrize(
@@ -226,16 +173,16 @@ def test_comparison__notes_other_settings_versions_and_physics(tmp_path: Path) -
     [
         (lambda: evaluated("paper-random", 21), "cannot be compared: their worlds differ (worlds_sha256 is "),
         (lambda: evaluated("paper-random", 20, [COAST]), "have no agent in common"),
-        (lambda: evaluated(slow("time_step_s", 0.2), 20), "their scenarios differ"),
-        (lambda: evaluated(slow("roles", {"vehicle_2": "full_brake", "vehicle_3": "learner"}), 20), "worlds differ"),
+        (changed(horizon_s=7.0), "their scenarios differ"),
+        (changed(roles={"vehicle_2": "full_brake", "vehicle_3": "learner"}), "worlds differ"),
     ],
 )
 def test_comparison__of_what_is_not_comparable(other: Callable[[], Result], message: str) -> None:
-    with refused(message, InvalidInput):
+    with refused(message):
         compare_results(evaluated("paper-random", 20, [FULL_BRAKE]), other())
 
 
-def slow(key: str, value: Any) -> dict[str, Any]:
-    from ethbrake_marl.worlds.catalogue import load_scenario
-
-    return dict(load_scenario("paper-random").replace(**{key: value}).declared())
+def test_comparison__of_other_parts_of_a_result_is_refused() -> None:
+    result = evaluated("paper-random", 20)
+    with refused("they do not list the same worlds"):
+        compare_results(result.take(np.arange(5)), result.take(np.arange(5, 10)))

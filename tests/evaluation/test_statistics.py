@@ -1,7 +1,6 @@
 """Means, rates and comparisons: by hand, against programs written otherwise, and how often they cover the truth."""
 
 import math
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -133,14 +132,7 @@ def drawn(rng: np.random.Generator, groups: int, spread: float, few: bool) -> tu
 
 
 @pytest.mark.parametrize(
-    ("groups", "spread", "few", "least"),
-    [
-        (3, 1.2, False, 0.90),
-        (5, 1.2, False, 0.92),
-        (10, 0.3, False, 0.91),
-        (30, 1.2, False, 0.92),
-        (66, 0.8, True, 0.91),
-    ],
+    ("groups", "spread", "few", "least"), [(3, 1.2, False, 0.90), (10, 0.3, False, 0.91), (66, 0.8, True, 0.91)]
 )
 def test_interval__by_few_unequal_recordings_covers_the_truth(
     groups: int, spread: float, few: bool, least: float
@@ -167,13 +159,3 @@ def test_unpaired_by_hand() -> None:
     assert unpaired(one, Estimate(4.0, (3.0, 5.0))).interval is None
     same = Estimate(2.0, (2.0, 2.0), 0.0, 8.0)
     assert unpaired(same, same).interval == (0.0, 0.0)
-
-
-def test_unpaired__uses_the_error_and_not_the_interval_that_is_cut_at_zero() -> None:
-    rng = np.random.default_rng(1)
-    values = [rng.exponential(1.0, 40) * (rng.random(40) < share) for share in (0.05, 0.1, 0.2)]
-    means = [mean(each) for each in values]
-    assert means[0].interval is not None and means[0].interval[0] == 0.0
-    for (a, x), (b, y) in pairwise(zip(means, values, strict=True)):
-        found, welch = unpaired(a, b), stats.ttest_ind(x, y, equal_var=False).confidence_interval()
-        assert found.interval == pytest.approx((welch.low, welch.high), rel=1e-9)

@@ -15,7 +15,7 @@ from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise, summarise_by, summarise_lists
 from ethbrake_marl.files.sheet import terminal_text
-from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, recorded
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Foreteller, evaluated, recorded
 from tests.refused import refused
 
 EXPENSIVE = ["sampled_harm", "vehicle_1_shoved_m"]
@@ -56,11 +56,8 @@ def test_estimates__are_those_of_the_columns(result: Result) -> None:
 
 def test_baseline__can_be_another_or_missing(result: Result) -> None:
     gentle = summarise(result, baseline="constant:4.0")
-    assert [row["total_harm_difference"] == statistics.Estimate(0.0, (0.0, 0.0)) for row in gentle] == [
-        False,
-        True,
-        False,
-    ]
+    same = [row["total_harm_difference"] == statistics.Estimate(0.0, (0.0, 0.0)) for row in gentle]
+    assert same == [False, True, False]
     with refused("unknown baseline 'nobody'; known: ", UnknownName):
         summarise(result, baseline="nobody")
     nobody = summarise(evaluated(PAIR, 2, [COAST, GENTLE]))  # without full braking
@@ -93,22 +90,9 @@ def test_terminal_of_80__shows_both_harms_with_intervals_and_what_was_asked_for(
     head = " ".join(text.splitlines()[0].split())
     assert head == "Agent, First-impact Total Sampled Shoved Shoved"
     assert "constant:4.0 ‡" in text and "own sensors" in text and "95 % interval" in text
-    narrow = at(48, summarise(result), monkeypatch)
+    narrow = at(56, summarise(result), monkeypatch)
     assert "Total" in narrow and "First-impact" in narrow and "Sampled" not in narrow
     assert "Decrease" in at(120, summarise(result), monkeypatch)
-
-
-@pytest.mark.parametrize("length", [20, 40, 60, 200])
-def test_names__are_never_broken(length: int, result: Result, monkeypatch: pytest.MonkeyPatch) -> None:
-    name = ("policy@runs/" + "deep/" * 40)[:length]
-    columns = {name: result["full_brake"], "constant:4.0": result["constant:4.0"]}
-    renamed = replace(
-        result, columns=columns, knows=dict.fromkeys(columns, "messages"), policies={key: {} for key in columns}
-    )
-    monkeypatch.setenv("COLUMNS", "80")
-    text = str(summarise(renamed, baseline=name))
-    assert any(name[:76] in line for line in text.splitlines()), text
-    assert "constant:4.0" in text and "harm" in text
 
 
 @pytest.mark.parametrize("where", ["script", "terminal", "notebook", "redirected"])
@@ -151,7 +135,7 @@ def test_data_frame(result: Result) -> None:
 def test_measures_without_a_heading__have_a_table_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     table = summarise(evaluated("paper-random", 20, measures=["jerk", "own"]))
     text = at(80, table, monkeypatch)
-    assert "jerk, vehicle 2 (1)" in text and "own_total, vehicle 3 (m2/s2)" in text
+    assert "jerk_2 (1)" in text and "own_total_3 (m2/s2)" in text
     assert summarise(evaluated("paper-random", 20)).measures() is None
 
 
@@ -179,33 +163,19 @@ def test_exploits__mark_the_row_and_are_a_sentence_below(shoved_m: float, moving
     assert ("mine ‡" in text) == bool(names) and "full_brake ‡" not in text
     assert (f"shoves Vehicle 1 by {shoved_m:.1f} m on average" in text) == ("shoves" in names)
     assert (f"runs past the horizon in {5 * moving:.1f} % of worlds" in text) == ("moving" in names)
-    assert f"still moved at the horizon (8 s): mine {moving}. Harm after" in text
 
 
-def test_notes__of_no_impact_rejected_draws_and_recordings() -> None:
-    far = {**PAIR, "gaps_m": 1000.0}
-    text = " ".join(str(summarise(evaluated(far, 50, [FULL_BRAKE]))).split())
-    assert "No impact in 50 worlds: full_brake. With 95 % confidence, at most 7.1 % of all such worlds" in text
+def test_notes__of_rejected_draws_and_recordings() -> None:
     rejecting = {**recorded(8).declared(), "early_impacts": "reject", "latency_s": [0.0, {"uniform": [0.3, 1.5]}, 1.6]}
     table = summarise(evaluated(rejecting, 60))
     text = " ".join(str(table).split())
-    assert table.parameters["rejected_draws"] > 0 and "drawn worlds (" in text
+    rejected = table.parameters["rejected_draws"]
+    share = f"{100 * rejected / (60 + rejected):.1f} %"
+    assert rejected > 0 and f"{rejected} of {60 + rejected} drawn worlds ({share}) were rejected" in text
     assert "60 worlds, seed 7; 95 % intervals by 8 recordings; d = " in text
     single = summarise(evaluated(recorded(1), 20))
     assert "no 95 % intervals: all worlds come from one recording" in " ".join(str(single).split())
     assert single[0]["total_harm"].interval is None  # type: ignore[union-attr]
-
-
-def test_intervals__are_by_recording() -> None:
-    result = evaluated(recorded(8), 200)
-    harm, recordings = result["constant:4.0"]["total_harm"], result.clusters
-    row = summarise(result)[1]
-    assert row["total_harm"] == statistics.mean(harm, recordings)
-    assert row["total_harm"].interval[1] > 1.05 * statistics.mean(harm).interval[1]  # type: ignore[union-attr, index]
-
-
-def test_knowledge__of_an_agent_that_says_nothing() -> None:
-    assert summarise(evaluated(PAIR, 2, [Careless()]))[0].knows == "not stated"
 
 
 # ---- groups and lists

@@ -1,14 +1,15 @@
 """One table, written in five ways."""
 
 import sys
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
 
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 
 RATE = Column("Collisions", "rate", digits=1, scale=100.0, unit=" %", short="Hit", interval="below")
-CHANGE = Column("Change", sign="+", interval="hidden", wide=True)
+CHANGE = Column("Change", sign="+", interval="hidden")
 HARM = Estimate(0.25, (0.125, 0.5))
 SHEET = Sheet(
     "Two agents",
@@ -46,6 +47,20 @@ def test_sheet__moves_no_cursor_and_reads_no_markup(capsys: pytest.CaptureFixtur
     assert printed(marked, 80, capsys) == "[b]t[/b]\n[red]x\n───────────\n\\x1b[31m[/]\n"
 
 
+def test_narrow_terminal__leaves_out_columns_from_the_right_and_numbers_long_names(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    name = "policy@runs/deep/deep"
+    columns = [Column("Agent", text=True), *(Column(f"Column {k}") for k in range(3))]
+    sheet = Sheet("", columns, [(f"{name}\nmessages", 1.0, 2.0, 3.0), ("coast", 4.0, 5.0, 6.0)], "Means.", 1, keep=2)
+    widths = {40: "Agent Column 0 Column 1", 30: "Agent Column 0", 25: "Agent Column 0"}
+    for width, head in widths.items():
+        text = printed(sheet, width, capsys)
+        assert " ".join(text.split("\n")[0].split()) == head and name in text and text.endswith("Means.\n")
+        assert (f"\n[1] {name}\n" in text) == (width == 25)
+    assert "Column 2" in printed(replace(sheet, keep=None), 40, capsys)
+
+
 def test_sheet__in_a_document() -> None:
     assert SHEET.markdown().split("\n") == [
         "| Agent | Collisions | Change |",
@@ -53,6 +68,16 @@ def test_sheet__in_a_document() -> None:
         r"| a\|b knows | 25.0 % [12.5, 50.0] | -0.00 |",
         "| paper, <test>: Non-E | – | +2.00 |",
         "| paper, <test>: last |  |  |",
+    ]
+
+
+def test_sheet__in_latex() -> None:
+    assert SHEET.latex().split("\n")[2:7] == [
+        r"Agent & Collisions & Change \\",
+        r"\midrule",
+        r"a|b knows & 25.0 \% {[}12.5, 50.0{]} & -0.00 \\",
+        r"paper, <test> \\",
+        r"Non-E & -- & +2.00 \\",
     ]
 
 
@@ -99,9 +124,6 @@ def test_sheet__as_data() -> None:
         "last,,,,,,",
         "",
     ]
-    assert csv_text([{"x": 1}], ["x", "y"]) == "x,y\n1,\n"
-    with pytest.raises(ValueError, match="dict contains fields not in fieldnames: 'z'"):
-        csv_text([{"z": 1}], ["x"])
 
 
 def test_estimates__in_words_and_as_data() -> None:

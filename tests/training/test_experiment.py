@@ -40,8 +40,8 @@ def test_one_learner__is_compared_alone_and_in_the_hybrid(tmp_path: Path) -> Non
     worst = np.maximum(*(found.compared.result[name]["first_impact_harm"] for name in ("trained policy", "e_v2x_bm")))
     assert (found.compared.result["hybrid"]["first_impact_harm"] <= worst).all()
     saved = eb.read_result(run / "results.json")
-    assert [*saved.agents] == names and saved.result is not None and saved.result.n == EPISODES
-    assert {"sampled_harm", "vehicle_1_shoved_m"} <= saved.result.columns["hybrid"].keys()
+    assert [*saved.agents] == names and saved.rows is not None and len(saved.rows["world"]) == len(names) * EPISODES
+    assert {"sampled_harm", "vehicle_1_shoved_m"} <= saved.agents["hybrid"].keys()
     end = status(run)
     assert (end["status"], end["stage"], end["steps"], end["reason"]) == ("finished", "evaluation", 256, None)
     assert end["written"] == ["results.json", "worlds.csv"] and end["policy"] == "policy" and end["started_utc"]

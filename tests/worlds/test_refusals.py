@@ -312,6 +312,11 @@ def test_mistake__is_refused_with_its_place_and_what_would_be_right(message: str
         REFUSED[message]()
 
 
+def test_first_mistake__is_shown() -> None:
+    with refused("braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2 (metres per second squared)"):
+        given(braking_capacity_mps2="0", mass_t="0", restitution="2")
+
+
 @pytest.mark.parametrize("copied", [PAPER, pickle.loads(pickle.dumps(PAPER)), copy.deepcopy(PAPER)])
 def test_roles__are_frozen(copied: Scenario) -> None:
     for change in (

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,10 @@ from ethbrake_marl.agents.drive import Team, play, to_action
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import NUMBER, State
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput, check_whole_number, naming_extras
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.identity import versions
-from ethbrake_marl.files.sheet import parquet_file
-from ethbrake_marl.files.store import check_target
+from ethbrake_marl.files.store import check_target, new_file
 from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.game import AnyScenario
 
@@ -71,14 +71,26 @@ def to_parquet(
         "reward": game.rewarding.params.model_dump(mode="json"),
         "versions": versions(),
     }
-    with parquet_file(check_target(path, force=force), told=lambda: {"ethbrake_marl": json.dumps(about)}) as write:
+    with naming_extras():
+        import pyarrow
+        from pyarrow.parquet import ParquetWriter
+
+    def tables() -> Iterator[Any]:
         for name, team in teams.items():
             for first in range(0, episodes, AT_ONCE):
                 alert = loaded.sample(min(AT_ONCE, episodes - first), seed, first=first)
                 rows = list(decisions(game, alert, actions_of(team, game, alert)))
                 columns = {column: np.concatenate([each[column] for each in rows]) for column in rows[0]}
                 order = np.argsort(columns["world"], kind="stable")  # one episode after the other
-                write({"agent": np.full(len(order), name)} | {key: values[order] for key, values in columns.items()})
+                table = {"agent": np.full(len(order), name)} | {key: values[order] for key, values in columns.items()}
+                yield pyarrow.table(table, metadata={"ethbrake_marl": json.dumps(about)})
+
+    with new_file(check_target(path, force=force)) as partial:
+        each = tables()
+        table = next(each)
+        with ParquetWriter(partial, table.schema) as writer:
+            for following in chain([table], each):
+                writer.write_table(following)
 
 
 def actions_of(team: Team, game: Game, alert: State) -> list[Observations]:

@@ -134,7 +134,7 @@ def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(compare
     assert (band.min(), band.max()) == (pytest.approx(min(low)), pytest.approx(max(high)))
     assert legend(figure) == [*compared.teams] and "seed 7" in caption(figure)
     assert first.get_xlabel() == "Total gap at the alert, d1 + d2 (m)"
-    one = harm_against_total_gap(compared.first(1)).axes[0].lines[0]
+    one = harm_against_total_gap(compared.result.take([0])).axes[0].lines[0]
     assert one.get_xydata() == pytest.approx(np.array([[gap[0], harm[0]]]))
 
 
