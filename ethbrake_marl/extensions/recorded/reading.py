@@ -84,9 +84,9 @@ def read_cells(file: Path, entry: Format) -> Cells:
     columns: dict[str, Any] = {}
     cells = Cells(file, {quantity: names[k] for quantity, k in at.items()}, heading, None)
     for quantity, name in zip(at, used, strict=True):
-        column = compute.utf8_trim_whitespace(table.column(name))
+        column = table.column(name)
         if quantity in entry.texts:
-            columns[quantity] = column.to_pandas()
+            columns[quantity] = compute.utf8_trim_whitespace(column).to_pandas()
         else:
             columns[quantity] = _numbers(cells, quantity, column, entry.gaps and quantity != "time")
     frame = pd.DataFrame(columns)
@@ -132,10 +132,10 @@ def _numbers(cells: Cells, quantity: str, column: Any, may_be_empty: bool) -> An
     try:
         values = column.cast(pyarrow.float64()).to_numpy()
     except pyarrow.ArrowException:
-        texts = column.to_pandas().str.replace(r"(?<=\d),(?=\d{3}(\D|$))", "", regex=True)
+        texts = column.to_pandas().str.strip().str.replace(r"(?<=\d),(?=\d{3}(\D|$))", "", regex=True)
         values = pd.to_numeric(texts, errors="coerce").to_numpy(np.float64)
     for k in np.flatnonzero(~np.isfinite(values)):
-        cell = column[k].as_py()
+        cell = column[k].as_py().strip()
         if not may_be_empty or cell.lower() not in ("", "nan"):
             place = cells.place(int(k), quantity)
             raise InvalidInput(f"{place}: must be a finite number, but is {repr(cell) if cell else 'empty'}"[:300])
