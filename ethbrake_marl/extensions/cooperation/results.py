@@ -54,11 +54,12 @@ def conditions(plan: Ablation, number: int) -> str:
     same, drawn = ("the same ", "") if alike else ("", ", drawn with the same random numbers")
     first = "" if number == plan.episodes else "first "
     others = "other seeds and other worlds" if plan.seeds > 1 else "other worlds only: one seed says nothing of others"
+    optimum = f"{count_of(plan.search_episodes, 'world')}, {plan.budget:,} candidates per world and count."
     return (
         f"{recipes}; {count_of(plan.seeds, 'seed')}, {plan.steps_per_learner:,} decisions of each learner, rounded up"
         f" to whole updates. Harms are means per world in m²/s² on {same}{first}{count_of(number, 'world')} of seed"
-        f" {SEED}{drawn}; 95 % intervals for {others}. Joint optimum: the least harm known that the level's learners can do,"
-        f" in the first {count_of(plan.search_episodes, 'world')}, {plan.budget:,} candidates per world and count."
+        f" {SEED}{drawn}; 95 % intervals for {others}. Joint optimum: the least harm known that the learners can do,"
+        f" in the first {optimum}"
     )
 
 
