@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.cooperation import (
@@ -19,8 +18,6 @@ from ethbrake_marl.extensions.cooperation import (
 from ethbrake_marl.extensions.cooperation.equilibria import turn_of
 from ethbrake_marl.extensions.search.pricing import Profiles, problem_of
 from ethbrake_marl.motion.layout import Floats
-
-LEVELS = ("cooperation-3-pair", "cooperation-4-all")
 
 
 def two_vehicles(rear_braking: float, front: str) -> tuple[eb.Scenario, eb.State]:
@@ -50,33 +47,6 @@ def test_two_learners__with_room_ahead_do_no_harm_and_stay_as_they_are_where_bra
     assert braking.borne.tolist() == [[0.0, 0.0]]
 
 
-class Replay:
-    """Drives one vehicle of an equilibrium."""
-
-    name, knows = "replay", "true model"
-
-    def __init__(self, commands: Floats) -> None:
-        self.commands = commands
-
-    def begin(self, alert: eb.State, body: int) -> None:
-        return None
-
-    def act(self, state: eb.State, memory: None, body: int) -> tuple[Floats, None]:
-        step = np.minimum(state.steps, self.commands.shape[1] - 1)
-        return self.commands[np.arange(state.n), step], None
-
-
-@pytest.mark.parametrize("name", LEVELS)
-def test_harm__is_the_episodes_to_the_bit(name: str) -> None:
-    scenario, game = eb.open_game(name)
-    worlds = scenario.sample(6, 5)
-    for end in find_equilibria(scenario, worlds, "own", budget=100, rounds=2, count="total").values():
-        commands = end.profiles.commands_mps2
-        team = Team("it", {body: Replay(commands[:, :, c]) for c, body in enumerate(scenario.learners)})
-        last = eb.drive(game, worlds, team)
-        assert last.borne_harm("total").tolist() == end.borne.tolist()
-
-
 def beaten_by(scenario: eb.Scenario, worlds: eb.State, end: Equilibrium, objective: str) -> Floats:
     """By how much some learner's constant or plan of two commands beats its own in each world, [n] m2/s2."""
     problem, objectives = problem_of(eb.open_game(scenario)[1], worlds), objectives_of(objective, scenario.vehicles)
@@ -94,11 +64,11 @@ def beaten_by(scenario: eb.Scenario, worlds: eb.State, end: Equilibrium, objecti
     return np.max(gains, axis=0)
 
 
-@pytest.mark.parametrize(("name", "objective"), [*product(LEVELS, ("own", "maximin"))])
+@pytest.mark.parametrize(("name", "objective"), [("cooperation-3-pair", "own"), ("cooperation-4-all", "maximin")])
 def test_what_converged__no_learner_improves_by_constants_or_two_commands(name: str, objective: str) -> None:
     scenario = eb.load_scenario(name)
     worlds = scenario.sample(4, 11)
-    for end in find_equilibria(scenario, worlds, objective, budget=2_000).values():
+    for end in find_equilibria(scenario, worlds, objective, budget=1_000).values():
         assert end.converged.mean() >= 0.7
         assert beaten_by(scenario, worlds, end, objective)[end.converged].max() <= 0.02
 
@@ -117,11 +87,11 @@ def test_turn__minimises_the_objective_of_its_learner_alone() -> None:
 
 def test_ends__never_beat_the_joint_optimum_and_do_not_depend_on_other_worlds() -> None:
     scenario = eb.load_scenario("cooperation-3-pair")
-    worlds = scenario.sample(6, 9)
+    worlds = scenario.sample(4, 9)
     ends = find_equilibria(scenario, worlds, "own", budget=500)
-    part = find_equilibria(scenario, worlds.take([5, 2]), "own", budget=500)
+    part = find_equilibria(scenario, worlds.take([3, 1]), "own", budget=500)
     for name, end in ends.items():
-        assert part[name].borne.tolist() == end.borne[[5, 2]].tolist()
+        assert part[name].borne.tolist() == end.borne[[3, 1]].tolist()
     joint = best_joint_harm(scenario, worlds, ends.values(), budget=2_000).sum(axis=1)
     best = best_joint_harm(scenario, worlds, (), budget=2_000).sum(axis=1)
     assert (joint <= best).all()
