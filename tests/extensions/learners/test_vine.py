@@ -73,3 +73,12 @@ def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -
     first = widened(member, turned, "mine", "start")["policy.0.weight"]
     assert not first[:, 0].any()
     np.testing.assert_array_equal(first[:, 1:], member.tensors["policy.0.weight"][:, ::-1])
+
+
+def test_policies_inside_a_policy__keep_their_own_weights() -> None:
+    universal = load_shipped("universal")
+    members = members_of(universal)
+    assert len(members) == 11
+    for m, member in enumerate(members, 1):
+        assert member.tensors.keys() == {name for name in member.network.tensors if not name.startswith("value.")}
+        assert all(array is universal.tensors[f"among_{m}.{name}"] for name, array in member.tensors.items())
