@@ -121,13 +121,13 @@ class Measured(NamedTuple):
 def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
     """Start or continue every training until it ends, ``jobs`` at a time; return False if Ctrl-C stopped one.
 
-    Raises ``InvalidInput`` before any training begins if a folder has something else than the right training.
+    Raises ``InvalidInput`` for a folder with something else than the right training.
     """
-    left = [job for _, _, job in plan.jobs() if not job.is_finished()]
-    for done, finished in enumerate(run_each(((job.finish,) for job in left), jobs), 1):
+    every = [job for _, _, job in plan.jobs()]
+    for done, finished in enumerate(run_each(((job.finish,) for job in every), jobs), 1):
         if not finished:
             return False
-        tell(Progress("trainings", done, len(left)))
+        tell(Progress("trainings", done, len(every)))
     return True
 
 

@@ -62,16 +62,14 @@ def test_level__share_of_the_reduction_and_too_little_training_by_hand() -> None
 
 
 def test_csv__has_a_row_for_each_seed() -> None:
-    rows = list(
-        csv.DictReader(levels_csv([measured("cooperation-1-front", [[1, 2, 3], [0, 2, 0]], "ppo")], 1).splitlines())
-    )
-    (row,) = rows
+    one = measured("cooperation-1-front", [[1, 2, 3], [0, 2, 0]], "ppo")
+    both = one._replace(reached={name: np.concatenate([each, 2 * each]) for name, each in one.reached.items()})
+    row, other = csv.DictReader(levels_csv([both], 1).splitlines())
     assert (row["level"], row["seed"], row["first_impact_harm"]) == ("cooperation-1-front", "0", "4.0")
+    assert (other["seed"], other["first_impact_harm"], other["searched_total_harm"]) == ("1", "8.0", "12.0")
     assert (row["searched_total_harm"], row["total_harm_3"], row["searched_best_known_total_harm"]) == (
-        "6.0",
-        "1.5",
-        "1.0",
-    )
+        "6.0", "1.5", "1.0",
+    )  # fmt: skip
 
 
 def answer(level: str, budget: int, n: int = 6, **changes: object) -> Answer:
@@ -125,6 +123,8 @@ def test_ablation__trains_compares_and_goes_on(
     assert sorted(path.name for path in out.glob("trainings/*")) == folders
     config = json.loads((out / "trainings" / folders[0] / "config.json").read_text())
     assert config["settings"] == ["horizon_s=7"] and config["recipe"]["scheme"] is None
+    pair = json.loads((out / "trainings" / folders[2] / "config.json").read_text())["recipe"]
+    assert (config["recipe"]["total_steps"], pair["total_steps"]) == (128, 256)
     for level in found["levels"][1:]:
         searched = level["first"]["searched"]
         assert level["seeds"] == 2
