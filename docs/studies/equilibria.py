@@ -66,8 +66,8 @@ def search(name: str, worlds: int) -> Level:
         ends[objective] = find_equilibria(scenario, lines, objective, budget=BUDGET, rounds=ROUNDS)
         seconds[objective] = time.process_time() - begun
     every = [end for starts in ends.values() for end in starts.values()]
-    optimum = best_joint_harm(scenario, lines, every, budget=JOINT_BUDGET, threads=1)
-    return Level(name, ends, seconds, optimum["first"])
+    optimum = best_joint_harm(scenario, lines, every, budget=JOINT_BUDGET)
+    return Level(name, ends, seconds, optimum)
 
 
 def train(folder: Path, name: str, objective: str, recipe: str, seed: int) -> None:
@@ -101,7 +101,7 @@ def price_rows(level: Level) -> list[list[str]]:
     """Return rows with the rates of convergence and of different ends, and the prices of anarchy and stability."""
     rows = []
     for objective, ends in level.ends.items():
-        spread, best = compare_starts(ends, "first"), level.optimum
+        spread, best = compare_starts(ends), level.optimum
         there = spread.found > 0
         rows.append(
             [

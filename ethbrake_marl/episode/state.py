@@ -198,6 +198,8 @@ def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
 
     A memory is None, an array with one row per world, or a tuple or mapping of memories, such as a state.
     """
+    if isinstance(memory, np.ndarray):  # first, because the check for a mapping is slow
+        return function(memory, *others)
     if isinstance(memory, tuple):
         parts = [mapped(function, *each) for each in zip(memory, *others, strict=True)]
         return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
@@ -207,8 +209,12 @@ def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """Return ``rows`` of a memory."""
-    return mapped(lambda array: array[rows], memory)
+    """Return ``rows`` of a memory, contiguous: a kernel is compiled again for another layout."""
+    if isinstance(rows, slice):
+        return mapped(lambda array: np.ascontiguousarray(array[rows]), memory)
+    places = np.asarray(rows, None if len(rows) else np.int64)
+    places = np.flatnonzero(places) if places.dtype == np.bool_ else places
+    return mapped(lambda array: array.take(places, axis=0), memory)  # more than twice as fast as array[rows]
 
 
 def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:

@@ -51,12 +51,6 @@ def ablate_command(
             min=1,
         ),
     ] = None,
-    shield: Annotated[
-        str | None,
-        typer.Option(
-            metavar="step", help="Also evaluate the learners of each level with this shield.", show_default="none"
-        ),
-    ] = None,
     settings: SettingsOption = None,
     quick: Annotated[bool, typer.Option("--quick", help="For a quick try: few seeds, worlds and decisions.")] = False,
     jobs: JobsOption = 1,
@@ -72,52 +66,33 @@ def ablate_command(
     with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.cli.train import changed
-        from ethbrake_marl.evaluation.door import SEED
-        from ethbrake_marl.extensions.cooperation.levels import (
-            FULL,
-            LADDER,
-            QUICK,
-            STANDARD,
-            SWEPT,
-            Plan,
-            read_levels,
-            sweep_levels,
-        )
-        from ethbrake_marl.extensions.cooperation.measured import measure
+        from ethbrake_marl.extensions.cooperation.ablation import FULL, QUICK, Ablation, measure, train_all
+        from ethbrake_marl.extensions.cooperation.levels import LADDER, STANDARD, SWEPT, read_levels, sweep_levels
+        from ethbrake_marl.extensions.cooperation.optimum import with_optima
         from ethbrake_marl.extensions.cooperation.results import tables, write_ablation
-        from ethbrake_marl.extensions.cooperation.trainings import train_all
-        from ethbrake_marl.extensions.studies.machine import this_machine
         from ethbrake_marl.training.recipe import load_recipe
 
         if sweep is not None and len(sweep) > 1:
             raise InvalidInput("--sweep is given twice; give it once, because the figures can show only one swept key")
         loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
         changes = read_settings(settings, [key for recipe in loaded for key in type(recipe).model_fields])
-        plans = [changed(recipe, changes.recipe, out) for recipe in loaded]
-        plans = [recipe if recipe.scheme else recipe.replace(scheme="shared") for recipe in plans]
+        own = [changed(recipe, changes.recipe, out) for recipe in loaded]
+        own = [recipe if recipe.scheme else recipe.replace(scheme="shared") for recipe in own]
         usual = ",".join(LADDER if quick else STANDARD) if sweep is None else SWEPT
         names = [each.strip() for each in (levels or usual).split(",")]
         if sweep is not None and len(names) != 1:
             raise InvalidInput(f"levels: {len(names)} levels given; a sweep needs exactly one level")
+        compared = read_levels(names, changes) if sweep is None else sweep_levels(names[0], sweep[0], changes, own)
         given = {
             "seeds": seeds, "steps_per_learner": steps, "episodes": episodes, "search_episodes": search_episodes,
         }  # fmt: skip
-        chosen = {key: value for key, value in given.items() if value is not None}
-        plan = Plan(
-            output,
-            tuple(read_levels(names, changes) if sweep is None else sweep_levels(names[0], sweep[0], changes, plans)),
-            tuple(plans),
-            list_seed=SEED,
-            shield=shield,
-            sweep=sweep[0] if sweep else None,
-            noted=changes.texts,
-            **{**(QUICK if quick else FULL), **chosen},
-        )
+        numbers = {**(QUICK if quick else FULL), **{key: each for key, each in given.items() if each is not None}}
+        plan = Ablation(output, tuple(compared), tuple(own), noted=changes.texts, **numbers)
         with plan.study_folder().work():
             if not train_all(plan, jobs or 1, out.show_progress):
                 out.interrupted(f"interrupted; {REMAINS}")
-            measured = measure(plan, jobs or 1, out.show_progress)
-            results, paths = write_ablation(plan, measured, str(this_machine()))
+            measured = with_optima(plan, measure(plan, out.show_progress), jobs or 1, out.show_progress)
+            results, paths = write_ablation(plan, measured)
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
         out.result(results, *tables(results), results["conditions"], *alarms)
         out.note(f"results: {', '.join(map(str, paths))}")

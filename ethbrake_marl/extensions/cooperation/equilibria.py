@@ -7,16 +7,14 @@ objective while the others keep theirs. n worlds, N vehicles, L learners, T deci
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.statistics import decrease
 from ethbrake_marl.extensions.search.best_harm import BUDGET as JOINT_BUDGET, best_harm
@@ -32,16 +30,17 @@ STARTS = ("braking", "driving", "random")  # constant commands with which the se
 BUDGET = 10_000  # plans that a learner tries in its turn, in each world
 ROUNDS = 12  # in each of which every learner has its turn once
 TOLERANCE = 0.01  # m2/s2; a learner changes its plan only if it gains more than this
+APART = 0.1  # m2/s2; equilibria differ if the harm of a vehicle differs by more than this
 SHARES, BORDERS = np.linspace(0.0, 1.0, 9), (3, 8, 15)  # of plans of two commands that every turn tries
 FIELD, SAME = 4, 1e-3  # plans that are improved; those closer in value (m2/s2) count as the same
-ATTENTION_STEPS, LONGEST_STEPS = 40, 25  # changes begin within so many decisions, and last up to so many
+DRAWING = np.array([PLAN, 40, 25, 25])  # changes begin within 40 decisions, and last up to 25
 
 
 class Equilibrium(NamedTuple):
     """Where the search from one start ended."""
 
     profiles: Profiles  # commands of the learners, with one phase for each decision
-    borne: Mapping[str, Floats]  # count -> harm of each vehicle, [n, N] m2/s2
+    borne: Floats  # harm of each vehicle, [n, N] m2/s2
     converged: Bools  # [n] whether no learner gained more than the tolerance in the last round
     rounds: Ints  # [n] number of rounds, the last one included
 
@@ -50,7 +49,7 @@ class Spread(NamedTuple):
     """How much the equilibria from different starts differ in each world; those that did not converge are left out."""
 
     found: Ints  # [n] number of starts that converged
-    differs: Bools  # [n] whether the harm of a vehicle differs by more than the tolerance
+    differs: Bools  # [n] whether the harm of a vehicle differs
     best: Floats  # [n, N] harm of each vehicle in the equilibrium with the least harm of the line, m2/s2; NaN: none
     worst: Floats  # [n, N] the same with the most harm
 
@@ -63,9 +62,6 @@ def find_equilibria(
     count: str = "first",
     budget: int = BUDGET,
     rounds: int = ROUNDS,
-    tolerance: float = TOLERANCE,
-    seed: int = 0,
-    threads: int = 1,
 ) -> dict[str, Equilibrium]:
     """Search equilibria of the scenario's learners by best responses in turn, once from each start in ``STARTS``.
 
@@ -76,7 +72,7 @@ def find_equilibria(
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
     >>> level = eb.load_scenario("cooperation-3-pair")
     >>> ends = find_equilibria(level, level.sample(5, seed=7), "own", budget=300)
-    >>> [*ends], compare_starts(ends, "first").differs.shape
+    >>> [*ends], compare_starts(ends).differs.shape
     (['braking', 'driving', 'random'], (5,))
 
     Args:
@@ -86,40 +82,29 @@ def find_equilibria(
         count: harm of the ``first`` impact of each pair, or ``total``.
         budget: number of plans that a learner tries in its turn, in each world.
         rounds: largest number of rounds.
-        tolerance: gain that a learner must exceed to change its plan, m2/s2.
-        seed: of the random start and of the searches.
-        threads: of the searches.
 
     Raises ``InvalidInput`` for a scenario without learners, a script that looks at the state, an objective that is
     neither a weighted sum of the vehicles' harm nor ``maximin``, and a number out of range.
 
     """
-    for name, value, least in (
-        ("rounds", rounds, 1),
-        ("budget", budget, 1),
-        ("seed", seed, 0),
-        ("threads", threads, 1),
-    ):
-        check_whole_number(name, value, least)
+    check_whole_number("rounds", rounds, 1)
+    check_whole_number("budget", budget, 1)
     if count not in COUNTS:
         raise InvalidInput(f"count = {count!r}: must be 'first' or 'total'")
-    if not 0.0 <= tolerance < math.inf:
-        raise InvalidInput(f"tolerance = {tolerance!r}: must be a finite number of m2/s2, at least 0")
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r} has no learner; give at least one vehicle the role learner")
     game, declared = open_game(scenario)[1], scenario.objective if objective is None else objective
     joint = problem_of(game, worlds, count=count)
     turns = [turn_of(game, worlds, body, declared, count) for body in scenario.learners]
     low, high = np.moveaxis(joint.bounds, 2, 0)
-    draws = [seeded(joint.identity, seed + c) >> np.uint64(11) for c in range(len(turns))]
+    draws = [seeded(joint.identity, c) >> np.uint64(11) for c in range(len(turns))]
     drawn = np.clip(low + np.stack(draws, axis=1) * 2.0**-53 * (high - low), low, high)
     ends = {}
     for k, (name, commands) in enumerate(zip(STARTS, (low, high, drawn), strict=True)):
         plans = np.repeat(commands[:, np.newaxis], int(joint.last_step.max()), axis=1)
-        converged, taken = _settle(turns, plans, budget, rounds, tolerance, seed + k * rounds, threads)
+        converged, taken = _settle(turns, plans, budget, rounds, k * rounds)
         profiles = Profiles.of_steps(plans, joint.last_step)
-        last = joint.follow(profiles)
-        ends[name] = Equilibrium(profiles, {each: last.borne_harm(each) for each in COUNTS}, converged, taken)
+        ends[name] = Equilibrium(profiles, joint.follow(profiles).borne_harm(count), converged, taken)
     return ends
 
 
@@ -130,9 +115,7 @@ def turn_of(game: Game, worlds: State, body: int, declared: Declared, count: str
     return aimed(problem._replace(bodies=problem.bodies[:1]), declared)._replace(bodies=problem.bodies)
 
 
-def _settle(
-    turns: list[Problem], plans: Floats, budget: int, rounds: int, tolerance: float, seed: int, threads: int
-) -> tuple[Bools, Ints]:
+def _settle(turns: list[Problem], plans: Floats, budget: int, rounds: int, seed: int) -> tuple[Bools, Ints]:
     """Let the learners improve ``plans`` [n, T, L] in turn, in place; return who converged, [n], and after how long."""
     active, taken = np.arange(len(plans)), np.zeros(len(plans), np.int64)
     for turn in range(rounds):
@@ -140,9 +123,10 @@ def _settle(
         for c, whole in enumerate(turns):
             problem, others = whole.take(active), [d for d in range(len(turns)) if d != c]
             now = plans[active][:, :, [c, *others]]
-            new = respond(problem, now, active, budget, seed + turn, threads)  # new draws in each round
-            before, after = (problem.value(problem.follow(_profiles(problem, each))) for each in (now, new))
-            better = after < before - tolerance
+            new = respond(problem, now, budget, seed + turn)  # new draws in each round
+            profiles = (Profiles.of_steps(each, problem.last_step) for each in (now, new))
+            before, after = (problem.value(problem.follow(each)) for each in profiles)
+            better = after < before - TOLERANCE
             plans[active[better], :, c] = new[better, :, 0]
             moved |= better
         taken[active] += 1
@@ -152,44 +136,34 @@ def _settle(
     return ~np.isin(np.arange(len(plans)), active), taken
 
 
-def _profiles(problem: Problem, plans: Floats) -> Profiles:
-    return Profiles.of_steps(plans, problem.last_step)
-
-
-def respond(problem: Problem, plans: Floats, numbers: Ints, budget: int, seed: int, threads: int) -> Floats:
+def respond(problem: Problem, plans: Floats, budget: int, seed: int) -> Floats:
     """Return plans [n, T, B] in which the first controlled vehicle has the best commands that were found.
 
     The best few of its own plan, of plans of two commands and of random ones are improved by changes of some decisions
-    at a time. Raises ``PhysicsError`` for worlds (``numbers`` [n]) in which no plan can be simulated.
+    at a time. Raises ``PhysicsError`` for a world in which no plan can be simulated.
     """
-    random, drawing = seeded(problem.identity, seed), np.array([PLAN, ATTENTION_STEPS, LONGEST_STEPS, LONGEST_STEPS])
-    shape = plans.shape[1:]
-
-    def work(k: int) -> Floats | None:
-        world, room = prepared(problem, k, random, shape[0], True)
+    random, found = seeded(problem.identity, seed), plans.copy()
+    shape = T, _ = plans.shape[1:]
+    for k, plan in enumerate(plans):
+        world, room = prepared(problem, k, random, T, True)
         world = world._replace(
             bounds=np.ascontiguousarray(world.bounds[:1])
         )  # only the first vehicle's commands change
-        ends, tried = steps_of(shape[0], problem.last_step[k]), other_plans(plans[k], world.bounds[0], budget // 3)
+        ends, tried = steps_of(T, problem.last_step[k]), other_plans(plan, world.bounds[0], budget // 3)
         field: Any = Field(
-            np.zeros((FIELD, shape[0]), np.int64), np.zeros((FIELD, *shape)), np.zeros(FIELD, np.int64),
-            np.full(FIELD, np.inf),
-        )  # fmt: skip
+            np.zeros((FIELD, T), np.int64), np.zeros((FIELD, *shape)), np.zeros(FIELD, np.int64), np.full(FIELD, np.inf)
+        )
         steps = np.repeat(ends[np.newaxis], len(tried), axis=0)
-        gather(world, room, steps, tried, np.full(len(tried), shape[0]), 0, drawing, SAME, field)
+        gather(world, room, steps, tried, np.full(len(tried), T), 0, DRAWING, SAME, field)
         each = max((budget - len(tried)) // (2 * FIELD), 1)
         for m in np.flatnonzero(field.phases):
-            field.values[m], _ = improve(world, room, ends, field.commands[m], each, drawing, 0.0)
+            field.values[m], _ = improve(world, room, ends, field.commands[m], each, DRAWING, 0.0)
         best = field.commands[int(field.values.argmin())]
-        value, _ = improve(world, room, ends, best, FIELD * each, drawing, 0.0)
-        return best.copy() if value < np.inf else None
-
-    with ThreadPoolExecutor(threads) as pool:
-        found = list(pool.map(work, range(problem.n)))
-    failed = {int(numbers[k]): "no plan can be simulated" for k in range(problem.n) if found[k] is None}
-    if failed:
-        raise PhysicsError(failed)
-    return np.stack([each for each in found if each is not None])
+        value, _ = improve(world, room, ends, best, FIELD * each, DRAWING, 0.0)
+        if not value < np.inf:
+            raise PhysicsError({int(problem.state.clock[k, NUMBER]): "no plan can be simulated"})
+        found[k] = best
+    return found
 
 
 def other_plans(plan: Floats, bounds: Floats, number: int) -> Floats:
@@ -215,42 +189,30 @@ def other_plans(plan: Floats, bounds: Floats, number: int) -> Floats:
     return tried
 
 
-def compare_starts(ends: Mapping[str, Equilibrium], count: str, tolerance: float = 0.1) -> Spread:
-    """Compare the equilibria that were reached from different starts, world by world.
-
-    They count as equal if the harm of each vehicle differs by at most ``tolerance`` (m2/s2).
-    """
+def compare_starts(ends: Mapping[str, Equilibrium]) -> Spread:
+    """Compare the equilibria that were reached from different starts, world by world."""
     converged = np.stack([each.converged for each in ends.values()])
-    borne = np.where(converged[:, :, np.newaxis], np.stack([each.borne[count] for each in ends.values()]), np.nan)
+    borne = np.where(converged[:, :, np.newaxis], np.stack([each.borne for each in ends.values()]), np.nan)
     line, rows = borne.sum(axis=2), np.arange(borne.shape[1])
     best, worst = np.where(converged, line, np.inf).argmin(axis=0), np.where(converged, line, -np.inf).argmax(axis=0)
-    differs = (np.fmax.reduce(borne) - np.fmin.reduce(borne) > tolerance).any(axis=1)
+    differs = (np.fmax.reduce(borne) - np.fmin.reduce(borne) > APART).any(axis=1)
     return Spread(converged.sum(axis=0), differs, borne[best, rows], borne[worst, rows])
 
 
 def best_joint_harm(
-    scenario: Scenario,
-    worlds: State,
-    ends: Iterable[Equilibrium] = (),
-    *,
-    count: str = "first",
-    budget: int = JOINT_BUDGET,
-    seed: int = 0,
-    threads: int = 1,
-) -> dict[str, Floats]:
-    """Return the harm of each vehicle in the joint optimum, count -> [n, N] m2/s2.
+    scenario: Scenario, worlds: State, ends: Iterable[Equilibrium], *, budget: int = JOINT_BUDGET, count: str = "first"
+) -> Floats:
+    """Return the harm of each vehicle in the joint optimum, [n, N] m2/s2.
 
     In each world it is the result with the least harm of the line among ``ends``, whatever objectives they are of, and
-    of ``best_harm``, which searches the commands of all learners together (its arguments are the other ones).
+    of ``best_harm``, which searches the commands of all learners together.
     """
     game = open_game(scenario)[1]
-    table = best_harm(game, worlds, counts=(count,), budget=budget, seed=seed, threads=threads)
-    last = problem_of(game, worlds).follow(table.profiles[count])
-    best = {each: last.borne_harm(each) for each in COUNTS}
+    table = best_harm(game, worlds, counts=(count,), budget=budget, threads=1)
+    best = problem_of(game, worlds).follow(table.profiles[count]).borne_harm(count)
     for end in ends:
-        better = end.borne[count].sum(axis=1) < best[count].sum(axis=1)
-        for each in COUNTS:
-            best[each][better] = end.borne[each][better]
+        better = end.borne.sum(axis=1) < best.sum(axis=1)
+        best[better] = end.borne[better]
     return best
 
 

@@ -6,7 +6,7 @@ that share one search. The best commands of one level count for every other leve
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -14,14 +14,14 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
-from ethbrake_marl.extensions.cooperation.levels import Level, Plan
+from ethbrake_marl.extensions.cooperation.ablation import HARM, Ablation, Measured
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.layout import FAR_M, GAP, OWN_LATENCY, WEIGHT, Bools, Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.scenario import Scenario
 
 ON_GRID = 1e-9  # part of a step by which decisions of two levels may differ
 
@@ -29,32 +29,41 @@ ON_GRID = 1e-9  # part of a step by which decisions of two levels may differ
 class Answer(NamedTuple):
     """What is known of a level with learners."""
 
-    level: Level
+    scenario: Scenario
     game: Game
     worlds: State  # at the alert, in which the joint optimum was searched, [m]
     searched: BestHarmTable
-    driven: dict[str, list[Floats]]  # count -> harm of what was driven, [m] each: trained teams
+    driven: Mapping[str, Sequence[Floats]]  # count -> harm of each trained team, [m]
 
 
-def search_all(plan: Plan, worlds: Sequence[Drawn], jobs: int, tell: OnProgress) -> dict[str, Answer]:
-    """Search the joint optimum of every level with learners; return name of the level -> answer.
+def with_optima(plan: Ablation, measured: Sequence[Measured], threads: int, tell: OnProgress) -> list[Measured]:
+    """Return the results, each with the joint optimum of its level, unless the level has no learner.
 
-    ``jobs`` is the number of threads. Finished chunks are read from the folder of the ablation.
+    Finished chunks of the search are read from the folder of the ablation.
     """
     tables: dict[bytes, BestHarmTable] = {}
     answers: dict[str, Answer] = {}
-    for level, drawn in zip(plan.levels, worlds, strict=True):
-        if level.scenario.learners:
-            game, some = open_game(level.scenario)[1], drawn.worlds.take(slice(plan.search_episodes))
-            identity = problem_of(game, some).identity.tobytes()
+    for one in measured:
+        name, scenario = one.level.name, one.level.scenario
+        if scenario.learners and name not in answers:
+            game, worlds = open_game(scenario)[1], one.worlds.take(slice(plan.search_episodes))
+            identity = problem_of(game, worlds).identity.tobytes()
             if identity not in tables:
-                say = partial(_tell, tell, f"joint optimum of {level.name}")
-                folder = plan.folder / "optimum" / level.name
+                say = partial(_tell, tell, f"joint optimum of {name}")
+                folder = plan.folder / "optimum" / name
                 tables[identity] = search_list(
-                    game, some, chunks=folder, on_progress=say, budget=plan.budget, threads=jobs
+                    game, worlds, chunks=folder, on_progress=say, budget=plan.budget, threads=threads
                 )
-            answers[level.name] = Answer(level, game, some, tables[identity], {"first": [], "total": []})
-    return answers
+            teams = [each.reached for each in measured if each.level.name == name]
+            driven = {
+                count: [row[: worlds.n] for own in teams for row in own[column]] for count, column in HARM.items()
+            }
+            answers[name] = Answer(scenario, game, worlds, tables[identity], driven)
+    best = {
+        name: {count: least_known(answer, answers.values(), count)[np.newaxis] for count in HARM}
+        for name, answer in answers.items()
+    }
+    return [each._replace(best=best.get(each.level.name)) for each in measured]
 
 
 def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
@@ -87,7 +96,7 @@ def can_imitate(own: Answer, other: Answer) -> Bools:
     and latencies are the same, and each decision of ``other`` is also one of ``own``. Only ``own`` may have an
     obstacle, because commands are simulated with it.
     """
-    mine, theirs = own.level.scenario, other.level.scenario
+    mine, theirs = own.scenario, other.scenario
     scripted = [name for name, role in mine.roles.items() if role != "learner"]
     if not set(theirs.learners) <= set(mine.learners) or any(mine.roles[n] != theirs.roles[n] for n in scripted):
         return np.zeros(own.worlds.n, np.bool_)

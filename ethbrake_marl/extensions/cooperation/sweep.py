@@ -32,6 +32,11 @@ class Swept(NamedTuple):
         return f"{self.key}={self.word}{self.text}"
 
     @property
+    def axis(self) -> str:
+        """What varies, as the label of an axis: ``v2x.lost`` or ``objective = social:…``."""
+        return f"{self.key} = {self.word}…" if self.word else self.key
+
+    @property
     def label(self) -> str:
         """End of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"

@@ -16,13 +16,12 @@ from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_one_learner
-from ethbrake_marl.extensions.fronts.hypervolume import nondominated
 from ethbrake_marl.extensions.fronts.weights import weight_table
 from ethbrake_marl.extensions.search.best_harm import best_harm, driven_profiles, joined, starting_profiles
 from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, problem_of
 from ethbrake_marl.extensions.search.search import search_profiles
 from ethbrake_marl.extensions.search.tables import best_known
-from ethbrake_marl.motion.layout import WEIGHT, Bools, Floats, Ints
+from ethbrake_marl.motion.layout import WEIGHT, Floats, Ints
 from ethbrake_marl.names import make_teams, open_game
 from ethbrake_marl.policies.bundle import shipped_policies
 from ethbrake_marl.worlds.scenario import Scenario
@@ -37,12 +36,11 @@ Progress = Callable[[int, int], None]  # called with the number of finished sear
 
 
 class Front(NamedTuple):
-    """Best profiles in n worlds for each of W choices of weights, and the harm of each vehicle."""
+    """The harm of each vehicle in n worlds, with the best commands for each of W choices of weights."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
     harm_count: str  # count of harm that is weighted, ``first`` or ``total``
     borne: Borne  # [W, n, N] m2/s2 by count
-    profiles: tuple[Profiles, ...]  # commands of the learners, [n] for each choice of weights
     agents: Mapping[str, Borne]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
 
     @property
@@ -51,14 +49,6 @@ class Front(NamedTuple):
         return np.stack(
             [weighted(each, row) for each, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
         )
-
-    def mean(self, count: str | None = None) -> Floats:
-        """Return the mean harm of each vehicle, [W, N] m2/s2; ``count`` None: the one that was searched."""
-        return np.asarray(self.borne[count or self.harm_count].mean(axis=1))
-
-    def nondominated(self) -> Bools:
-        """Return whether no other profile of the same world is better for a vehicle and worse for none, [W, n]."""
-        return nondominated(self.borne[self.harm_count].transpose(1, 0, 2)).T
 
 
 def weighted(borne: Floats, weights: Floats) -> Floats:
@@ -79,7 +69,6 @@ def search_front(
     *,
     count: str = "first",
     budget: int = BUDGET,
-    seed: int = 0,
     threads: int = 1,
     agents: Sequence[str] = (),
     on_progress: Progress | None = None,
@@ -103,7 +92,6 @@ def search_front(
         weights: weights of the vehicles' harm, [W, N].
         count: harm of the ``first`` impact of each pair, or ``total``.
         budget: number of profiles that are tried for each world and choice of weights.
-        seed: of the random search.
         threads: of the search.
         agents: names of agents for the one learner. For each choice of weights they drive every world, with these
             weights as the scenario's ``harm_weight``, and the objective ``preference``.
@@ -127,7 +115,7 @@ def search_front(
     preferring = [scenario.replace(harm_weight=row.tolist(), objective="preference") for row in weights]
     silent = [name for name in shipped_policies() if name not in agents] if len(learners) == 1 else []
     teams = [make_teams([*agents, *silent], each, harm_count=count) for each in preferring]
-    effort, parts, done = {"budget": budget, "seed": seed, "threads": threads}, [], 0
+    effort, parts, done = {"budget": budget, "threads": threads}, [], 0
 
     def tell(more: int) -> None:
         nonlocal done
@@ -138,14 +126,13 @@ def search_front(
     game = open_game(scenario)[1]
     games = [open_game(each)[1] for each in preferring]
     for first in range(0, worlds.n, CHUNK):
-        pool = Pool(problem_of(game, worlds.take(slice(first, first + CHUNK)), count=count), count)
         some = worlds.take(slice(first, first + CHUNK))
+        pool = Pool(problem_of(game, some, count=count), count)
         driven = _tried(pool, some, weights, list(zip(games, teams, strict=True)))
         _search(pool, some, weights, effort, tell)
-        parts.append((pool.least(weights), {name: driven[name] for name in agents}))
-    borne = _joined([borne for (borne, _), _ in parts])
-    profiles = tuple(Profiles.join(each) for each in zip(*(best for (_, best), _ in parts), strict=True))
-    return Front(weights, count, borne, profiles, {name: _joined([part[1][name] for part in parts]) for name in agents})
+        parts.append((pool.least(weights), driven))
+    borne = _joined([least for least, _ in parts])
+    return Front(weights, count, borne, {name: _joined([driven[name] for _, driven in parts]) for name in agents})
 
 
 def _joined(parts: Sequence[Borne]) -> Borne:
@@ -226,11 +213,10 @@ class Pool:
         place = np.searchsorted(used, chosen)
         return Profiles(np.stack(ends)[place, rows], np.stack(commands)[place, rows])
 
-    def least(self, weights: Floats) -> tuple[Borne, tuple[Profiles, ...]]:
-        """Return the harm of each vehicle with the best profiles, [W, n, N] m2/s2 by count, and the profiles."""
+    def least(self, weights: Floats) -> Borne:
+        """Return the harm of each vehicle with the best profiles, [W, n, N] m2/s2 by count."""
         chosen, rows = [self.choice(row) for row in weights], np.arange(self.problem.n)
-        borne = {count: np.stack([np.stack(each)[k, rows] for k in chosen]) for count, each in self.borne.items()}
-        return borne, tuple(self.best(row) for row in weights)
+        return {count: np.stack([np.stack(each)[k, rows] for k in chosen]) for count, each in self.borne.items()}
 
 
 def least_largest(scenario: Scenario, worlds: State, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:

@@ -16,14 +16,13 @@ from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
 from ethbrake_marl.extensions.fronts.front import Borne, Front, weighted
 from ethbrake_marl.extensions.fronts.hypervolume import MOST_DIMENSIONS, hypervolume
 from ethbrake_marl.extensions.search.pricing import COUNTS
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
 from ethbrake_marl.worlds.sampling import Drawn
 from ethbrake_marl.worlds.scenario import Scenario
 
-RESAMPLES = 200  # bootstrap samples of the worlds, for intervals of hypervolumes
 FRONT = "Pareto front"  # name of the front beside the agents in the entry "hypervolume"; no agent can have this name
 
 Json = dict[str, Any]
@@ -57,7 +56,7 @@ def front_results(
         "beside": {name: _vehicles(borne, by) for name, borne in beside.items()},
         "points": _points(front, front.borne, by),
         "agents": {name: _points(front, borne, by) for name, borne in front.agents.items()},
-        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count], by),
+        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count]),
         "scenario_sha256": about_scenario(scenario)["scenario_sha256"],
         "worlds_sha256": worlds_sha256(drawn.worlds),
         "versions": versions(),
@@ -84,46 +83,29 @@ def _vehicles(borne: Borne, by: Clusters) -> dict[str, list[Json]]:
     return {count: [mean(each, by).to_json() for each in borne[count].T] for count in COUNTS}
 
 
-def hypervolumes(front: Front, full_brake: Floats, clusters: Clusters = None) -> list[Json]:
+def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
     """Return the hypervolumes of the front and of each agent, for two reference points.
 
     A point is the mean harm of all vehicles for one choice of weights. The first reference point is each vehicle's mean
     harm under full braking, so only points count that are better for every vehicle. The second is the larger of that
-    and of the vehicle's largest mean harm on the front. ``share`` is an agent's hypervolume divided by the front's.
-    Intervals (95 %) are percentiles over ``RESAMPLES`` bootstrap samples of worlds, or of ``clusters``. ``full_brake``
-    is the harm of each vehicle if the learners brake fully, [n, N] m2/s2. Nothing for more than ``MOST_DIMENSIONS``
-    vehicles.
+    and of the vehicle's largest mean harm on the front. ``share`` is an agent's hypervolume divided by the front's,
+    None if that is 0. ``full_brake`` is the harm of each vehicle if the learners brake fully, [n, N] m2/s2. Nothing for
+    more than ``MOST_DIMENSIONS`` vehicles.
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
-    worlds = np.arange(len(full_brake))
-    names = worlds if clusters is None else np.unique(clusters, return_inverse=True)[1]
-    members = [np.flatnonzero(names == k) for k in range(names.max() + 1)]  # worlds of each cluster
-    drawn = np.random.default_rng(0).integers(len(members), size=(RESAMPLES, len(members)))
-    draws = [worlds, *(np.concatenate([members[k] for k in row]) for row in drawn)]  # first: each world once
-    harms = {FRONT: front.borne, **front.agents}
-    points = {
-        name: np.stack([borne[front.harm_count][:, rows].mean(axis=1) for rows in draws])
-        for name, borne in harms.items()
-    }
-    braking = np.stack([full_brake[rows].mean(axis=0) for rows in draws])
-    largest = np.maximum(braking, points[FRONT].max(axis=1))
+    points = {name: each[front.harm_count].mean(axis=1) for name, each in {FRONT: front.borne, **front.agents}.items()}
+    braking = full_brake.mean(axis=0)
+    references = {
+        "full braking": braking, "largest harm of each vehicle": np.maximum(braking, points[FRONT].max(axis=0)),
+    }  # fmt: skip
     entries = []
-    for words, reference in (("full braking", braking), ("largest harm of each vehicle", largest)):
-        volumes = {name: np.array(list(map(hypervolume, rows, reference))) for name, rows in points.items()}
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = {name: volume / volumes[FRONT] for name, volume in volumes.items()}
-        each = {name: {"volume": _interval(volumes[name]), "share": _interval(shares[name])} for name in volumes}
-        entries.append({"reference": words, "at": reference[0].tolist(), "of": each})
+    for words, reference in references.items():
+        volumes = {name: hypervolume(rows, reference) for name, rows in points.items()}
+        whole = volumes[FRONT]
+        of = {name: {"volume": each, "share": each / whole if whole else None} for name, each in volumes.items()}
+        entries.append({"reference": words, "at": reference.tolist(), "of": of})
     return entries
-
-
-def _interval(values: Floats) -> Json | None:
-    """Return the first value with the interval of the others; None unless all are finite."""
-    if not np.isfinite(values).all():
-        return None
-    low, high = np.percentile(values[1:], [2.5, 97.5])
-    return Estimate(float(values[0]), (float(low), float(high))).to_json()
 
 
 def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
@@ -168,10 +150,9 @@ def hypervolume_sheet(results: Json) -> Sheet:
     """Return a table of the hypervolumes."""
     share = Column("Share of the front", digits=1, scale=100.0, unit=" %")
     rows = [
-        (each["reference"], name, *(None if value is None else Estimate(**value) for value in volume.values()))
+        (each["reference"], name, *volume.values())
         for each in results["hypervolume"]
         for name, volume in each["of"].items()
     ]
-    return Sheet(
-        "Hypervolume of the mean harm (m2/s2)^N", ["Reference", "Of", Column("Hypervolume"), share], rows, gap=2
-    )
+    columns: list[Column | str] = ["Reference", "Of", Column("Hypervolume"), share]
+    return Sheet("Hypervolume of the mean harm (m2/s2)^N", columns, rows, gap=2)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats
 
 MOST = 1_000  # largest number of choices of weights
@@ -20,13 +20,12 @@ def weight_grid(vehicles: int, steps: int) -> Floats:
     """Return W evenly spaced choices of weights, [W, N]. In each choice the weights of the N vehicles sum to 1.
 
     From each row to the next, the weight of one vehicle rises by 1 / ``steps``, and the weight of another vehicle falls
-    by 1 / ``steps``. Raises ``InvalidInput`` if ``steps`` is below 1, or if there would be more than ``MOST`` choices.
+    by 1 / ``steps``. Raises ``InvalidInput`` if there would be more than ``MOST`` choices.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
     [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     """
-    check_whole_number("steps of the weights", steps, 1)
     number = comb(steps + vehicles - 1, steps)
     if number > MOST:
         raise InvalidInput(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
@@ -11,17 +10,13 @@ import torch
 from ethbrake_marl.extensions.learners.mixture import MixtureModel
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
 from ethbrake_marl.extensions.learners.rollout_classification import RolloutClassificationModel
-from ethbrake_marl.extensions.learners.start import named_policy, shipped_for, start_weights
+from ethbrake_marl.extensions.learners.start import named_policy, start_weights
 from ethbrake_marl.extensions.learners.vine import VineModel
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.training.algorithm import Algorithm
 from ethbrake_marl.training.training import Training
-
-
-class RandomStart(UserWarning):
-    """Warning: a recipe names a policy to start from, but none is shipped for the scenario."""
 
 
 class Vine(Algorithm):
@@ -32,18 +27,12 @@ class Vine(Algorithm):
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
         model = (VineModel if recipe.experts is None else MixtureModel)(training, environment)
-        start, scenario = recipe.start, training.scenario.name
-        if start is not None and "@" not in start:
-            start = shipped_for(start, scenario)
-            if start is None:
-                why = f"recipe {recipe.name!r}: start: no policy {recipe.start} is shipped for scenario {scenario!r}"
-                warnings.warn(RandomStart(f"{why}; training begins with random weights"), stacklevel=2)
-        if start is not None:
+        if recipe.start is not None:
             first = model.policy.actors[0] if isinstance(model, MixtureModel) else model.policy
-            policy, wanted = named_policy(start, recipe.name, "start"), recipe.network_spec(len(model.features))
-            for name, tensor in start_weights(policy, wanted, model.features, recipe.name).items():
-                if name in first.weights("policy"):
-                    first.weights("policy")[name].copy_(torch.from_numpy(tensor))
+            policy, wanted = named_policy(recipe.start, recipe.name, "start"), recipe.network_spec(len(model.features))
+            tensors = start_weights(policy, wanted, model.features, recipe.name)
+            for name, weight in first.weights("policy").items():
+                weight.copy_(torch.from_numpy(tensors[name]))
             first.learning.load_state_dict(first.average.state_dict())
         return model
 

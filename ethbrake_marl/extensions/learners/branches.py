@@ -40,14 +40,6 @@ class Moment(NamedTuple):
 Decide = Callable[[Moment], Floats]  # returns the learners' actions, [m, L]
 
 
-class Offsets(NamedTuple):
-    """What is added to the actions of one learner in the first steps of every branch."""
-
-    learner: Ints  # [n] from 0, the foremost
-    size: Floats  # [n] offset; the sum is clipped to [-1, 1]
-    steps: Ints  # [n] number of steps with the offset
-
-
 def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least: int = 0) -> tuple[Floats, State]:
     """Play episodes to the end; return each learner's discounted return, [n, L], and the last states.
 
@@ -55,7 +47,8 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
     everything stands for good, but not in its first ``at_least`` steps.
     """
     learners, only_harm = game.rules.learners, set(game.rewarding.counted) <= {"harm"}
-    gained, last, rows = np.zeros((state.n, len(learners))), state, np.flatnonzero(~state.ended)
+    gained, over = np.zeros((state.n, len(learners))), state.ended
+    rows, ended, last = np.flatnonzero(~over), [np.flatnonzero(over)], [state.take(over)]
     now, discount, number = state.take(rows), 1.0, 0
     while len(rows):
         after, step = game.step(now, decide(Moment(now, game.observe_alike(now, learners), rows, number)))
@@ -64,10 +57,11 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
         if only_harm and number >= at_least:
             over |= stands_for_good(now, after)
         if over.any():
-            last = last.put(rows[over], after.take(over), donate=last is not state)
-            rows, after = rows[~over], after.take(np.flatnonzero(~over))
+            ended.append(rows[over])
+            last.append(after.take(over))
+            rows, after = rows[~over], after.take(~over)
         now, discount, number = after, discount * gamma, number + 1
-    return gained, last
+    return gained, State.join(last).take(np.argsort(np.concatenate(ended)))
 
 
 def stands_for_good(before: State, after: State) -> Bools:
@@ -98,29 +92,6 @@ def find_standing(before: Floats, line: Floats, car: Floats, know: Floats, clock
                 for j in range(bodies):
                     stands = stands and (know[k, i, j] < time or know[k, i, j] == math.inf)
         out[k] = stands
-
-
-def play_to_the_end(game: Game, state: State, act: Act, offsets: Offsets, gamma: float) -> tuple[Floats, Floats]:
-    """Let a policy play branches with offsets to the end.
-
-    Returns the return of the learner with the offset, [n], and by how much the offset has moved its actions, after
-    clipping, summed over the steps, [n].
-    """
-    moved = np.zeros(state.n)
-
-    def decide(now: Moment) -> Floats:
-        actions = now.ask(act)
-        some = np.flatnonzero(now.number < offsets.steps[now.rows])
-        row = now.rows[some]
-        learner = offsets.learner[row]
-        before = actions[some, learner]
-        after = np.clip(before + offsets.size[row], -1.0, 1.0)
-        actions[some, learner] = after
-        moved[row] += after - before
-        return actions
-
-    gained, _ = play_on(game, state, decide, gamma, at_least=int(offsets.steps.max(initial=0)))
-    return gained[np.arange(state.n), offsets.learner], moved
 
 
 def moving(state: State) -> Bools:

@@ -1,20 +1,19 @@
 """A mixture of experts, trained by vine: several actors, and a gating network that chooses one at every decision.
 
-The training has four stages. The first expert is trained in all worlds. Each other expert imitates *templates*, random
+The training has three stages. The first expert is trained in all worlds. Each other expert imitates *templates*, random
 braking profiles that do better than all earlier experts, and is then trained where it is not much worse than they are.
-The gating network learns which expert costs least. In the last stage all learn together.
+At last the gating network learns which expert costs least.
 """
 
 from __future__ import annotations
 
 import copy
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.utils import update_learning_rate
 from torch import nn
 from torch.nn.functional import mse_loss, softplus
 
@@ -24,7 +23,7 @@ from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.learners.branches import Act, Moment, moving, other_count, play_on
 from ethbrake_marl.extensions.learners.networks import Averaged, Memory, drawn, perceptron, silent
 from ethbrake_marl.extensions.learners.recipes import ExpertsPlan, VineRecipe
-from ethbrake_marl.extensions.learners.vine import Actor, Tried, VineModel
+from ethbrake_marl.extensions.learners.vine import Actor, VineModel
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.network import NetworkSpec
@@ -38,8 +37,6 @@ LONGEST_WHILE_S = 0.8  # and lasts at most this long
 FULL_BRAKE_SHARE = 0.8  # probability that the first command is full braking
 LIKELY_ACTIONS, THEIR_SHARES = np.array([-1.0, 1.0, 0.0]), np.array([0.35, 0.5, 0.6])  # cumulative; else uniform
 
-Trains = Literal["first", "other", "gating", "joint"]
-
 
 class NoBetterTemplate(EthBrakeError, ValueError):
     """No template has a higher return than the earlier experts, so a further expert has nothing to learn."""
@@ -48,8 +45,7 @@ class NoBetterTemplate(EthBrakeError, ValueError):
 class Stage(NamedTuple):
     """A range of updates, and what they train."""
 
-    trains: Trains
-    network: int  # number of the expert that a stage ``other`` trains; 0 in all other stages
+    expert: int | None  # number of the expert that is trained; None: the gating network
     first: int  # number of its first update, from 0
     end: int  # number of the first update after it
 
@@ -57,14 +53,13 @@ class Stage(NamedTuple):
 def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
     """Return the stages of a training of so many updates. One with a small share may have none."""
     shares, others = plan.shares, plan.networks - 1
-    parts: list[tuple[Trains, int, float]] = [("first", 0, shares.pretraining_first)]
-    parts += [("other", k + 1, shares.pretraining_others / others) for k in range(others)]
-    parts += [("gating", 0, shares.gating), ("joint", 0, shares.joint)]
+    parts: list[tuple[int | None, float]] = [(0, shares.pretraining_first)]
+    parts += [(k + 1, shares.pretraining_others / others) for k in range(others)]
     stages, done, first = [], 0.0, 0
-    for trains, network, share in parts:
+    for expert, share in [*parts, (None, shares.gating)]:
         done += share
         end = min(math.ceil(done * updates - ROUNDING), updates)
-        stages.append(Stage(trains, network, first, end))
+        stages.append(Stage(expert, first, end))
         first = end
     return tuple(stages)
 
@@ -142,14 +137,14 @@ class MixtureModel(VineModel):
         if stage != self.stage:
             self.enter(stage)
         if self.own is None:
-            return self.visit(callback, self.policy.actors[0].act if stage.trains == "first" else self.policy.act)
+            return self.visit(callback, self.policy.act if stage.expert is None else self.policy.actors[0].act)
         self.num_timesteps += each
         seen, states = [], []
 
         def decide(now: Moment) -> Floats:
             seen.append(now.seen[:, 0])
             states.append(now.state)
-            return now.ask(self.policy.actors[stage.network].act)
+            return now.ask(self.policy.actors[stage.expert].act)
 
         play_on(self.game, self.own.take(torch.randint(self.own.n, (self.n_envs,)).numpy()), decide, 1.0)
         return np.concatenate(seen), State.join(states)
@@ -159,25 +154,11 @@ class MixtureModel(VineModel):
         stage, policy = self.stage, self.policy
         assert stage is not None
         self._update_current_progress_remaining(self.number - stage.first, stage.end - stage.first)
-        if stage.trains in ("first", "other"):
-            member = policy.actors[stage.network]
-            self.train_actor(member, self.try_out(seen, states, member))
-            return
-        if stage.trains == "joint":  # each expert learns from the decisions at which it is chosen
-            tried = self.try_out(seen, states, policy)  # type: ignore[arg-type]  # it acts like an actor
-            chosen = policy.gate.best(tried.seen)
-            for k, actor in enumerate(policy.actors):
-                rows = np.flatnonzero(chosen == k)
-                if len(rows) > 1:
-                    self.train_actor(actor, Tried(*(array[rows] for array in tried)))
-        self.train_gate(*self.compare(seen, states))
-
-    def _update_learning_rate(self, optimizers: list[torch.optim.Optimizer] | torch.optim.Optimizer) -> None:
-        assert isinstance(optimizers, torch.optim.Optimizer) and self.stage is not None
-        share = self.plan.joint_rate if self.stage.trains == "joint" else 1.0
-        rate = share * self.lr_schedule(self._current_progress_remaining)
-        self.logger.record("train/learning_rate", rate)
-        update_learning_rate(optimizers, rate)
+        if stage.expert is None:
+            self.train_gate(*self.compare(seen, states))
+        else:
+            expert = policy.actors[stage.expert]
+            self.train_actor(expert, self.try_out(seen, states, expert))
 
     def enter(self, stage: Stage) -> None:
         """Prepare a stage that begins, or is resumed.
@@ -187,21 +168,21 @@ class MixtureModel(VineModel):
         there is no better template, or no world to select.
         """
         self.stage, self.own = stage, None
-        if stage.trains != "other":
+        if not stage.expert:
             return
-        explored = self.explore([actor.act for actor in self.policy.actors[: stage.network]])
+        explored = self.explore([actor.act for actor in self.policy.actors[: stage.expert]])
         shown = self.show(explored, *self.best_templates(explored))
         pupil = copy.deepcopy(self.policy.actors[0])
-        self.imitate(pupil, shown, self.recipe.seed + stage.network)
+        self.imitate(pupil, shown, self.recipe.seed + stage.expert)
         self.own = self.worlds_of(pupil.act, explored)
         if len(shown.action) == 0 or self.own.n == 0:
             raise NoBetterTemplate(
-                f"experts: expert {stage.network + 1} has nothing to learn: in none of {self.plan.worlds:,} worlds"
+                f"experts: expert {stage.expert + 1} has nothing to learn: in none of {self.plan.worlds:,} worlds"
                 f" does one of {self.plan.templates} random braking profiles (templates) improve the return of the"
                 f" earlier experts by more than {self.plan.gain:g}; set fewer networks, or remove the key experts"
             )
         if self.number == stage.first:
-            self.policy.actors[stage.network].load_state_dict(pupil.state_dict())
+            self.policy.actors[stage.expert].load_state_dict(pupil.state_dict())
 
     def explore(self, acts: list[Act]) -> Explored:
         """Let the earlier experts drive the first worlds of the training."""

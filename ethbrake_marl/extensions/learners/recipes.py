@@ -10,7 +10,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from ethbrake_marl.agents.drive import MESSAGES
 from ethbrake_marl.agents.trained import make_trained
-from ethbrake_marl.errors import InvalidInput, refuse_shipped_path
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.learners.start import Member, members_of, named_policy
 from ethbrake_marl.files.model import FileModel, refuse
 from ethbrake_marl.policies.network import Activation, NetworkSpec
@@ -92,15 +92,14 @@ class Shares(FileModel):
     pretraining_first: Fraction  # the first expert, in all worlds
     pretraining_others: Fraction  # the others together, each in worlds selected for it
     gating: Fraction  # the gating network
-    joint: Fraction  # all networks; each expert learns at decisions at which it is chosen
 
     @model_validator(mode="after")
     def _everything(self) -> Self:
-        total = self.pretraining_first + self.pretraining_others + self.gating + self.joint
+        total = self.pretraining_first + self.pretraining_others + self.gating
         if not abs(total - 1.0) <= 1e-9:
             raise ValueError(
-                "pretraining_first, pretraining_others, gating and joint are shares of all updates: they must sum to 1,"
-                f" but sum to {total:g}"
+                "pretraining_first, pretraining_others and gating are shares of all updates: they must sum to 1, but"
+                f" sum to {total:g}"
             )
         return self
 
@@ -134,7 +133,6 @@ class ExpertsPlan(FileModel):
     tie_break: NonNegative = Field(
         description="weight, when experts are compared, of the harm count (first or total) that the reward does not use"
     )
-    joint_rate: Rate = Field(description="factor on the learning rate in the last stage, in which all networks learn")
     shares: Shares = Field(description="share of all updates for each stage of the training; the shares sum to 1")
 
 
@@ -143,9 +141,7 @@ class VineRecipe(BranchingRecipe):
 
     algorithm: Literal["vine"]
     start: Text | None = Field(
-        None,
-        description="policy to start from: ppo, or ppo@PATH; ppo stands for the shipped PPO policy of this scenario,"
-        " and for random weights, with a warning, if there is none; left out: random weights",
+        None, description="trained policy to start from, as in --agents: ppo, or policy@PATH; left out: random weights"
     )
     offset: Range = Field(description="range of the offset between a tried action and the policy's action")
     gradient_limit: Positive = Field(
@@ -158,17 +154,6 @@ class VineRecipe(BranchingRecipe):
     experts: Annotated[ExpertsPlan | None, Field(exclude_if=not_)] = Field(
         None, description="mixture of experts: several networks and a gating network; left out: one network"
     )
-
-    @field_validator("start")
-    @classmethod
-    def _names_a_policy(cls, start: str | None) -> str | None:
-        kind, at, path = (start or "ppo").partition("@")
-        refuse_shipped_path(path, kind)
-        if not kind.replace("-", "").isalpha() or (at and (not path or kind not in ("ppo", "vine"))):
-            raise ValueError(
-                "must be the name of a shipped policy, for instance ppo, or ppo@PATH or vine@PATH of a trained policy"
-            )
-        return start
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
         """Return the actor, or the experts and the gating network."""
@@ -260,9 +245,6 @@ class RolloutClassificationRecipe(BranchingRecipe):
             refuse(("memory",), self.memory, f"must be at least tried, which is {self.tried}")
         if not self.others:
             refuse(("near",), list(self.near), "must contain a range, because the recipe has no fixed or drawn actions")
-        for name in self.policies:
-            kind, _, path = name.partition("@")
-            refuse_shipped_path(path, kind)
         return self
 
     @cached_property

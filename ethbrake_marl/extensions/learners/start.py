@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.policies.bundle import load_policy, load_shipped, shipped_policies
+from ethbrake_marl.names import make_agent
 from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.policy import Policy
@@ -41,22 +42,15 @@ def members_of(policy: Policy) -> list[Member]:
 
 
 def named_policy(name: str, recipe: str, key: str) -> Policy:
-    """Return a shipped policy, or that of ``ALGORITHM@PATH``. Raises ``InvalidInput`` if another algorithm trained it.
+    """Return the policy that a name for ``--agents`` stands for: ``ppo``, ``policy@runs/mine``.
 
-    ``key`` of the recipe with the name ``recipe`` names the policy, for messages.
+    ``key`` of the recipe with the name ``recipe`` names the policy, for messages. Raises the errors of ``make_agent``,
+    and ``InvalidInput`` for an agent that is no policy.
     """
-    kind, _, path = name.partition("@")
-    policy = load_policy(path) if path else load_shipped(kind)
-    by = policy.manifest.algorithm
-    if path and kind not in ("policy", by):
-        raise InvalidInput(f"recipe {recipe!r}: {key}: {name}: this policy was trained by {by}; write {by}@{path}")
-    return policy
-
-
-def shipped_for(start: str, scenario: str) -> str | None:
-    """Return the shipped policy ``start`` or ``start-...`` that was trained on a scenario; None if there is none."""
-    names = [name for name in shipped_policies() if name == start or name.startswith(f"{start}-")]
-    return next((name for name in names if load_shipped(name).manifest.scenario.get("name") == scenario), None)
+    driver = make_agent(name)
+    if not isinstance(driver, LearnedAgent):
+        raise InvalidInput(f"recipe {recipe!r}: {key}: {name}: must name a trained policy, such as ppo or policy@PATH")
+    return driver.policy
 
 
 def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:

@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.learners.branches import Offsets, moving, play_to_the_end
+from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
 from ethbrake_marl.extensions.learners.networks import Averaged, drawn, linear_layers, perceptron
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
@@ -79,11 +79,23 @@ class VineModel(BranchingModel):
         rows = drawn(alive, recipe.tried)
         least, most = recipe.offset.smallest, recipe.offset.largest
         sizes: Floats = least * (most / least) ** torch.rand(len(rows), dtype=torch.float64).numpy()
-        steps = np.tile(self.drawn_steps(len(rows)), 2)
-        offsets = Offsets(np.tile(rows % learners, 2), np.concatenate([sizes, -sizes]), steps)
-        branches = states.take(np.tile(rows // learners, 2))
-        gained, moved = play_to_the_end(self.game, branches, policy.act, offsets, recipe.gamma)
-        (up, down), (higher, lower) = np.split(gained, 2), np.split(moved, 2)
+        world, learner = np.divmod(np.tile(rows, 2), learners)
+        size, steps = np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2)
+        moved = np.zeros(len(size))  # by how much the actions were moved, after clipping, summed over the steps
+
+        def decide(now: Moment) -> Floats:
+            actions = now.ask(policy.act)
+            some = np.flatnonzero(now.number < steps[now.rows]) if now.number < longest else steps[:0]
+            row = now.rows[some]
+            before = actions[some, learner[row]]
+            after = np.clip(before + size[row], -1.0, 1.0)
+            actions[some, learner[row]] = after
+            moved[row] += after - before
+            return actions
+
+        longest = int(steps.max(initial=0))
+        gained, _ = play_on(self.game, states.take(world), decide, recipe.gamma, at_least=longest)
+        (up, down), (higher, lower) = np.split(gained[np.arange(len(size)), learner], 2), np.split(moved, 2)
         measured = (up - down) / (higher - lower)
         gradient = np.clip(measured, -recipe.gradient_limit, recipe.gradient_limit)
         whole = float(np.abs(measured).sum())

@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 import typer
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, example
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.store import new_file
 from ethbrake_marl.registry import Part
 
@@ -19,9 +18,7 @@ def from_data_command(
     ],
     format: Annotated[
         Literal["highd", "exid", "ngsim", "openacc", "table"],
-        typer.Option(
-            help="Format of the recordings. 'table' is a CSV or Parquet file whose columns --columns describes."
-        ),
+        typer.Option(help="Format of the recordings. 'table' is a CSV file whose columns --columns describes."),
     ],
     output: Annotated[
         Path,
@@ -49,11 +46,6 @@ def from_data_command(
         ),
     ] = "realistic-motorway",
     every: Annotated[float, typer.Option(help="Take rows from the recordings every so many seconds.")] = 1.0,
-    draw: Annotated[
-        Literal["rows", "quantiles"],
-        typer.Option(help="Draw worlds as whole recorded rows, or each quantity from 40 quantiles of the rows."),
-    ] = "rows",
-    strict: Annotated[bool, typer.Option("--strict", help="Write no scenario if any file has errors.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -69,26 +61,17 @@ def from_data_command(
         rows = output.with_suffix(".csv")
         out.check(output, ".yaml", what="the scenario")
         out.check(rows)
-        try:
-            result = scenario_from_data(
-                output.stem, folder, format, columns=columns, based_on=based_on, every_s=every, draw=draw,
-                strict=strict, progress=out.progress,
-            )  # fmt: skip
-        except InvalidInput as error:
-            for each in getattr(error, "__notes__", ()):
-                out.note(f"refused: {each}")
-            raise
+        result = scenario_from_data(
+            output.stem, folder, format, columns=columns, based_on=based_on, every_s=every, progress=out.progress
+        )
         for each in result.refused:
             out.note(f"refused: {each}")
         with new_file(output) as partial:
             partial.write_text(result.text, "utf-8")
-            if draw == "rows":
-                out.write(rows, result.csv, what="rows")
-            else:  # remove the rows of an earlier run, to which no scenario refers any more
-                rows.unlink(missing_ok=True)
+            out.write(rows, result.csv, what="rows")
         out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
         lists = {"found": result.found, "refused": result.refused, "skipped": result.skipped}
-        out.result({"scenario": str(output), "rows": str(rows) if draw == "rows" else None, **lists}, *result.found)
+        out.result({"scenario": str(output), "rows": str(rows), **lists}, *result.found)
 
 
 FROM_DATA = Part(

@@ -28,15 +28,13 @@ class Format(NamedTuple):
     licence: str  # sentence on the licence, for the key ``source`` of the scenario
     metres: float = 1.0  # length in m of the files' unit of length
     mps: float = 1.0  # speed in m/s of the files' unit of speed
-    ticks: float = 1.0  # number of ticks (intervals between recorded moments) in the files' unit of time
-    hertz: float = 10.0  # number of ticks in a second; 0: computed from the times in each file
+    per_second: float = 1.0  # number of the files' units of time in a second
     # Largest accepted share of vehicles with a fault (overlap, missing vehicle ahead). Faulty vehicles are left out.
     impossible: float = 0.0
     # If one of two vehicles is slower than this (m/s), a gap of 0 or less is noise and not a fault.
     standing_mps: float = -math.inf
     streets: tuple[str, ...] = ()  # values of the column Location, if there is one, whose rows are left out
     alone: float = 0.0  # value in the column of the vehicle ahead if no vehicle is ahead
-    headless: tuple[str, ...] = ()  # names of the columns of a text file without a header, separated by blanks
     texts: tuple[str, ...] = ()  # quantities whose columns have names instead of numbers
     optional: tuple[str, ...] = ()  # quantities whose columns may be missing
 
@@ -51,11 +49,6 @@ class Format(NamedTuple):
         return "ahead" not in self.columns and not self.gaps
 
 
-_NGSIM_TEXT = (
-    "Vehicle_ID", "Frame_ID", "Total_Frames", "Global_Time", "Local_X", "Local_Y", "Global_X", "Global_Y", "v_Length",
-    "v_Width", "v_Class", "v_Vel", "v_Acc", "Lane_ID", "Preceding", "Following", "Space_Hdwy", "Time_Hdwy",
-)  # fmt: skip
-
 _LEVELX = "is lent on request for non-commercial use and must not be passed on: these rows are for you alone."
 
 FORMATS: dict[DataFormat, Format] = {
@@ -63,29 +56,29 @@ FORMATS: dict[DataFormat, Format] = {
         "highD", ("*_tracks.csv",),
         {"time": "frame", "vehicle": "id", "lane": "laneId", "ahead": "precedingId", "front": "x", "length": "width",
          "speed": "xVelocity"},
-        "m and m/s", f"highD {_LEVELX}", hertz=25.0,
+        "m and m/s", f"highD {_LEVELX}", per_second=25.0,
     ),
     "exid": Format(
         "exiD", ("*_tracks.csv",),
         {"time": "frame", "vehicle": "trackId", "ahead": "leadId", "front": "xCenter", "side": "yCenter",
          "heading": "heading", "length": "length", "speed": "lonVelocity"},
-        "m and m/s", f"exiD {_LEVELX}", hertz=25.0, impossible=0.01, alone=-1.0,
+        "m and m/s", f"exiD {_LEVELX}", per_second=25.0, impossible=0.01, alone=-1.0,
     ),
     "ngsim": Format(
-        "NGSIM", ("*.csv", "*.txt"),
+        "NGSIM", ("*.csv",),
         {"time": "Global_Time", "vehicle": "Vehicle_ID", "lane": "Lane_ID", "ahead": "Preceding", "front": "Local_Y",
          "length": "v_Length", "speed": "v_Vel", "location": "Location"},
         "feet and feet/s",
         "NGSIM is of the US Department of Transportation, CC BY-SA: name the source, and share what you make of it"
         " under the same licence. Streets with crossings (lankershim, peachtree) are left out.",
-        metres=FOOT_M, mps=FOOT_M, ticks=0.01, impossible=0.05, streets=("lankershim", "peachtree"),
-        headless=_NGSIM_TEXT, texts=("location",), optional=("location",),
+        metres=FOOT_M, mps=FOOT_M, per_second=1000.0, impossible=0.05, streets=("lankershim", "peachtree"),
+        texts=("location",), optional=("location",),
     ),
     "openacc": Format(
         "OpenACC", ("*.csv",), {"time": "Time", "speed": f"Speed{NUMBER}", "gap": f"IVS{NUMBER}"}, "m and m/s",
         "OpenACC is of the European Commission's Joint Research Centre, CC BY 4.0: name the source, and say that these"
         " rows are made from it.",
-        ticks=10.0, impossible=0.01, standing_mps=0.5,
+        impossible=0.01, standing_mps=0.5,
     ),
 }  # fmt: skip
 
@@ -122,16 +115,16 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
         raise InvalidInput(f"columns: units = {settings['units']!r}: must be one of {', '.join(_UNITS)}")
     metres, mps, units = _UNITS[settings["units"]]
     column, _, divisor = settings["time"].rpartition("/")
-    second = parse_numeral(divisor) if column else None
-    if second is not None:
+    per_second = parse_numeral(divisor) if column else None
+    if per_second is not None:
         settings["time"] = column
-        if not 0.0 < second < math.inf:
+        if not 0.0 < per_second < math.inf:
             raise InvalidInput(
                 f"columns: time = .../{divisor}: the number after / must be the number of time units in 1 s,"
                 " for instance 1000 for ms"
             )
     return Format(
-        "the table", ("*.csv", "*.txt", "*.parquet"), {role: settings[role] for role in _ROLES}, units,
-        "Its licence is unknown: look it up where the data come from.", metres, mps, 1.0 / (second or 1.0), 0.0, 0.01,
+        "the table", ("*.csv", "*.txt"), {role: settings[role] for role in _ROLES}, units,
+        "Its licence is unknown: look it up where the data come from.", metres, mps, per_second or 1.0, 0.01,
         texts=("vehicle", "lane"),
     )  # fmt: skip

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.drive import Team
-from ethbrake_marl.cli.settings import read_settings
+from ethbrake_marl.extensions.cooperation.ablation import Measured
 from ethbrake_marl.extensions.cooperation.comparison import compare
-from ethbrake_marl.extensions.cooperation.levels import Level, read_levels
-from ethbrake_marl.extensions.cooperation.measured import Measured, all_braking, driven
+from ethbrake_marl.extensions.cooperation.levels import Level
 from ethbrake_marl.extensions.cooperation.optimum import Answer, can_imitate, least_known
 from ethbrake_marl.extensions.cooperation.results import levels_csv
 from ethbrake_marl.extensions.search.best_harm import best_harm
@@ -29,18 +27,20 @@ def columns(vehicles: list[list[float]]) -> dict[str, np.ndarray]:
     return {**borne, **line, "collided": each.any(axis=2)}
 
 
-def measured(level: str, vehicles: list[list[float]], algorithm: str | None, braking=None) -> Measured:
+def measured(level: str, vehicles: list[list[float]], algorithm: str | None, braking=None, before=None) -> Measured:
     scenario = eb.load_scenario(level)
     best = dict.fromkeys(("first", "total"), np.ones((1, len(vehicles))))
+    worlds = scenario.sample(1, 0)
     return Measured(
-        Level(level, scenario), algorithm, columns(vehicles), columns(braking or vehicles), best,
-        goal="first-impact harm" if algorithm else "",
-    )  # fmt: skip
+        Level(level, scenario, before), algorithm, columns(vehicles), columns(braking or vehicles), worlds, best
+    )
 
 
 def test_change__says_who_is_worse_off_and_by_how_much() -> None:
     before = measured("cooperation-0-sensors", [[2, 4, 0], [0, 6, 0], [1, 1, 0], [0, 0, 0]], None)
-    after = measured("cooperation-1-front", [[1, 2, 3], [0, 2, 0], [1, 2, 0], [0, 0, 0]], "ppo")
+    after = measured(
+        "cooperation-1-front", [[1, 2, 3], [0, 2, 0], [1, 2, 0], [0, 0, 0]], "ppo", None, before.level.name
+    )
     (step,) = compare([before, after], 4)["steps"]
     assert (step["from"], step["to"], step["algorithm"]) == ("cooperation-0-sensors", "cooperation-1-front", "ppo")
     for count in ("first", "total"):
@@ -58,16 +58,18 @@ def test_level__share_of_the_reduction_and_too_little_training_by_hand() -> None
     assert share["value"] == pytest.approx((5.5 - 2.5) / (5.5 - 1.0)) and found["undertrained"] == []
     worse = measured("cooperation-1-front", [[0, 6, 0], [0, 5, 0]], "ppo", [[1, 2, 0], [0, 2, 0]])
     (sentence,) = compare([worse], 2)["undertrained"]
-    assert "cooperation-1-front (ppo), first-impact harm 5.50 (2.50 if everybody brakes fully)" in sentence
+    assert "cooperation-1-front (ppo) with 5.50 (2.50 with full braking)" in sentence
 
 
 def test_csv__has_a_row_for_each_seed() -> None:
-    rows = list(
-        csv.DictReader(levels_csv([measured("cooperation-1-front", [[1, 2, 3], [0, 2, 0]], "ppo")], 1).splitlines())
-    )
-    (row,) = rows
+    one = measured("cooperation-1-front", [[1, 2, 3], [0, 2, 0]], "ppo")
+    both = one._replace(reached={name: np.concatenate([each, 2 * each]) for name, each in one.reached.items()})
+    row, other = csv.DictReader(levels_csv([both], 1).splitlines())
     assert (row["level"], row["seed"], row["first_impact_harm"]) == ("cooperation-1-front", "0", "4.0")
-    assert (row["searched_total_harm"], row["total_harm_3"], row["shielded_total_harm"]) == ("6.0", "1.5", "")
+    assert (other["seed"], other["first_impact_harm"], other["searched_total_harm"]) == ("1", "8.0", "12.0")
+    assert (row["searched_total_harm"], row["total_harm_3"], row["searched_best_known_total_harm"]) == (
+        "6.0", "1.5", "1.0",
+    )  # fmt: skip
 
 
 def answer(level: str, budget: int, n: int = 6, **changes: object) -> Answer:
@@ -75,7 +77,7 @@ def answer(level: str, budget: int, n: int = 6, **changes: object) -> Answer:
     loaded, game = eb.open_game(scenario)
     worlds = loaded.sample(n, 7)
     found = best_harm(game, worlds, budget=budget, threads=1)
-    return Answer(Level(level, loaded), game, worlds, found, {"first": [], "total": []})
+    return Answer(loaded, game, worlds, found, {"first": [], "total": []})
 
 
 def test_optimum__of_a_level_counts_what_fewer_learners_do_and_what_teams_did() -> None:
@@ -99,7 +101,7 @@ def test_optimum__of_a_level_with_an_obstacle_is_simulated_with_it() -> None:
 def test_levels__of_other_roles_or_latencies_cannot_be_imitated() -> None:
     pair = answer("cooperation-3-pair", 1)
     for changes in (
-        {"roles": {**pair.level.scenario.roles, "vehicle_1": "coast"}},
+        {"roles": {**pair.scenario.roles, "vehicle_1": "coast"}},
         {"latency_s": [0, 0.5, 0.9]},
         {"mass_t": 5.0},
     ):
@@ -108,44 +110,29 @@ def test_levels__of_other_roles_or_latencies_cannot_be_imitated() -> None:
     assert not can_imitate(answer("cooperation-3-pair", 1, latency_s=[0, 0.55, 0.5]), late).any()
 
 
-def test_braking__is_that_of_all_vehicles_in_the_worlds_of_a_level() -> None:
-    pair = eb.load_scenario("cooperation-3-pair")
-    drawn = pair.draw(10, 7)
-    braking = pair.replace(roles=dict.fromkeys(pair.vehicle_names, "full_brake"))
-    _, found = driven(braking, all_braking(drawn), {"full_brake": Team("full_brake", {})}, None)
-    expected = eb.evaluate(pair, {"it": "full_brake"}, episodes=10)["it"]["total_harm"]
-    assert found["total_harm"][0] == pytest.approx(expected)
-
-
 def test_ablation__trains_compares_and_goes_on(
     ethbrake: Command, empty_folder: Path, tiny_recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     draw_nothing(monkeypatch)
     small = "--seeds 2 --steps 128 --episodes 12 --search-episodes 2 --set horizon_s=7"
     line = f"study ablate --levels cooperation-0-sensors,cooperation-2-paper,cooperation-3-pair --recipes {tiny_recipe}"
-    assert ethbrake(*line.split(), *small.split(), "--output", "out", "--shield", "step").status == 0
+    assert ethbrake(*line.split(), *small.split(), "--output", "out").status == 0
     out, found = Path("out"), json.loads(Path("out/ablation.json").read_text())
     assert {path.name for path in out.glob("ablation*")} == {"ablation.json", "ablation.csv", "ablation.png"}
     folders = [f"cooperation-{name}-seed{k}" for name in ("2-paper-tiny", "3-pair-tiny-shared") for k in (0, 1)]
     assert sorted(path.name for path in out.glob("trainings/*")) == folders
     config = json.loads((out / "trainings" / folders[0] / "config.json").read_text())
     assert config["settings"] == ["horizon_s=7"] and config["recipe"]["scheme"] is None
+    pair = json.loads((out / "trainings" / folders[2] / "config.json").read_text())["recipe"]
+    assert (config["recipe"]["total_steps"], pair["total_steps"]) == (128, 256)
     for level in found["levels"][1:]:
-        shielded, searched = level["first"]["shielded"], level["first"]["searched"]
-        assert shielded["above_bound"] == 0 and shielded["harm"]["value"] <= shielded["bound"]["value"]
-        assert 0.1 < shielded["replaced"] < 1.0 and level["seeds"] == 2
+        searched = level["first"]["searched"]
+        assert level["seeds"] == 2
         assert searched["best_known"]["value"] <= searched["harm"]["value"]
         assert len(level["policy_sha256"]) == 2 and level["policy_sha256"][0] != level["policy_sha256"][1]
     assert found["levels"][1]["first"]["full_brake"] == found["levels"][2]["first"]["full_brake"]
     assert "first 2 worlds" in found["conditions"] and "2 seeds, 128 decisions" in found["conditions"]
-    again = ethbrake(*line.split(), *small.split(), "--output", "out", "--shield", "step", "--json")
+    again = ethbrake(*line.split(), *small.split(), "--output", "out", "--json")
     assert again.status == 0 and json.loads(again.out)["levels"] == found["levels"]
-    other = ethbrake(*line.split(), *small.split(), "--output", "out")
-    assert other.status == 2 and "contains an ablation with other settings (shield" in other.err
-
-
-def test_quick_levels__are_the_ladder() -> None:
-    from ethbrake_marl.extensions.cooperation.levels import LADDER, STANDARD
-
-    assert STANDARD[: len(LADDER)] == LADDER
-    assert [level.clear for level in read_levels(STANDARD, read_settings(()))] == [None] * 5 + ["cooperation-2-paper"]
+    other = ethbrake(*line.split(), *small.replace("12", "13").split(), "--output", "out")
+    assert other.status == 2 and "contains an ablation with other settings (steps-per-learner 128, now 138" in other.err

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.cooperation import (
@@ -19,8 +18,6 @@ from ethbrake_marl.extensions.cooperation import (
 from ethbrake_marl.extensions.cooperation.equilibria import turn_of
 from ethbrake_marl.extensions.search.pricing import Profiles, problem_of
 from ethbrake_marl.motion.layout import Floats
-
-LEVELS = ("cooperation-3-pair", "cooperation-4-all")
 
 
 def two_vehicles(rear_braking: float, front: str) -> tuple[eb.Scenario, eb.State]:
@@ -37,45 +34,17 @@ def test_rear_vehicle_alone__can_do_no_better_than_brake_from_any_start() -> Non
     """Closing at 8 - 6 m/s2 over 2 m: the square of the impact speed is 2 * 2 * 2 = 8, of which 1/4 is the rear's."""
     ends = find_equilibria(*two_vehicles(6.0, "full_brake"), budget=1_000)
     for end in ends.values():
-        assert end.converged.all() and end.borne["first"] == pytest.approx(np.array([[6.0, 2.0]]), abs=0.02)
+        assert end.converged.all() and end.borne == pytest.approx(np.array([[6.0, 2.0]]), abs=0.02)
     assert ends["braking"].rounds.tolist() == [1] and (ends["braking"].profiles.commands_mps2 == -6.0).all()
 
 
 def test_two_learners__with_room_ahead_do_no_harm_and_stay_as_they_are_where_braking_does_none() -> None:
     """The front one stops after 25 m if it brakes fully and needs 60; braking by 6 m/s2 like the rear takes 33 m."""
     ends = find_equilibria(*two_vehicles(6.0, "learner"), budget=1_000)
-    assert all(end.converged.all() for end in ends.values()) and ends["braking"].borne["total"].sum() < 0.01
+    assert all(end.converged.all() for end in ends.values()) and ends["braking"].borne.sum() < 0.01
     braking = find_equilibria(*two_vehicles(8.0, "learner"), budget=300)["braking"]
     assert braking.rounds.tolist() == [1] and (braking.profiles.commands_mps2 == -8.0).all()
-    assert braking.borne["total"].tolist() == [[0.0, 0.0]]
-
-
-class Replay:
-    """Drives one vehicle of an equilibrium."""
-
-    name, knows = "replay", "true model"
-
-    def __init__(self, commands: Floats) -> None:
-        self.commands = commands
-
-    def begin(self, alert: eb.State, body: int) -> None:
-        return None
-
-    def act(self, state: eb.State, memory: None, body: int) -> tuple[Floats, None]:
-        step = np.minimum(state.steps, self.commands.shape[1] - 1)
-        return self.commands[np.arange(state.n), step], None
-
-
-@pytest.mark.parametrize("name", LEVELS)
-def test_harm__is_the_episodes_to_the_bit(name: str) -> None:
-    scenario, game = eb.open_game(name)
-    worlds = scenario.sample(6, 5)
-    for end in find_equilibria(scenario, worlds, "own", budget=100, rounds=2).values():
-        commands = end.profiles.commands_mps2
-        team = Team("it", {body: Replay(commands[:, :, c]) for c, body in enumerate(scenario.learners)})
-        last = eb.drive(game, worlds, team)
-        for count in ("first", "total"):
-            assert last.borne_harm(count).tolist() == end.borne[count].tolist()
+    assert braking.borne.tolist() == [[0.0, 0.0]]
 
 
 def beaten_by(scenario: eb.Scenario, worlds: eb.State, end: Equilibrium, objective: str) -> Floats:
@@ -95,11 +64,11 @@ def beaten_by(scenario: eb.Scenario, worlds: eb.State, end: Equilibrium, objecti
     return np.max(gains, axis=0)
 
 
-@pytest.mark.parametrize(("name", "objective"), [*product(LEVELS, ("own", "maximin"))])
+@pytest.mark.parametrize(("name", "objective"), [("cooperation-3-pair", "own"), ("cooperation-4-all", "maximin")])
 def test_what_converged__no_learner_improves_by_constants_or_two_commands(name: str, objective: str) -> None:
     scenario = eb.load_scenario(name)
     worlds = scenario.sample(4, 11)
-    for end in find_equilibria(scenario, worlds, objective, budget=2_000).values():
+    for end in find_equilibria(scenario, worlds, objective, budget=1_000).values():
         assert end.converged.mean() >= 0.7
         assert beaten_by(scenario, worlds, end, objective)[end.converged].max() <= 0.02
 
@@ -118,35 +87,35 @@ def test_turn__minimises_the_objective_of_its_learner_alone() -> None:
 
 def test_ends__never_beat_the_joint_optimum_and_do_not_depend_on_other_worlds() -> None:
     scenario = eb.load_scenario("cooperation-3-pair")
-    worlds = scenario.sample(6, 9)
+    worlds = scenario.sample(4, 9)
     ends = find_equilibria(scenario, worlds, "own", budget=500)
-    part = find_equilibria(scenario, worlds.take([5, 2]), "own", budget=500, threads=2)
+    part = find_equilibria(scenario, worlds.take([3, 1]), "own", budget=500)
     for name, end in ends.items():
-        assert part[name].borne["total"].tolist() == end.borne["total"][[5, 2]].tolist()
-    joint = best_joint_harm(scenario, worlds, ends.values(), budget=2_000)["first"].sum(axis=1)
-    best = best_joint_harm(scenario, worlds, budget=2_000)["first"].sum(axis=1)
+        assert part[name].borne.tolist() == end.borne[[3, 1]].tolist()
+    joint = best_joint_harm(scenario, worlds, ends.values(), budget=2_000).sum(axis=1)
+    best = best_joint_harm(scenario, worlds, (), budget=2_000).sum(axis=1)
     assert (joint <= best).all()
     for end in ends.values():
-        assert (end.borne["first"].sum(axis=1) >= joint).all()
+        assert (end.borne.sum(axis=1) >= joint).all()
 
 
 def ends_of(*borne: list[list[float]], converged: list[list[bool]]) -> dict[str, Equilibrium]:
     nothing, rounds = Profiles(np.zeros((0, 1), int), np.zeros((0, 1, 1))), np.ones(len(borne[0]), np.int64)
     return {
-        str(k): Equilibrium(nothing, {"first": np.array(each)}, np.array(there), rounds)
+        str(k): Equilibrium(nothing, np.array(each), np.array(there), rounds)
         for k, (each, there) in enumerate(zip(borne, converged, strict=True))
     }
 
 
 def test_spread__is_of_the_ends_that_converged() -> None:
     one, other = [[1.0, 2.0], [5.0, 0.0], [9.0, 9.0]], [[2.05, 1.0], [0.0, 0.0], [8.0, 8.0]]
-    spread = compare_starts(ends_of(one, other, converged=[[True, True, False], [True, False, False]]), "first")
+    spread = compare_starts(ends_of(one, other, converged=[[True, True, False], [True, False, False]]))
     assert spread.found.tolist() == [2, 1, 0] and spread.differs.tolist() == [True, False, False]
     assert spread.best[:2].tolist() == [[1.0, 2.0], [5.0, 0.0]]
     assert spread.worst[:2].tolist() == [[2.05, 1.0], [5.0, 0.0]]
     assert np.isnan(spread.best[2]).all() and np.isnan(spread.worst[2]).all()
     close = ends_of([[1.0, 2.0]], [[1.09, 2.0]], converged=[[True], [True]])
-    assert not compare_starts(close, "first").differs.any() and compare_starts(close, "first", 0.05).differs.all()
+    assert not compare_starts(close).differs.any()
 
 
 def test_price__is_the_ratio_of_the_means_over_worlds_where_something_converged() -> None:
@@ -161,10 +130,8 @@ def test_price__is_the_ratio_of_the_means_over_worlds_where_something_converged(
     ("level", "options", "message"),
     [
         ("cooperation-0-sensors", {}, "'cooperation-0-sensors' has no learner; give at least one vehicle"),
-        ("cooperation-3-pair", {"tolerance": float("nan")}, "tolerance = nan: must be a finite"),
         ("cooperation-3-pair", {"rounds": 0}, "rounds = 0: must be a whole number, at least 1"),
         ("cooperation-3-pair", {"budget": 0}, "budget = 0: must be a whole number, at least 1"),
-        ("cooperation-3-pair", {"seed": -1}, "seed = -1: must be a whole number, at least 0"),
         ("cooperation-3-pair", {"objective": ["own"]}, "objective: the list has 1 entries; must have 3"),
         ("cooperation-3-pair", {"objective": "injury:lr4s"}, "is not a weighted sum of the vehicles' harm; use"),
         ("cooperation-3-pair", {"count": "last"}, "count = 'last'"),

@@ -25,10 +25,9 @@ def coast(seen: np.ndarray) -> np.ndarray:
 
 def test_stages__follow_each_other_and_get_their_shares() -> None:
     plan = ExpertsPlan(**PLAN | {"networks": 3})
-    found = [(s.trains, s.network, s.first, s.end) for s in stages_of(plan, 16)]
-    others = [("other", 1, 4, 6), ("other", 2, 6, 8)]
-    assert found == [("first", 0, 0, 4), *others, ("gating", 0, 8, 12), ("joint", 0, 12, 16)]
-    assert [s.end for s in stages_of(plan, 3)] == [1, 2, 2, 3, 3]  # rounded up, so the first is never left out
+    found = [tuple(stage) for stage in stages_of(plan, 16)]
+    assert found == [(0, 0, 4), (1, 4, 6), (2, 6, 8), (None, 8, 16)]
+    assert [stage.end for stage in stages_of(plan, 3)] == [1, 2, 2, 3]  # rounded up, so the first is never left out
 
 
 def test_templates__are_one_action_another_for_a_while_then_full_braking() -> None:
@@ -90,7 +89,6 @@ def test_gate__learns_what_costs_least_and_what_matters_most() -> None:
     model = new_model(EXPERTS.replace(**fast, experts={**PLAN, "gating_memory": 1000, "gating_steps": 20}))
     seen = np.repeat(np.eye(27, dtype=np.float32)[[0, 1, 1]], 100, axis=0)
     costs = np.repeat([[0.0, 1.0], [5.0, 0.0], [0.0, 1.0]], 100, axis=0)
-    model.stage = stages_of(model.plan, 8)[2]
     assert (model.policy.gate.best(seen) == 0).all()
     for _ in range(20):
         model.train_gate(seen, costs)

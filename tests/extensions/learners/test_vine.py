@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.learners.algorithms import RandomStart
-from ethbrake_marl.extensions.learners.start import members_of, shipped_for, widened
+from ethbrake_marl.extensions.learners.start import members_of, widened
 from ethbrake_marl.extensions.learners.vine import Tried, trusted_targets
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.recipe import load_recipe
@@ -66,7 +65,6 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
     np.testing.assert_allclose(found["old"]["total_harm"], found["new"]["total_harm"], atol=1e-3)
     assert (policy.manifest.algorithm, len(policy.manifest.observation.features)) == ("vine", 57)
     assert eb.make_agent(f"vine@{tmp_path / 'run'}").name == f"vine@{tmp_path / 'run'}"
-    assert shipped_for("ppo", "paper-random-obstacle") == "ppo-obstacle"
 
 
 def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -> None:
@@ -77,8 +75,10 @@ def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -
     np.testing.assert_array_equal(first[:, 1:], member.tensors["policy.0.weight"][:, ::-1])
 
 
-def test_training__starts_at_random_where_no_policy_ships_and_says_so(tmp_path: Path) -> None:
-    with pytest.warns(RandomStart, match="no policy ppo is shipped for scenario 'cooperation-2-five'"):
-        policy = train(STILL, "cooperation-2-five", tmp_path / "run", measure=None, on_progress=None).policy
-    seen = np.random.default_rng(0).uniform(0, 1, (50, 57)).astype(np.float32)
-    np.testing.assert_allclose(policy(seen), -0.9, atol=0.1)
+def test_policies_inside_a_policy__keep_their_own_weights() -> None:
+    universal = load_shipped("universal")
+    members = members_of(universal)
+    assert len(members) == 11
+    for m, member in enumerate(members, 1):
+        assert member.tensors.keys() == {name for name in member.network.tensors if not name.startswith("value.")}
+        assert all(array is universal.tensors[f"among_{m}.{name}"] for name, array in member.tensors.items())

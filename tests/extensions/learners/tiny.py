@@ -35,8 +35,8 @@ POLICIES = ROLLOUTS.replace(
 )  # fmt: skip
 PLAN: dict[str, Any] = {
     "networks": 2, "gating": [4], "worlds": 64, "templates": 20, "gain": 0.0, "margin": 5.0, "imitation_epochs": 2,
-    "gating_states": 32, "gating_memory": 100, "gating_steps": 4, "tie_break": 0.05, "joint_rate": 0.5,
-    "shares": {"pretraining_first": 0.25, "pretraining_others": 0.25, "gating": 0.25, "joint": 0.25},
+    "gating_states": 32, "gating_memory": 100, "gating_steps": 4, "tie_break": 0.05,
+    "shares": {"pretraining_first": 0.25, "pretraining_others": 0.25, "gating": 0.5},
 }  # fmt: skip
 EXPERTS = VINE.replace(experts=PLAN)
 

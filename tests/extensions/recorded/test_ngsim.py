@@ -1,4 +1,4 @@
-"""NGSIM in the three forms in which it is handed out, in feet."""
+"""NGSIM in the two forms in which it is handed out, in feet."""
 
 from pathlib import Path
 
@@ -43,13 +43,7 @@ def form_of_api() -> list[str]:
     return [",".join(f'"{cell}"' for cell in row) for row in [names, *(portal(*car) for car in CARS)]]
 
 
-def form_of_text() -> list[str]:
-    """A text file of the zip: blanks between, no header, 18 columns."""
-    rows = (portal(*car) for car in CARS)
-    return ["   ".join([*row[:14], *row[20:24]]).replace(",", "") for row in rows]
-
-
-FORMS = {"portal.csv": form_of_portal(), "api.csv": form_of_api(), "trajectories-0750am-0805am.txt": form_of_text()}
+FORMS = {"portal.csv": form_of_portal(), "api.csv": form_of_api()}
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -59,14 +53,8 @@ def test_form__gives_three_cars_60_feet_apart(name: str, tmp_path: Path) -> None
     assert "CC BY-SA" in made.text and "same licence" in made.text
 
 
-def test_text_beside_its_csv__is_skipped_because_it_is_the_same(tmp_path: Path) -> None:
-    files = {"a.csv": form_of_portal(), "a.txt": form_of_text(), "readme.txt": ["Vehicle trajectory data", "1 2 of it"]}
-    made = scenario_from_data("mine", write_files(tmp_path, files), "ngsim")
-    assert rows_of(made) == ROWS and made.skipped == ["a.txt", "readme.txt"]
-
-
-@pytest.mark.parametrize("street", ["lankershim", "peachtree"])
-def test_rows_of_streets__are_said_to_be_all(street: str, tmp_path: Path) -> None:
+def test_rows_of_streets__are_said_to_be_all(tmp_path: Path) -> None:
+    street = "peachtree"
     right = "contains no rows of data except those from lankershim and peachtree"
     with pytest.raises(InvalidInput, match=right):
         scenario_from_data("mine", write_files(tmp_path, {"a.csv": form_of_portal(street)}), "ngsim")
@@ -85,12 +73,9 @@ def test_rows_of_streets__are_said_to_be_all(street: str, tmp_path: Path) -> Non
         ),
         ("api.csv", '"15.0"', '"15 ft"', "api.csv, line 2, column v_length: must be a finite number, but is '15 ft'"),
         ("api.csv", '"40.00"', '"40.00', "api.csv: cannot be read .*Row #1: Expected 25 columns, got 24"),
-        ("a.txt", "40.00", "fast", "a.txt, line 1, column v_Vel: must be a finite number, but is 'fast'"),
-        ("a.txt", "   60.00", "", "a.txt: cannot be read .*Row #1: Expected 18 columns, got 17"),
     ],
 )
 def test_fault__is_named_with_its_line(name: str, old: str, new: str, right: str, tmp_path: Path) -> None:
-    lines = {**FORMS, "a.txt": form_of_text()}[name]
-    changed = "\n".join(lines).replace(old, new, 1 if name != "portal.csv" else 2).splitlines()
+    changed = "\n".join(FORMS[name]).replace(old, new, 1 if name != "portal.csv" else 2).splitlines()
     with pytest.raises(InvalidInput, match=right):
         scenario_from_data("mine", write_files(tmp_path, {name: changed}), "ngsim")

@@ -80,48 +80,16 @@ def test_times_of_30_hertz__may_be_rounded(tmp_path: Path) -> None:
         for k in range(61)
     ]
     assert rows_of(made_of(table(tmp_path, cars))) == [ROWS[0]] * 3
-    with pytest.raises(
-        InvalidInput,
-        match=r"every = 0.05 s: the time between the moments that are read must be a multiple of 0.0333333 s",
-    ):
-        made_of(table(tmp_path, cars), every_s=0.05)
+    assert rows_of(made_of(table(tmp_path, cars), every_s=0.1)) == [ROWS[0]] * 21
+    with pytest.raises(InvalidInput, match=r"every = 0.02 s: .* must be at least 0.033 s, the time between recorded"):
+        made_of(table(tmp_path, cars), every_s=0.02)
 
 
-def test_parquet__gives_the_same_rows_and_names_rows(tmp_path: Path) -> None:
-    arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
-
-    def write(cars: list[tuple[object, ...]]) -> Path:
-        columns = dict(zip(HEAD, zip(*cars, strict=True), strict=True))
-        parquet.write_table(
-            arrow.table({name: list(column) for name, column in columns.items()}), tmp_path / "a.parquet"
-        )
-        return tmp_path
-
-    assert rows_of(made_of(write(CARS))) == ROWS
-    numbered = [(k % 5 + 1, *row[1:2], int(row[2][-1]), *row[3:]) for k, row in enumerate(CARS)]
-    assert made_of(write(numbered)).csv.endswith("a.parquet: 3-4-1\n")
-    for k, cell, right in (
-        (4, -1.0, r"a.parquet, row 3, column l: -1.0 m: the length must be above 0 and at most 40 m"),
-        (5, None, "a.parquet, row 3, column v: must be a finite number, but is empty"),
-        (0, None, "a.parquet, row 3, column who: .*must be a name"),
-    ):
-        with pytest.raises(InvalidInput, match=right):
-            made_of(write([*CARS[:2], (*CARS[2][:k], cell, *CARS[2][k + 1 :]), *CARS[3:]]))
-    with pytest.raises(InvalidInput, match=r"a.parquet, row 1, column v: must be a finite number, but is 'fast'"):
-        made_of(write([(*car[:5], "fast") for car in CARS]))
-    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read \(Unsupported cast from list"):
-        made_of(write([(*car[:5], [car[5]]) for car in CARS]))
-    (tmp_path / "a.parquet").write_bytes(b"PAR1 and no more")
-    with pytest.raises(InvalidInput, match=r"a.parquet: cannot be read"):
-        made_of(tmp_path)
-
-
-@pytest.mark.parametrize("package", ["pandas", "pyarrow"])
-def test_missing_package__is_named_with_the_extra(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package__is_named_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in sys.modules if name.startswith("ethbrake_marl.extensions.recorded.")]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(MissingExtra, match=rf"needs the package {package}.*pip install 'ethbrake-marl\[data\]'"):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingExtra, match=r"needs the package pyarrow.*pip install 'ethbrake-marl\[data\]'"):
         importlib.import_module("ethbrake_marl.extensions.recorded.scenario")
 
 
@@ -133,11 +101,11 @@ def one_more(*car: object) -> list[tuple[object, ...]]:
 WRONG = {
     "direction": (
         [(*car[:3], -car[3], *car[4:]) for car in CARS],
-        "lane E1_0, positions .column front. change by -1.00 times the distance",
+        "lane E1_0, positions .column x. change by -1.00 times the distance",
     ),
     "backwards": (
         [(*car[:3], -car[3], car[4], -car[5]) for car in CARS],
-        "in lane E1_0, positions .column front. change by 1.00 times .*, and the speeds are negative; front must",
+        "in lane E1_0, positions .column x. change by 1.00 times .*, and the speeds are negative; positions must",
     ),
     "feet": (
         [(*car[:3], car[3] / 0.3048, *car[4:]) for car in CARS],
@@ -151,15 +119,6 @@ WRONG = {
         one_more("d", 1.0, "E1_0", 150.0, "5 m", 20.0),
         "line 17, column l: must be a finite number, but is '5 m'",
     ),
-    "late": (one_more("d", 1e308, "E1_0", 150.0, 5, 20.0), r"line 17, column t: 1e\+308 must be between -2\^53 and"),
-    "too late": (
-        [*one_more("d", 1.0001, "E1_0", 150.0, 5, 20.0), ("d", 1e15, "E1_0", 150.0, 5, 20.0)],
-        r"line 18, column t: 1e\+15 must be a multiple of 0.0001 s after the first time, and less than 2\^53",
-    ),
-    "time": (
-        one_more("d", 0.625, "E1_0", 150.0, 5, 20.0),
-        "every = 0.8 s: the time between the moments that are read must be a multiple of 0.125 s",
-    ),
 }
 
 
@@ -167,7 +126,7 @@ WRONG = {
 def test_wrong_table__is_refused_with_what_would_be_right(what: str, tmp_path: Path) -> None:
     cars, right = WRONG[what]
     with pytest.raises(InvalidInput, match=right):
-        made_of(table(tmp_path, cars), every_s=0.8 if what == "time" else 1.0)
+        made_of(table(tmp_path, cars))
 
 
 @pytest.mark.parametrize(
@@ -217,19 +176,11 @@ def exid(folder: Path, degrees: float, ahead: int = 4) -> Path:
     return write_files(folder, {"03_tracks.csv": [EXID, *rows], "03_tracksMeta.csv": ["recordingId,trackId"]})
 
 
-@pytest.mark.parametrize("degrees", [0.0, 90.0, 137.5, 300.0])
+@pytest.mark.parametrize("degrees", [0.0, 137.5])
 def test_exid__has_gaps_along_the_direction_of_travel(degrees: float, tmp_path: Path) -> None:
     made = scenario_from_data("mine", exid(tmp_path, degrees), "exid")
     assert made.csv.splitlines()[1:] == ["22.0,16.5,30.0,26.0,23.0,03_tracks.csv: 0-4-7"]  # 30 - 2 - 6 and 25 - 6 - 2.5
     assert "must not be passed on" in made.text
-
-
-def test_ind_and_round__are_refused_because_they_lack_the_vehicle_ahead(tmp_path: Path) -> None:
-    file = exid(tmp_path, 0.0) / "03_tracks.csv"
-    lines = [",".join(line.split(",")[:17]) for line in file.read_text().splitlines()]
-    file.write_text("\n".join([*lines, ""]))
-    with pytest.raises(InvalidInput, match=r"03_tracks.csv: lacks columns that files of exiD have: leadId"):
-        scenario_from_data("mine", tmp_path, "exid")
 
 
 def test_order_of_rows_and_vehicles__has_no_effect(tmp_path: Path) -> None:
@@ -250,7 +201,3 @@ def test_frames_of_video__keep_their_rate_and_names_of_columns_are_literal(tmp_p
     columns = "time=t/29.97,vehicle=veh#,lane=lane,front=x,length=l,speed=v,units=m"
     made = made_of(folder, columns, based_on="realistic-pair")
     assert rows_of(made) == ["15.0,20.0,20.0"] * 21
-    with pytest.raises(
-        InvalidInput, match=r"every = 0\.05 s: the time between the moments that are read must be a multiple of 0\.0333"
-    ):
-        made_of(folder, columns, based_on="realistic-pair", every_s=0.05)

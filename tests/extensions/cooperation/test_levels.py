@@ -6,19 +6,26 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.settings import read_settings
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.cooperation.levels import common_worlds, read_levels, sweep_levels
+from ethbrake_marl.extensions.cooperation.levels import (
+    LADDER,
+    STANDARD,
+    Level,
+    common_worlds,
+    read_levels,
+    sweep_levels,
+)
 from ethbrake_marl.extensions.cooperation.sweep import parse_sweep
 from tests.fixtures.commands import Refuse
+from tests.refused import refused
 
 NOTHING = read_settings(())
+LEVEL_2 = eb.load_scenario("cooperation-2-paper")
 
 
 @pytest.mark.parametrize(
     ("text", "settings"),
     [
         ("objective=social:0..90:45", ["objective=social:0", "objective=social:45", "objective=social:90"]),
-        ("v2x.lost=0..0.3:0.1", ["v2x.lost=0", "v2x.lost=0.1", "v2x.lost=0.2", "v2x.lost=0.3"]),
         ("friction = 0.9, 0.2..0.4:0.1, 10", [f"friction={each}" for each in ("0.2", "0.3", "0.4", "0.9", "10")]),
         ("k=-0.5..0.5:0.5", ["k=-0.5", "k=0", "k=0.5"]),
         ("objective=social:45,0", ["objective=social:0", "objective=social:45"]),
@@ -28,6 +35,12 @@ def test_parse__ranges_and_lists_in_ascending_order(text: str, settings: list[st
     values = parse_sweep(text)
     assert [each.setting for each in values] == settings
     assert [each.number for each in values] == [float(each.replace(":", "=").split("=")[-1]) for each in settings]
+
+
+def test_standard_levels__are_a_ladder_and_one_beside_the_paper() -> None:
+    assert STANDARD[: len(LADDER)] == LADDER
+    before = [None, *LADDER[:-1], "cooperation-2-paper"]
+    assert [level.before for level in read_levels(STANDARD, NOTHING)] == before
 
 
 REFUSED = {
@@ -45,13 +58,12 @@ REFUSED = {
     "--sweep objective=social:0,90 --set reward.objective=own": "has its own objective",
     "--levels cooperation-3-pair,cooperation-3-pair": "given twice",
     "--levels cooperation-3-pair": "give at least two levels",
-    "--levels cooperation-0-sensors,paper-distance": "level 'paper-distance': speeds_mps is",
+    "--levels cooperation-0-sensors,paper-distance": "level 'paper-distance': speed_1_mps is",
     "--levels cooperation-3-pair,cooperation-3-five": "vehicles is 5, but 3",
     "--levels cooperation-0-sensors,cooperation-3-pair --set roles.vehicle_2=coast --set roles.vehicle_3=coast": (
         "no level has a learner"
     ),
     "--episodes 10 --search-episodes 11": "search-episodes = 11",
-    "--shield robust": "shield 'robust'",
     "--recipes ppo,ppo": "two recipes have the same name",
 }
 
@@ -67,24 +79,43 @@ def test_output__is_a_folder_of_its_own(refuse: Refuse) -> None:
     refuse("study ablate --recipes ppo --output file/new", "is not a folder; give a new folder (--output)")
 
 
-def test_levels__that_differ_only_in_messages_are_compared_with_the_first_one() -> None:
-    levels = read_levels(["cooperation-2-paper", "cooperation-3-pair", "cooperation-3-congested"], NOTHING)
-    assert [level.clear for level in levels] == [None, None, "cooperation-3-pair"]
-    one, *others = common_worlds(levels, 20, 7)
+def level(scenario: eb.Scenario) -> Level:
+    return Level(scenario.name, scenario)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mass_t": [4.5, 5.5, 6]}, "level 'mine': mass_3_t is 6.0, but 5.9 at level 'cooperation-2-paper'"),
+        ({"restitution": 0.2}, "level 'mine': restitution is 0.2, but 0.1 at level 'cooperation-2-paper'"),
+        ({"latency_s": [0, 0.5, 0.9]}, "level 'mine': latency_3_s is 0.9, but 0.8 at level"),
+        ({"brake_rate_mps3": 30}, "level 'mine': brake_rate_1_mps3 is 30.0, but not set at level"),
+    ],
+)
+def test_levels__are_compared_on_the_same_lines(changes: dict[str, object], message: str) -> None:
+    mine = LEVEL_2.replace(name="mine", roles={"vehicle_3": "learner"}, **changes)
+    with refused(message):
+        common_worlds([level(LEVEL_2), level(mine)], 5, 7)
+
+
+def test_levels__may_differ_in_roles_objective_obstacle_and_channel_alone() -> None:
+    roles = {"vehicle_1": "learner", "vehicle_3": "coast"}
+    free = LEVEL_2.replace(name="mine", roles=roles, objective="own", obstacle_gap_m=42, v2x="blocked")
+    late = LEVEL_2.replace(name="late", v2x="blocked")
+    one, *others = common_worlds([level(LEVEL_2), level(free), level(late)], 5, 7)
     for other in others:
         assert other.worlds.gaps_m.tolist() == one.worlds.gaps_m.tolist()
-    late = others[1].worlds.latency_s > one.worlds.latency_s
-    assert late.any()  # a congested channel delays
+        assert (other.worlds.latency_s > one.worlds.latency_s).any()
+    with refused("level 'late': latency_3_s is"):
+        common_worlds([level(LEVEL_2), level(free), level(late.replace(latency_s=[0, 0.5, 0.9]))], 5, 7)
 
 
-def test_levels__whose_vehicles_differ_are_refused_unless_a_sweep_varies_them(tmp_path: Path) -> None:
-    heavy = read_levels(["cooperation-2-paper", "cooperation-3-pair"], NOTHING)
-    heavy[1] = heavy[1]._replace(scenario=heavy[1].scenario.replace(mass_t=[4.5, 5.5, 40.0]))
-    with pytest.raises(InvalidInput, match=r"level 'cooperation-3-pair': mass_t is 4.5, 5.5, 40, but 4.5, 5.5, 5.9"):
-        common_worlds(heavy, 5, 7)
+def test_sweep__may_vary_the_vehicles() -> None:
     recipe = eb.load_recipe("ppo")
     swept = sweep_levels("cooperation-3-pair", "mass_t.2=5,40", NOTHING, [recipe])
-    assert [level.name for level in swept] == ["cooperation-3-pair-mass_t.2-5", "cooperation-3-pair-mass_t.2-40"]
+    names = ["cooperation-3-pair-mass_t.2-5", "cooperation-3-pair-mass_t.2-40"]
+    assert [(level.name, level.before) for level in swept] == [(names[0], None), (names[1], names[0])]
     assert [each.worlds.mass_t[0, 2] for each in common_worlds(swept, 5, 7)] == [5.0, 40.0]
     alike = sweep_levels("cooperation-3-pair", "objective=social:0,30", NOTHING, [recipe])
     assert [level.same_vehicles for level in (*swept, *alike)] == [False, False, True, True]
+    assert alike[0].swept is not None and alike[0].swept.axis == "objective = social:…"
