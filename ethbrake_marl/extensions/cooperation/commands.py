@@ -113,11 +113,11 @@ def ablate_command(
             noted=changes.texts,
             **{**(QUICK if quick else FULL), **chosen},
         )
-        with plan.study_folder().work():
+        with plan.study_folder():
             if not train_all(plan, jobs or 1, out.show_progress):
                 out.interrupted(f"interrupted; {REMAINS}")
             measured = measure(plan, jobs or 1, out.show_progress)
-            results, paths = write_ablation(plan, measured, str(this_machine()))
+            results, paths = write_ablation(plan, measured, this_machine())
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
         out.result(results, *tables(results), results["conditions"], *alarms)
         out.note(f"results: {', '.join(map(str, paths))}")

@@ -8,6 +8,7 @@ the value of one key.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ import numpy as np
 from ethbrake_marl.cli.settings import Settings
 from ethbrake_marl.errors import InvalidInput, check_whole_number, count_of
 from ethbrake_marl.extensions.cooperation.sweep import Swept, parse_sweep
-from ethbrake_marl.extensions.studies.folder import StudyFolder
+from ethbrake_marl.extensions.studies.folder import work_in
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.training.recipe import TrainingRecipe
@@ -230,9 +231,9 @@ class Plan:
             **{name: getattr(self, name) for name in (*FULL, "list_seed", "shield")},
         }
 
-    def study_folder(self) -> StudyFolder:
+    def study_folder(self) -> AbstractContextManager[None]:
         """Return the folder, which refuses results of other settings."""
         advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
-        return StudyFolder(
+        return work_in(
             self.folder, "an ablation", self.settings(), record=SETTINGS, advice=advice, writes=(JSON, CSV, FIGURE)
         )

@@ -35,6 +35,12 @@ def coasting(mode: str, steps: int = 0, **changes: Any) -> Any:
     return environment
 
 
+def scene_of(renderer: Any, row: int) -> Any:
+    """What a viewer shows of a world at present."""
+    motion = renderer.motion(row)
+    return motion.scene(motion.until_s)
+
+
 def flashes(frame: Any) -> bool:
     """Whether a picture shows an impact."""
     return bool((frame == np.array(FLASH, np.uint8)).all(axis=2).any())
@@ -98,7 +104,7 @@ def test_scene__has_the_places_of_the_physics(scenario: str) -> None:
     while environment.agents:
         before = environment.episode
         environment.step({"vehicle_2": [-0.3]})
-        after, scene = environment.episode, environment.renderer.scenes(0)[0]
+        after, scene = environment.episode, scene_of(environment.renderer, 0)
         assert np.array_equal(scene.line, after.line[0])
         way += 0.1 * float(before.speeds_mps[0, 0] + after.speeds_mps[0, 0]) / 2.0
         assert scene.front_m == pytest.approx(way, abs=0.6)  # the speed jumps at impacts
@@ -139,7 +145,7 @@ def test_many_worlds__begin_anew_row_by_row() -> None:
     for _ in range(120):
         many.step(np.full((4, 1), -0.6))
         for row, shown in enumerate(many.render()):
-            scene = many.renderer.scenes(row)[0]
+            scene = scene_of(many.renderer, row)
             assert np.array_equal(scene.line, many.episode.line[row])
             assert shown.startswith(f"paper-random  {many.episode.time_s[row]:.2f} s")
             begun |= scene.front_m == 0.0
