@@ -13,7 +13,7 @@ import numpy as np
 from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput, count_of, need
+from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.extensions.rendering.picture import HEIGHT, WIDTH, Frame, picture
 from ethbrake_marl.extensions.rendering.scene import Motion, Scene
 from ethbrake_marl.motion.layout import TOTAL
@@ -24,14 +24,7 @@ ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a pictu
 
 
 def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
-    """Let a team drive one world; return 25 scenes per second from the alert on, and the final one.
-
-    Raises ``InvalidInput`` unless there is exactly one world.
-    """
-    if world.n != 1:
-        raise InvalidInput(
-            f"film_scenes: world has {count_of(world.n, 'world')}; give exactly one, for instance worlds.take([0])"
-        )
+    """Let a team drive one world; return 25 scenes per second from the alert on, and the final one."""
     motion, scenes = Motion(game, world, 0), list[Scene]()
     for _, state in play(game, world, team):
         motion.step(state)
@@ -46,7 +39,7 @@ def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> by
 
     The keys of ``teams`` are the titles. A film that ends before the longest shows its last scene on. ``ending``:
     ``.gif`` or ``.mp4``, or ``.png`` for three moments: the alert, the hardest impact under any team, and the end.
-    Raises the errors of ``film_scenes`` and ``check_film``.
+    Raises the errors of ``check_film``.
     """
     check_film(ending)
     films = {title: film_scenes(world, team, game) for title, team in teams.items()}

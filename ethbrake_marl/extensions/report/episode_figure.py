@@ -20,15 +20,10 @@ IMPACT: dict[str, Any] = {"marker": "X", "s": 60.0, "edgecolor": "black", "linew
 
 
 @in_our_style
-def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> Figure:
-    """Draw recorded episodes, one column each, all with the same scales.
+def trajectories(records: Mapping[str, EpisodeRecord]) -> Figure:
+    """Draw recorded episodes, one column each (title -> episode), all with the same scales.
 
-    Raises ``InvalidInput`` if there are none.
-
-    Args:
-        records: title of a column -> episode.
-        caption: text below; by default the quantities of the first world.
-
+    Below stand the quantities of the first world. Raises ``InvalidInput`` if there are no episodes.
     """
     if not records:
         raise InvalidInput("trajectories: there are no records; give at least one recorded episode")
@@ -53,7 +48,7 @@ def trajectories(records: Mapping[str, EpisodeRecord], *, caption: str = "") -> 
     gaps.set_ylabel("Gap ahead (m)")
     numbers = ", ".join(map(str, first.vehicles))
     commands.set_ylabel(f"Command of\nVehicle{'s' * (len(first.vehicles) > 1)} {numbers} (m/s²)")
-    return finish(figure, caption or f"{first.scenario}: {quantities(first.initial)}. {NOTE}", positions)
+    return finish(figure, f"{first.scenario}: {quantities(first.initial)}. {NOTE}", positions)
 
 
 def _rest_s(record: EpisodeRecord) -> float:

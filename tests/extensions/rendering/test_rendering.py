@@ -71,12 +71,7 @@ def test_ansi__shows_the_obstacle_and_who_cannot_act_yet() -> None:
 
 @pytest.mark.skipif(version("pillow") != "13.0.0", reason="another Pillow draws letters otherwise")
 @pytest.mark.parametrize(
-    ("scenario", "pixels"),
-    [
-        ("paper-random", "00ce431a32c8"),
-        ("paper-random-obstacle", "a7e48ead9a28"),
-        ("cooperation-4-five", "dcca9a4d99a5"),
-    ],
+    ("scenario", "pixels"), [("paper-random-obstacle", "a7e48ead9a28"), ("cooperation-4-five", "dcca9a4d99a5")]
 )
 def test_pictures__have_the_same_pixels_as_ever(scenario: str, pixels: str) -> None:
     environment = EthBrakeParallelEnv(scenario, render_mode="rgb_array")
@@ -96,7 +91,7 @@ def test_step_frames__show_an_impact_inside_a_step_from_its_moment_on() -> None:
     assert not flashes(coasting("rgb_array", 13).render())  # 0.3 s later
 
 
-@pytest.mark.parametrize("scenario", ["paper-random", "paper-random-obstacle", "paper-random-buildup"])
+@pytest.mark.parametrize("scenario", ["paper-random-obstacle", "paper-random-buildup"])
 def test_scene__has_the_places_of_the_physics(scenario: str) -> None:
     environment = EthBrakeParallelEnv(scenario, render_mode="rgb_array")
     environment.reset(seed=7)
@@ -130,12 +125,6 @@ def test_many_worlds__have_the_picture_of_each() -> None:
             single.step(np.full(1, 0.5))
         assert np.array_equal(many.render()[k], single.render())
         assert np.array_equal(rows.get_images()[k], single.render())
-
-
-def test_sb3__renders_texts() -> None:
-    environment = make_sb3_vec_env("paper-random", 2, seed=1, render_mode="ansi")
-    environment.reset()
-    assert [text.split()[0] for text in environment.render()] == ["paper-random"] * 2
 
 
 def test_many_worlds__begin_anew_row_by_row() -> None:
