@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.report.style import band, finish, in_our_style, label_text, new_panels, series_style
 from ethbrake_marl.files.sheet import Estimate
 
@@ -47,14 +46,10 @@ def curves_figure(
         lines: title -> label -> value of a horizontal line.
         y_label: label of a vertical axis that all panels share; "": each has its own.
 
-    Raises ``InvalidInput`` for a curve without points.
-
     """
     figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
     for axes, (title, curves) in zip(every, panels.items(), strict=True):
         for number, (label, curve) in enumerate(curves.items()):
-            if not curve:
-                raise InvalidInput(f"curves_figure: {label!r} has no points; give runs that were evaluated alike")
             style, x = series_style(number), list(curve)
             axes.plot(x, [each.value for each in curve.values()], label=label_text(label), **style)
             low, high = zip(*(each.ends for each in curve.values()), strict=True)

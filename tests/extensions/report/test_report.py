@@ -55,7 +55,10 @@ def test_first_sentence__flatters_nobody(compared: Compared) -> None:
         return first_sentence(found, agents.rpartition(",")[2], {})
 
     assert " % more harm than full braking (" in about("full_brake,coast")
-    assert about("full_brake,constant:6.5").startswith("constant:6.5 does about as much harm as full braking (")
+    equal = compared_by("paper-random", "full_brake,constant:6.5")
+    said = first_sentence(equal, "constant:6.5", {"Other test": equal})
+    assert said.startswith("constant:6.5 does about as much harm as full braking (")
+    assert "), and as much in the other test (" in said
     alone = about("full_brake")
     assert alone.startswith("Full braking does ") and "instead of" not in alone and alone.endswith(").")
     far = {"gaps_m": {"uniform": [60.0, 70.0]}}
