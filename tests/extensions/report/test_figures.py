@@ -61,6 +61,7 @@ def test_label__of_anybody_can_be_drawn(text: str) -> None:
     svg = picture_bytes(figure, "a.svg")
     assert b"<script" not in svg and len(svg) < 200_000
     assert figure._repr_png_().startswith(b"\x89PNG\r\n\x1a\n")
+    assert label_text("$x^2$ is no formula") == r"\$x^2\$ is no formula"
 
 
 # ---- of a scenario
