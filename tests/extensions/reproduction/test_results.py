@@ -131,8 +131,8 @@ def test_distance__says_where_the_paper_is_right() -> None:
     assert found["non-ethical: the larger the distance, the larger the harm (as stated)"] != "agrees"
     assert [row[0] for row in made.sheets[0].rows] == [*FOUR, PREDICTED, PROVEN]
     stated, early = made.figures[0].figure.axes
-    means = [cell.value for cell in made.sheets[1].rows[0][1:]]
-    assert early.lines[0].get_ydata().tolist() == means != stated.lines[0].get_ydata().tolist()
+    means = [cell.value for cell in made.sheets[1].rows[2][1:]]
+    assert early.lines[2].get_ydata().tolist() == means != stated.lines[2].get_ydata().tolist()
 
 
 def test_delays__in_the_world_of_the_figure_are_those_of_the_page() -> None:
