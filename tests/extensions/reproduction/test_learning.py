@@ -74,7 +74,7 @@ def test_trainings__are_done_once_continue_and_give_curves(tmp_path: Path, monke
     final = [learning.column(run, learning.HARM)[2048] for run in runs]
     assert last.value == pytest.approx(np.mean(final)) and kept.value <= last.value
     assert final[0] != final[1]  # other seeds
-    (runs[1] / "run.json").unlink()
-    assert learning.trained(tiny.folder, HIGH) == {}  # one seed of two is missing
+    (runs[1] / "run.json").write_text('{"status": "interrupted"}')
+    assert learning.trained(tiny.folder, HIGH) == {}  # one seed of two is not finished
     nothing = reproduce_curves(HIGH, replace(tiny, full=False))
     assert nothing.verdict.outcome == "not run" and not nothing.figures

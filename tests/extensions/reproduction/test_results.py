@@ -61,6 +61,7 @@ def test_numbers__are_those_of_version_0_5(where) -> None:
         said = own.get("predicted harm")
         assert (said and said.value) == (predicted and pytest.approx(predicted, **close))
         assert numbers[tables.NOBODY]["average harm"].value <= first
+        assert 0.0 < numbers[tables.NOBODY]["collision rate"].value <= collisions / 100
 
 
 def test_rows__are_compared_under_every_reading_and_name_the_nearest() -> None:
