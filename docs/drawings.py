@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.rendering.picture import COLOURS, vehicle_colour
-from ethbrake_marl.extensions.report.style import DASHES, GREY, add_caption, new_figure, style_axes, write_picture
+from ethbrake_marl.extensions.report.style import DASHES, GREY, finish, in_our_style, new_figure, write_picture
 
 FOLDER = Path(__file__).parent / "figures"
 SEED = 7
@@ -30,6 +30,7 @@ CASES = {  # gap (m), closing speed (m/s), closing acceleration (m/s2), how the 
 }
 
 
+@in_our_style
 def draw_timeline(agent: str = "full_brake") -> Figure:
     """What each vehicle does in world 0 of paper-random, its impacts, and its speed."""
     scenario, game = eb.open_game("paper-random")
@@ -55,16 +56,12 @@ def draw_timeline(agent: str = "full_brake") -> Figure:
     for time, pair, closing in zip(rows.time_s, rows.pair, rows.closing_speed_mps, strict=True):
         lanes.plot([time, time], [pair - 1, pair], color="black", linewidth=1.4, marker="X", markersize=8)
         lanes.annotate(f" impact, {closing:.1f} m/s", (time, pair - 0.5), fontsize=9, va="center")
-    for axes in (lanes, speeds):
-        style_axes(axes)
     lanes.set_yticks(range(record.speeds_mps.shape[1]), [f"Vehicle {k + 1}" for k in range(record.speeds_mps.shape[1])])
     lanes.invert_yaxis()
-    lanes.legend(ncols=len(PHASES), fontsize=9, frameon=False, loc="lower left", bbox_to_anchor=(0.0, 1.0))
-    speeds.legend(fontsize=9, frameon=False)
-    speeds.set_ylabel("Speed (m/s)", fontsize=9)
-    speeds.set_xlabel("Time since the alert (s)", fontsize=9)
-    add_caption(figure, f"World 0 of paper-random, list of seed {SEED}; {agent} drives Vehicle 2.")
-    return figure
+    lanes.legend(ncols=len(PHASES), loc="lower left", bbox_to_anchor=(0.0, 1.0))
+    speeds.legend()
+    speeds.set(xlabel="Time since the alert (s)", ylabel="Speed (m/s)")
+    return finish(figure, f"World 0 of paper-random, list of seed {SEED}; {agent} drives Vehicle 2.")
 
 
 def phases(
@@ -86,28 +83,27 @@ def phases(
             start = k
 
 
+@in_our_style
 def draw_regimes() -> Figure:
     """The gap of a pair over time in the four cases of a segment."""
     figure = new_figure(9.6, 2.9)
     for axes, (title, (gap, closing, pull, case, end)) in zip(
         figure.subplots(1, len(CASES), sharey=True), CASES.items(), strict=True
     ):
-        style_axes(axes)
         time = np.linspace(0.0, 4.0, 401)
         left = gap - (closing + pull * time / 2.0) * time
         met = int(np.argmax(left <= 0.0)) if (left <= 0.0).any() else len(time) - 1
         axes.plot(time[: met + 1], np.maximum(left[: met + 1], 0.0), color=COLOURS[2], linewidth=2.0)
         if (left <= 0.0).any():
             axes.plot(time[met], 0.0, "X", color="black", markersize=9, clip_on=False, zorder=5)
-        axes.set_title(title, loc="left", fontsize=9.5)
+        axes.set_title(title, fontsize=9.5)
         axes.annotate(f"{case}: {end}", (0.02, 0.93), xycoords="axes fraction", fontsize=9, color=GREY)
-        axes.set_xlabel("Time in the segment (s)", fontsize=9)
-        axes.set_ylim(0.0, 10.0)
-        axes.set_xlim(0.0, 4.0)
-    figure.axes[0].set_ylabel("Gap (m)", fontsize=9)
+        axes.set(xlabel="Time in the segment (s)", xlim=(0.0, 4.0), ylim=(0.0, 10.0))
+    figure.axes[0].set_ylabel("Gap (m)")
     return figure
 
 
+@in_our_style
 def draw_knowledge() -> Figure:
     """From when on each vehicle acts on news of each: by the paper's rule, and over a channel."""
     paper = eb.load_scenario("paper-random")
@@ -116,13 +112,11 @@ def draw_knowledge() -> Figure:
     every = figure.subplots(1, 2, sharex=True, sharey=True)
     for axes, (title, scenario) in zip(every, shown.items(), strict=True):
         _knowledge(axes, scenario)
-        axes.set_title(title.replace("`", ""), loc="left", fontsize=10)
-        axes.set_xlabel("Time since the alert (s)", fontsize=9)
+        axes.set(title=title.replace("`", ""), xlabel="Time since the alert (s)")
     every[0].set_xlim(0.0, 1.6)
-    add_caption(
+    return finish(
         figure, f"Bars: the row's vehicle acts on news of the other. World 0 of paper-random, list of seed {SEED}."
     )
-    return figure
 
 
 def _knowledge(axes: Axes, scenario: eb.Scenario) -> None:
@@ -137,7 +131,6 @@ def _knowledge(axes: Axes, scenario: eb.Scenario) -> None:
                 f"{known[i, j]:.2f} s ", (known[i, j], row), fontsize=8.5, va="center",
                 ha="right" if known[i, j] > 0.2 else "left", color="black" if known[i, j] > 0.2 else "white",
             )  # fmt: skip
-    style_axes(axes)
     axes.set_yticks(range(len(labels)), labels)
     axes.set_ylim(len(labels) - 0.4, -0.6)
 

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.report.seed_curves import SeedCurve, seed_curves
+from ethbrake_marl.extensions.report.curves import Curve, curves_figure
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.training.fixed_list import HARM
 from ethbrake_marl.training.job import Job
 from ethbrake_marl.training.recipe import load_recipe
@@ -45,12 +46,11 @@ def job_of(test: str, count: str, name: str, seconds: int, folder: Path) -> Job:
     return Job(Training.of(recipe, test), folder / test / name)
 
 
-def curve_of(run: RunFolder, count: str) -> SeedCurve:
+def curve_of(run: RunFolder, count: str) -> Curve:
     """Return harm against the processor time of the training, without evaluations (s)."""
     spent = read_object(run.status)["cpu_s"]
     rows = [row for row in run.rows() if row.get("eval/total_harm")]
-    harm = [float(row[f"eval/{HARM[count]}"]) for row in rows]
-    return SeedCurve(np.array([spent[str(int(row["steps"]))] for row in rows]), np.array([harm]))
+    return {spent[str(int(row["steps"]))]: Estimate(float(row[f"eval/{HARM[count]}"]), None) for row in rows}
 
 
 if __name__ == "__main__":
@@ -67,11 +67,14 @@ if __name__ == "__main__":
             if not job.finish():
                 raise SystemExit(1)
             curve = panels[label][name] = curve_of(RunFolder(job.folder), count)
-            harm = curve.values[0]
-            cells = [f"{each:.3f}" for each in (harm[-1], harm.min(), harm.min() / known[label])]
-            print(f"| `{test}` | {count} | `{name}` | {curve.steps[-1]:.0f} s | {' | '.join(cells)} |", flush=True)
+            harm = [each.value for each in curve.values()]
+            cells = [f"{each:.3f}" for each in (harm[-1], min(harm), min(harm) / known[label])]
+            print(f"| `{test}` | {count} | `{name}` | {max(curve):.0f} s | {' | '.join(cells)} |", flush=True)
         print(f"best known: {known[label]:.3f}", flush=True)
     caption = f"One training per recipe; harm on the fixed list of the trainings, {WORLDS:,} worlds of seed {SEED}."
     axis = "Processor time of the training (s)"
-    figure = seed_curves(panels, logarithmic=[*panels], caption=caption, x_label=axis, known=known)
+    lines = {label: {"best known": harm} for label, harm in known.items()}
+    figure = curves_figure(panels, axis, caption, lines=lines)
+    for axes in figure.axes:
+        axes.set_yscale("log")
     write_picture(picture, figure, force=True)

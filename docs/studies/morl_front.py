@@ -113,7 +113,7 @@ def main(words: list[str]) -> int:
         "seed": SEED,
         "roof": ROOF,
         "versions": {name: version(name) for name in PACKAGES},
-        "machine": str(this_machine()),
+        "machine": this_machine(),
         "weights": WEIGHTS,
         "trainings": [],
     }

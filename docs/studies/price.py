@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.statistics import difference, mean, rate
-from ethbrake_marl.extensions.report.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
+from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style, write_picture
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.channel import V2X
@@ -109,12 +109,13 @@ def markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     return "\n".join(["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(cells) + " |" for cells in lines)])
 
 
+@in_our_style
 def draw(found: Mapping[str, eb.Result]) -> Figure:
     """Draw the prices: a group of bars per channel, a bar per agent, a panel per count of harm."""
     units = ("price, first-impact harm (m²/s²)", "price, total harm (m²/s²)")
-    figure, at, width = new_figure(8.4, 7.2), np.arange(len(found)), 0.8 / len(LIMITS)
-    for axes, count, unit in zip(figure.subplots(2, sharex=True), COUNTS, units, strict=True):
-        style_axes(axes)
+    at, width = np.arange(len(found)), 0.8 / len(LIMITS)
+    figure, panels = new_panels((8.4, 7.2), 2, sharex=True)
+    for axes, count, unit in zip(panels, COUNTS, units, strict=True):
         for number, agent in enumerate(LIMITS):
             prices = [price(over, agent, count) for over in found.values()]
             value = np.array([each.value for each in prices])
@@ -125,11 +126,10 @@ def draw(found: Mapping[str, eb.Result]) -> Figure:
                 error_kw={"ecolor": GREY, "elinewidth": 0.8},
             )  # fmt: skip
         axes.axhline(0.0, color="black", linewidth=0.8)
-        axes.set_ylabel(unit, fontsize=9)
+        axes.set_ylabel(unit)
     axes.set_xticks(at, list(found), rotation=30, ha="right", fontsize=8.5)
-    figure.axes[0].legend(fontsize=8.5, frameon=False)
-    add_caption(figure, CAPTION)
-    return figure
+    panels[0].legend(fontsize=8.5)
+    return finish(figure, CAPTION)
 
 
 if __name__ == "__main__":

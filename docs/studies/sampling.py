@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.identity import versions, worlds_sha256
-from ethbrake_marl.extensions.report.style import GREY, add_caption, new_figure, series_style, style_axes, write_picture
+from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style, write_picture
 from ethbrake_marl.extensions.reproduction.paper_map import advance_sampled
 
 SCENARIO, WORLDS, SEED = "paper-random", 2000, 7
@@ -93,12 +93,11 @@ def table(study: Convergence) -> str:
     )
 
 
+@in_our_style
 def draw(studies: Sequence[Convergence]) -> Figure:
     """Draw absolute errors over steps on logarithmic axes: a panel per agent, with a line of order 1."""
-    figure = new_figure(7.4, 3.9)
-    places = figure.subplots(1, len(studies), sharey=True, squeeze=False)[0]
-    for axes, study in zip(places, studies, strict=True):
-        style_axes(axes)
+    figure, panels = new_panels((7.4, 3.9), columns=len(studies), sharey=True)
+    for axes, study in zip(panels, studies, strict=True):
         for number, label in enumerate(filter(None, COLUMNS.values())):
             axes.loglog(study.steps_s, np.abs(study.errors[:, number]), label=label, **series_style(number))
         ends = np.array([min(study.steps_s), max(study.steps_s)])
@@ -106,13 +105,9 @@ def draw(studies: Sequence[Convergence]) -> Figure:
         axes.set_xticks(study.steps_s, [f"{step:g}" for step in study.steps_s])
         axes.minorticks_off()
         axes.tick_params(labelsize=8)
-        axes.set_title(f"Vehicle 2: {study.agent}", loc="left", fontsize=10)
-        axes.set_xlabel("Step (s)", fontsize=9)
-    places[0].set_ylabel("Absolute error of harm (m²/s²)", fontsize=9)
-    handles, labels = places[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper left", ncols=2, frameon=False, fontsize=9)
-    add_caption(figure, CAPTION)
-    return figure
+        axes.set(title=f"Vehicle 2: {study.agent}", xlabel="Step (s)")
+    panels[0].set_ylabel("Absolute error of harm (m²/s²)")
+    return finish(figure, CAPTION, panels[0], columns=2)
 
 
 if __name__ == "__main__":

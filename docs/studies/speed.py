@@ -277,7 +277,7 @@ def main() -> None:
     given = parser.parse_args()
     machine, figures = this_machine(), measure(quick=given.quick)
     if given.json:
-        print(json.dumps({"machine": asdict(machine), "figures": [asdict(speed) for speed in figures]}, indent=2))
+        print(json.dumps({"machine": machine, "figures": [asdict(speed) for speed in figures]}, indent=2))
         return
     rows = [
         (

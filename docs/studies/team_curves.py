@@ -40,7 +40,7 @@ from ethbrake_marl.extensions.report.style import (
     TITLES,
     band,
     finish,
-    name_axes,
+    in_our_style,
     new_panels,
     series_style,
     write_picture,
@@ -314,7 +314,7 @@ def check(folder: Path, given: argparse.Namespace) -> None:
         print(f"{algorithm} runs; {time.monotonic() - begun:.0f} s to import and compile", flush=True)
     if not file.exists():
         today = datetime.datetime.now(datetime.UTC).date().isoformat()
-        write(file, {**study, "machine": str(this_machine()), "date": today})
+        write(file, {**study, "machine": this_machine(), "date": today})
 
 
 # 3. Figure, numbers and table
@@ -374,6 +374,7 @@ def table(found: Results) -> list[list[str]]:
     return rows
 
 
+@in_our_style
 def draw(found: Results) -> Figure:
     """Draw first-impact harm over processor seconds, with a panel per level and bands of 95 % intervals."""
     levels = levels_of(found)
@@ -396,7 +397,7 @@ def draw(found: Results) -> Figure:
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter(NullFormatter())
-        name_axes(axes, level, "Processor time of learning (s)", TITLES["first"])
+        axes.set(title=level, xlabel="Processor time of learning (s)", ylabel=TITLES["first"])
     seeds = len({curve["seed"] for curve in found["curves"]})
     caption = (
         f"Interquartile means over {count_of(seeds, 'seed')} with 95 % intervals; {found['worlds']:,} worlds of the"

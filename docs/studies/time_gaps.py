@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.report.style import add_caption, name_axes, new_panels, series_style, write_picture
+from ethbrake_marl.extensions.report.style import finish, in_our_style, new_panels, series_style, write_picture
 
 WORLDS, SEED = 2000, 7
 GAPS_S = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4)
@@ -37,6 +37,7 @@ def mean_harm(scenario: eb.Scenario) -> dict[str, list[float]]:
     return {count: [float(result[name][column].mean()) for name in AGENTS] for count, column in COUNTS.items()}
 
 
+@in_our_style
 def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
     """Return the figure: the avoided share of full braking's harm by agent and time gap, with a panel per scenario.
 
@@ -48,16 +49,14 @@ def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
         for k, agent in enumerate(AGENTS[1:]):
             share = 100.0 * (1.0 - rows[shown, k + 1] / rows[shown, 0])
             axes.plot(np.array(GAPS_S)[shown], share, label=agent, **series_style(k))
-        name_axes(axes, name, "time gap (s)", "" if axes is not panels[0] else "saved of full braking's harm (%)")
-        axes.set_xlim(GAPS_S[0] - 0.05, GAPS_S[-1] + 0.05)
-        axes.set_ylim(0.0, 103.0)
-    panels[1].legend(fontsize=8.5, frameon=False)
-    add_caption(
+        axes.set(title=name, xlabel="time gap (s)", xlim=(GAPS_S[0] - 0.05, GAPS_S[-1] + 0.05), ylim=(0.0, 103.0))
+    panels[0].set_ylabel("saved of full braking's harm (%)")
+    panels[1].legend(fontsize=8.5)
+    return finish(
         figure,
         f"{WORLDS:,} lines of seed {SEED} for each time gap, {'first impacts' if count == 'first' else 'all impacts'}."
         " Lines end where full braking does almost no harm.",
     )
-    return figure
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +24,7 @@ from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.measures import Given, Measure
 from ethbrake_marl.evaluation.statistics import Clusters
 from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds
-from ethbrake_marl.extensions.studies.folder import StudyFolder
+from ethbrake_marl.extensions.studies.folder import work_in
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.parallel import run_each
@@ -89,17 +90,15 @@ class Ablation:
                     noted = self.noted if level.swept is None else (*self.noted, level.swept.setting)
                     yield level, algorithm, Job(training, folder, noted)
 
-    def study_folder(self) -> StudyFolder:
-        """Return the folder, which refuses results of other settings."""
+    def study_folder(self) -> AbstractContextManager[None]:
+        """Context manager: the folder, which refuses results of other settings."""
         settings = {
             "levels": [level.scenario.content(without=WORDS) for level in self.levels],
             "recipes": [recipe.model_dump(mode="json", exclude=set(WORDS)) for recipe in self.recipes],
             **{name: getattr(self, name) for name in FULL},
         }
         advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
-        return StudyFolder(
-            self.folder, "an ablation", settings, record=SETTINGS, advice=advice, writes=(JSON, CSV, FIGURE)
-        )
+        return work_in(self.folder, "an ablation", settings, record=SETTINGS, advice=advice, writes=(JSON, CSV, FIGURE))
 
 
 Columns = dict[str, Floats]  # column of an evaluation -> [seeds, n]

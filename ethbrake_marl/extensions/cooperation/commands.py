@@ -88,7 +88,7 @@ def ablate_command(
         }  # fmt: skip
         numbers = {**(QUICK if quick else FULL), **{key: each for key, each in given.items() if each is not None}}
         plan = Ablation(output, tuple(compared), tuple(own), noted=changes.texts, **numbers)
-        with plan.study_folder().work():
+        with plan.study_folder():
             if not train_all(plan, jobs or 1, out.show_progress):
                 out.interrupted(f"interrupted; {REMAINS}")
             measured = with_optima(plan, measure(plan, out.show_progress), jobs or 1, out.show_progress)

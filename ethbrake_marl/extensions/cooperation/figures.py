@@ -11,16 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from ethbrake_marl.extensions.report.style import (
-    GREY,
-    TITLES,
-    finish,
-    in_our_style,
-    name_axes,
-    new_panels,
-    plain,
-    series_style,
-)
+from ethbrake_marl.extensions.report.style import GREY, TITLES, finish, in_our_style, new_panels, plain, series_style
 from ethbrake_marl.files.sheet import Estimate
 
 LINEAR = 0.1  # m2/s2; axes are linear below this harm and logarithmic above it, because harm varies by a factor of 100
@@ -54,7 +45,7 @@ def ablation_figure(results: Json, caption: str) -> Figure:
             axes.set_yscale("symlog", linthresh=LINEAR)
         axes.yaxis.set_major_formatter(FuncFormatter(plain))
         axes.set_ylim(0.0, (1.5 if axes.get_yscale() == "symlog" else 1.1) * axes.get_ylim()[1])
-        name_axes(axes, TITLES[count], swept or "")
+        axes.set(title=TITLES[count], xlabel=swept or "")
     return finish(figure, " ".join([*results["undertrained"], caption]), panels[0], columns=2, fontsize=8.5)
 
 

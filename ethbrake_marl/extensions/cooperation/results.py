@@ -24,7 +24,7 @@ WORDS = {"first": "first-impact harm", "total": "total harm"}
 def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, list[Path]]:
     """Write the results, and replace those of an earlier run; return the content of the JSON file, and the paths."""
     recipes = zip(plan.algorithms, plan.recipes, strict=True)
-    swept, machine = plan.levels[0].swept, str(this_machine())
+    swept, machine = plan.levels[0].swept, this_machine()
     results = {
         "settings": {
             **{name: getattr(plan, name) for name in FULL},

@@ -9,15 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.extensions.report.style import (
-    finish,
-    in_our_style,
-    label_text,
-    name_axes,
-    new_panels,
-    plain,
-    series_style,
-)
+from ethbrake_marl.extensions.report.style import finish, in_our_style, label_text, new_panels, plain, series_style
 
 SIZE_IN = (5.6, 4.6)  # narrow enough for a phone
 
@@ -45,7 +37,7 @@ def front_figure(results: Json) -> Figure:
             axis.set_minor_formatter(FuncFormatter(plain))
     axes.tick_params(which="minor", labelsize=7)
     impacts = {"first": "first impacts", "total": "all impacts"}[count]
-    name_axes(axes, x=f"Harm of the line, {impacts} (m²/s²)", y="Harm of the vehicle that bears most (m²/s²)")
+    axes.set(xlabel=f"Harm of the line, {impacts} (m²/s²)", ylabel="Harm of the vehicle that bears most (m²/s²)")
     worlds = count_of(results["episodes"], "world")
     caption = f"{results['scenario']}, {worlds}; one point for each of {len(results['points'])} choices of the weights."
     return finish(figure, caption, axes, columns=2, fontsize=8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -12,38 +13,24 @@ import numpy as np
 from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput, count_of, need
-from ethbrake_marl.extensions.rendering.picture import Frame, picture
-from ethbrake_marl.extensions.rendering.scene import Motion, Scene, whole_road
+from ethbrake_marl.errors import InvalidInput, need
+from ethbrake_marl.extensions.rendering.picture import HEIGHT, WIDTH, Frame, picture
+from ethbrake_marl.extensions.rendering.scene import Motion, Scene
 from ethbrake_marl.motion.layout import TOTAL
 
 FPS = 25  # scenes per second; a divisor of 100, because a GIF stores times in hundredths of a second
-MOST_PICTURES = 2_500  # of all films together; they need 1.8 GB of memory
 COLOURS = 64
 ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a picture
 
 
 def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
-    """Let a team drive one world; return 25 scenes per second from the alert on, and the final one.
-
-    Raises ``InvalidInput`` unless there is exactly one world.
-    """
-    if world.n != 1:
-        raise InvalidInput(
-            f"film_scenes: world has {count_of(world.n, 'world')}; give exactly one, for instance worlds.take([0])"
-        )
-    road, learners, scenes = whole_road(world, 0), tuple(team.drivers), list[Scene]()
-    motion = Motion(world, 0)
+    """Let a team drive one world; return 25 scenes per second from the alert on, and the final one."""
+    motion, scenes = Motion(game, world, 0), list[Scene]()
     for _, state in play(game, world, team):
-        motion, until = motion.next(state, 0), float(state.time_s[0])
-        ended, first = bool(state.ended[0]), int(np.ceil(motion.start_s * FPS - 1e-9)) if scenes else 0
-        times = [k / FPS for k in range(first, int(np.ceil(until * FPS - 1e-9)))]
-        for time_s in [*times, *([until] if ended else [])]:
-            line, front_m, impacts = motion.at(time_s)
-            over = ended and time_s == until
-            scenes.append(
-                Scene(game.name, learners, over, time_s, line, motion.car, motion.wanted, front_m, impacts, road)
-            )
+        motion.step(state)
+        first = math.ceil(motion.start_s * FPS - 1e-9) if scenes else 0
+        times = [k / FPS for k in range(first, math.ceil(motion.until_s * FPS - 1e-9))]
+        scenes += map(motion.scene, [*times, motion.until_s] if motion.ended else times)
     return scenes
 
 
@@ -52,16 +39,10 @@ def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> by
 
     The keys of ``teams`` are the titles. A film that ends before the longest shows its last scene on. ``ending``:
     ``.gif`` or ``.mp4``, or ``.png`` for three moments: the alert, the hardest impact under any team, and the end.
-    Raises the errors of ``film_scenes`` and ``check_film``, and ``InvalidInput`` above ``MOST_PICTURES``.
+    Raises the errors of ``check_film``.
     """
     check_film(ending)
     films = {title: film_scenes(world, team, game) for title, team in teams.items()}
-    pictures = len(films) * max(map(len, films.values()))
-    if pictures > MOST_PICTURES:
-        raise InvalidInput(
-            f"film of {len(films)} agents: needs {pictures:,} pictures, but at most {MOST_PICTURES:,} are allowed; give"
-            " fewer agents, or a scenario with a shorter horizon_s"
-        )
     return WRITERS[ending](films)
 
 
@@ -86,22 +67,22 @@ def stacked(films: Films) -> Iterator[Frame]:
 def write_gif(films: Films) -> bytes:
     from PIL import Image
 
-    pictures = [Image.fromarray(frame).quantize(COLOURS, method=Image.Quantize.FASTOCTREE) for frame in stacked(films)]
+    first, *others = (
+        Image.fromarray(frame).quantize(COLOURS, method=Image.Quantize.FASTOCTREE) for frame in stacked(films)
+    )
     buffer = io.BytesIO()
-    pictures[0].save(buffer, "GIF", save_all=True, append_images=pictures[1:], duration=1000 // FPS, loop=0)
+    first.save(buffer, "GIF", save_all=True, append_images=others, duration=1000 // FPS, loop=0)
     return buffer.getvalue()
 
 
 def write_mp4(films: Films) -> bytes:
     from imageio_ffmpeg import write_frames
 
-    frames = list(stacked(films))
-    height, width, _ = frames[0].shape
     with TemporaryDirectory() as folder:
         path = Path(folder) / "film.mp4"
-        writer = write_frames(str(path), (width, height), fps=FPS, quality=8)
-        writer.send(None)
-        for frame in frames:
+        writer = write_frames(str(path), (WIDTH, HEIGHT * len(films)), fps=FPS, quality=8)
+        next(writer)
+        for frame in stacked(films):
             writer.send(frame)
         writer.close()
         return path.read_bytes()
@@ -110,10 +91,10 @@ def write_mp4(films: Films) -> bytes:
 def write_png(films: Films) -> bytes:
     from PIL import Image
 
-    last = max(map(len, films.values())) - 1
     numbered = [(k, scene) for scenes in films.values() for k, scene in enumerate(scenes)]
     impacts = [(impact.closing_mps, -k) for k, scene in numbered for impact in scene.impacts]
     hardest = -max(impacts, default=(0.0, 0))[1]  # number of the first scene that shows the hardest impact
+    last = max(map(len, films.values())) - 1
     rows = []
     for title, scenes in films.items():
         for scene in (scenes[min(k, len(scenes) - 1)] for k in sorted({0, hardest, last})):

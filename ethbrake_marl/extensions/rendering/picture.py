@@ -24,6 +24,7 @@ ROAD_TOP, ROAD_BOTTOM = 84, 138
 LANE = (ROAD_TOP + ROAD_BOTTOM) // 2
 BODY = 13  # half of a body's height
 PANEL_TOP = 172
+SPACINGS_M = (5.0, 10.0, 20.0, 50.0, 100.0, 200.0)  # between written distances, of which at most twelve are in view
 
 PAPER, INK, GREY, PALE = "#ffffff", "#1a1a1a", "#6b6b6b", "#eeeeee"
 ASPHALT, DASH, GLASS = "#4a4d52", "#e8e8e8", "#dfefff"
@@ -54,11 +55,26 @@ def fitting(choices: Sequence[str], width: float, size: int) -> str:
 
 
 class Pen:
-    """Draws in pixels of the finished picture."""
+    """Draws a scene in pixels of the finished picture."""
 
-    def __init__(self) -> None:
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.fronts_m, (self.left_m, self.right_m) = scene, scene.fronts_m, scene.shown_m
         self.image = Image.new("RGB", (WIDTH * FINE, HEIGHT * FINE), PAPER)
         self.draw = ImageDraw.Draw(self.image)
+
+    def x(self, place_m: float) -> float:
+        return (place_m - self.left_m) / (self.right_m - self.left_m) * WIDTH
+
+    def ends(self, body: int) -> tuple[float, float]:
+        """Return rear and front of a body in the picture."""
+        if body == 0:
+            return self.x(self.scene.obstacle_m), self.x(self.scene.obstacle_m) + 9
+        return self.x(self.fronts_m[body - 1] - BODY_M), self.x(self.fronts_m[body - 1])
+
+    def marks(self, every_m: float) -> list[float]:
+        """Return the multiples of a distance that are in view."""
+        first, last = math.ceil(self.left_m / every_m), math.floor(self.right_m / every_m)
+        return [k * every_m for k in range(first, last + 1)]
 
     def box(self, left: float, top: float, right: float, bottom: float, fill: str, edge: str | None = None) -> None:
         corners = [value * FINE for value in (left, top, max(right, left + 1), max(bottom, top + 1))]
@@ -77,42 +93,15 @@ class Pen:
         return np.array(self.image.reduce(FINE))
 
 
-class Road:
-    """Where the places of a scene are in its picture."""
-
-    def __init__(self, scene: Scene) -> None:
-        self.scene, self.fronts_m = scene, scene.fronts_m
-        self.left_m, self.right_m = scene.shown_m
-
-    def x(self, place_m: float) -> float:
-        return (place_m - self.left_m) / (self.right_m - self.left_m) * WIDTH
-
-    def ends(self, body: int) -> tuple[float, float]:
-        """Return rear and front of a body in the picture."""
-        if body == 0:
-            return self.x(self.scene.obstacle_m), self.x(self.scene.obstacle_m) + 9
-        return self.x(self.fronts_m[body - 1] - BODY_M), self.x(self.fronts_m[body - 1])
-
-    def marks(self, every_m: float) -> list[float]:
-        """Return the multiples of a distance that are in view."""
-        first, last = math.ceil(self.left_m / every_m), math.floor(self.right_m / every_m)
-        return [k * every_m for k in range(first, last + 1)]
-
-    def spacing_m(self) -> float:
-        """Return a round distance with at most twelve marks in view."""
-        width = self.right_m - self.left_m
-        return next((every for every in (5.0, 10.0, 20.0, 50.0, 100.0, 200.0) if width <= 12 * every), 500.0)
-
-
 def picture(scene: Scene) -> Frame:
     """Return a scene as a picture, [304, 800, 3] uint8."""
-    pen, road = Pen(), Road(scene)
-    draw_road(pen, road)
+    pen = Pen(scene)
+    draw_road(pen)
     for body in range(1, len(scene.wanted)):
-        draw_vehicle(pen, road, body)
-        draw_panel(pen, scene, body)
-    write_gaps(pen, road)
-    show_impacts(pen, road)
+        draw_vehicle(pen, body)
+        draw_panel(pen, body)
+    write_gaps(pen)
+    show_impacts(pen)
     title = plain_text(scene.title)[:200]
     cut = [title, *(f"{title[:k]}..." for k in range(len(title), -1, -1))]
     pen.write(MARGIN, 10, fitting(cut, WIDTH - 3 * MARGIN - width_of(scene.clock, 18), 15), GREY, 15)
@@ -121,40 +110,41 @@ def picture(scene: Scene) -> Frame:
     return pen.frame()
 
 
-def draw_road(pen: Pen, road: Road) -> None:
+def draw_road(pen: Pen) -> None:
     """Draw the lane with its edges, the distances and the obstacle."""
     pen.box(0, ROAD_TOP, WIDTH, ROAD_BOTTOM, ASPHALT)
-    for place_m in road.marks(5.0):
+    for place_m in pen.marks(5.0):
         for y in (ROAD_TOP + 5, ROAD_BOTTOM - 5):
-            pen.line(road.x(place_m), y, road.x(place_m + 2.0), y, DASH, 1.5)
-    for place_m in road.marks(road.spacing_m()):
-        x = road.x(place_m)
+            pen.line(pen.x(place_m), y, pen.x(place_m + 2.0), y, DASH, 1.5)
+    spacing_m = next((every for every in SPACINGS_M if pen.right_m - pen.left_m <= 12 * every), 500.0)
+    for place_m in pen.marks(spacing_m):
+        x = pen.x(place_m)
         pen.line(x, ROAD_BOTTOM, x, ROAD_BOTTOM + 5, GREY)
         if 20 <= x <= WIDTH - 20:
             pen.write(x, ROAD_BOTTOM + 7, f"{place_m:.0f} m", GREY, 12, "ma")
-    if road.scene.has_obstacle:
-        left, right = road.ends(0)
+    if pen.scene.has_obstacle:
+        left, right = pen.ends(0)
         pen.box(left, ROAD_TOP + 4, right, ROAD_BOTTOM - 4, INK, FLASH)
 
 
-def draw_vehicle(pen: Pen, road: Road, body: int) -> None:
+def draw_vehicle(pen: Pen, body: int) -> None:
     """Draw a vehicle with its number, its brake lights, and a mark above it if it learns."""
-    left, right = road.ends(body)
+    left, right = pen.ends(body)
     pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
     glass = left + (right - left) * 0.72
     pen.box(glass, LANE - BODY + 4, glass + (right - left) * 0.1, LANE + BODY - 4, GLASS)
-    if road.scene.command(body) < 0.0:
+    if pen.scene.command(body) < 0.0:
         for y in (LANE - BODY, LANE + BODY - 6):
             pen.box(left, y, left + 4, y + 6, LIGHT)
-    if body in road.scene.learners:
+    if body in pen.scene.learners:
         middle = (left + right) / 2
         pen.shape([(middle - 6, ROAD_TOP + 1), (middle + 6, ROAD_TOP + 1), (middle, ROAD_TOP + 10)], PAPER)
     pen.write(left + (right - left) * 0.45, LANE, str(body), PAPER, 16, "mm")
 
 
-def draw_panel(pen: Pen, scene: Scene, body: int) -> None:
+def draw_panel(pen: Pen, body: int) -> None:
     """Draw what a vehicle does; its bar extends to the left for braking and to the right for driving."""
-    count = len(scene.wanted) - 1
+    scene, count = pen.scene, len(pen.scene.wanted) - 1
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * MARGIN - gap * (count - 1)) / count, 240.0)
     left = WIDTH - MARGIN - width - (body - 1) * (WIDTH - 2 * MARGIN - width) / max(count - 1, 1)
@@ -174,35 +164,35 @@ def draw_panel(pen: Pen, scene: Scene, body: int) -> None:
     pen.write(left, PANEL_TOP + 78, fitting([*exact, said, ""], width, 13), GREY, 13)
 
 
-def write_gaps(pen: Pen, road: Road) -> None:
+def write_gaps(pen: Pen) -> None:
     """Write every gap above the road; one without enough space is written a line higher."""
     free = math.inf
-    for pair in range(0 if road.scene.has_obstacle else 1, len(road.scene.wanted) - 1):
-        left, right = road.ends(pair + 1)[1], road.ends(pair)[0]
+    for pair in range(0 if pen.scene.has_obstacle else 1, len(pen.scene.wanted) - 1):
+        left, right = pen.ends(pair + 1)[1], pen.ends(pair)[0]
         for x in (left, right):
             pen.line(x, ROAD_TOP - 10, x, ROAD_TOP - 2, GREY)
         pen.line(left, ROAD_TOP - 6, right, ROAD_TOP - 6, GREY)
-        words = f"{road.scene.line[GAP, pair]:.1f} m"
+        words = f"{pen.scene.line[GAP, pair]:.1f} m"
         middle, half = (left + right) / 2, width_of(words, 14) / 2 + 3
         high = middle + half > free
-        colour = BRAKE if road.scene.line[HIT, pair] else INK
+        colour = BRAKE if pen.scene.line[HIT, pair] else INK
         pen.write(middle, ROAD_TOP - (27 if high else 13), words, colour, 14, "ms")
         free = math.inf if high else middle - half
 
 
-def show_impacts(pen: Pen, road: Road) -> None:
+def show_impacts(pen: Pen) -> None:
     """Draw a star at every recent impact, and say which two were hardest."""
 
     def x(impact: Impact) -> float:
-        return (road.ends(impact.pair + 1)[1] + road.ends(impact.pair)[0]) / 2
+        return (pen.ends(impact.pair + 1)[1] + pen.ends(impact.pair)[0]) / 2
 
-    for impact in road.scene.impacts:
+    for impact in pen.scene.impacts:
         points = [
             (x(impact) + r * math.cos(k * math.pi / 8), LANE + r * math.sin(k * math.pi / 8))
             for k, r in enumerate([17, 8] * 8)
         ]
         pen.shape(points, FLASH, BRAKE)
-    hardest = sorted(road.scene.impacts, key=lambda impact: -impact.closing_mps)[:2]
+    hardest = sorted(pen.scene.impacts, key=lambda impact: -impact.closing_mps)[:2]
     if hardest:
         words = "impact of " + ", ".join(str(impact) for impact in hardest)
         half = width_of(words, 15) / 2

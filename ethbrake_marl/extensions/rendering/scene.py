@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import advance_worlds
 from ethbrake_marl.motion.layout import (
@@ -134,18 +135,23 @@ class Scene(NamedTuple):
 class Motion:
     """One world from one decision to the next. Every moment of it is computed with the physics of the episode."""
 
-    def __init__(self, state: State, row: int, front_m: float = 0.0, impacts: tuple[Impact, ...] = ()) -> None:
+    def __init__(self, game: Game, state: State, row: int) -> None:
+        self.game, self.row, self.road_m = game, row, whole_road(state, row)
         self.line, self.car, self.wanted = state.line[row].copy(), state.car[row], state.wanted[row].copy()
         self.start_s = self.until_s = float(state.time_s[row])
-        self.front_m, self.impacts = front_m, impacts
-        self.has_obstacle = bool(self.line[GAP, 0] < FAR_M)
+        self.front_m, self.impacts, self.ended = 0.0, tuple[Impact, ...](), False
+
+    def step(self, state: State) -> None:
+        """Go on to the next decision, at which the worlds are in this state."""
+        self.line, self.front_m, self.impacts = self.at(self.until_s)
+        self.start_s, self.until_s = self.until_s, float(state.time_s[self.row])
+        self.wanted, self.ended = state.wanted[self.row].copy(), bool(state.ended[self.row])
 
     def at(self, time_s: float) -> tuple[Floats, float, tuple[Impact, ...]]:
         """Return line, place of Vehicle 1 and recent impacts at a time of this motion (s after the alert)."""
         line = self.line.copy()
-        if not self.has_obstacle:
-            line[GAP, 0] = POST_M
-        ahead_m, counts, scratch = line[GAP, 0], line[COUNT].copy(), scratch_for(len(self.wanted))
+        line[GAP, 0] = ahead_m = min(line[GAP, 0], POST_M)
+        counts, scratch = line[COUNT].copy(), scratch_for(len(self.wanted))
         times = np.array([self.start_s]), np.array([time_s])
         if time_s > self.start_s:
             advance_worlds(line[np.newaxis], self.car[np.newaxis], *times, self.wanted[np.newaxis], scratch)
@@ -155,16 +161,17 @@ class Motion:
         ]
         recent = tuple(impact for impact in (*self.impacts, *new) if impact.time_s > time_s - FLASH_S)
         front_m = self.front_m + float(ahead_m - line[GAP, 0])
-        if not self.has_obstacle:
+        if ahead_m == POST_M:
             line[GAP, 0] = self.line[GAP, 0]
         return line, front_m, recent
 
-    def next(self, state: State, row: int) -> Motion:
-        """Return the motion that begins where this one ends, and leads to a state."""
-        line, front_m, impacts = self.at(self.until_s)
-        new = Motion(state, row, front_m, impacts)
-        new.line, new.start_s = line, self.until_s
-        return new
+    def scene(self, time_s: float) -> Scene:
+        """Return what there is to see at a time of this motion (s after the alert)."""
+        line, front_m, impacts = self.at(time_s)
+        learners, ended = tuple(map(int, self.game.rules.learners)), self.ended and time_s == self.until_s
+        return Scene(
+            self.game.name, learners, ended, time_s, line, self.car, self.wanted, front_m, impacts, self.road_m
+        )
 
 
 def whole_road(state: State, row: int) -> tuple[float, float]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_whole_number, need
-from ethbrake_marl.extensions.rendering.scene import Motion, Scene, whole_road
+from ethbrake_marl.extensions.rendering.scene import Motion, Scene
 from ethbrake_marl.motion.layout import Floats
 
 SMOOTH_FPS = 50  # frames per second in the window, and default of `step_frames`
@@ -22,38 +22,22 @@ class Viewer:
         self.environment = environment
         self.many = hasattr(environment, "num_envs")
         self.motions: list[Motion] = []  # of each world, since its last decision
-        self.roads: list[tuple[float, float]] = []
 
     def began(self, state: State) -> None:
         """Start the pictures of new episodes; those that go on keep theirs."""
         if len(self.motions) != state.n:
-            self.motions = [Motion(state, row) for row in range(state.n)]
-            self.roads = [whole_road(state, row) for row in range(state.n)]
+            self.motions = [Motion(self.environment.game, state, row) for row in range(state.n)]
         self.stepped(state)
 
     def stepped(self, state: State) -> None:
         """Remember the step that led to this state, in every world."""
-        for row, last in enumerate(self.motions):
+        for row, motion in enumerate(self.motions):
             if state.steps[row] == 0:
-                self.motions[row], self.roads[row] = Motion(state, row), whole_road(state, row)
-            elif state.time_s[row] > last.until_s:
-                self.motions[row] = last.next(state, row)
+                self.motions[row] = Motion(self.environment.game, state, row)
+            elif state.time_s[row] > motion.until_s:
+                motion.step(state)
 
-    def scenes(self, row: int, times_s: Floats | None = None) -> list[Scene]:
-        """Return a world at some times of its last step (s after the alert); None: at its end."""
-        motion, environment = self.last_step(row), self.environment
-        ended = bool(environment.episode.ended[row])
-        learners = tuple(int(body) for body in environment.game.rules.learners)
-        return [
-            Scene(
-                environment.scenario.name, learners, ended and time == motion.until_s, float(time), line, motion.car,
-                motion.wanted, front_m, impacts, self.roads[row],
-            )
-            for time in ([motion.until_s] if times_s is None else times_s)
-            for line, front_m, impacts in [motion.at(float(time))]
-        ]  # fmt: skip
-
-    def last_step(self, row: int) -> Motion:
+    def motion(self, row: int) -> Motion:
         """Return the last step of a world."""
         if not self.motions:
             raise InvalidInput("render: no episode has started; call reset first")
@@ -61,7 +45,8 @@ class Viewer:
 
     def render(self) -> Any:
         """Return the present moment, as the mode shows it; of every world if there are many."""
-        shown = [self.show(self.scenes(row)[0]) for row in range(len(self.motions) or 1)]
+        motions = map(self.motion, range(len(self.motions) or 1))
+        shown = [self.show(motion.scene(motion.until_s)) for motion in motions]
         return shown if self.many else shown[0]
 
     def show(self, scene: Scene) -> Any:
@@ -73,10 +58,10 @@ class Viewer:
     def step_frames(self, fps: int = SMOOTH_FPS, row: int = 0) -> list[Any]:
         """Return the last step of a world as pictures, ``fps`` per second of the episode."""
         check_whole_number("step_frames: fps", fps, 1)
-        motion = self.last_step(row)
+        motion = self.motion(row)
         count = max(round((motion.until_s - motion.start_s) * fps), 1)
         times: Floats = np.linspace(motion.start_s, motion.until_s, count + 1)[1:]
-        return [Viewer.show(self, scene) for scene in self.scenes(row, times)]
+        return [Viewer.show(self, motion.scene(float(time_s))) for time_s in times]
 
     def close(self) -> None:
         """Do nothing: there is no window."""

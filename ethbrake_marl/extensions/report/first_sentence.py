@@ -1,4 +1,4 @@
-"""The first sentence of a page: what an agent does against full braking, and where it fails."""
+"""The first sentence of a page: what an agent does against full braking, and in which test it fails."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
 from ethbrake_marl.files.sheet import Column
 
-ROUNDING = 1e-6  # m2/s2
 LEARNED = ("trained policy", "trained team")  # names that get an article
 
 
 def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
     """Return the sentence about an agent. ``tests``: title -> the same agents in another test.
 
-    It names the tests in which the agent does about as much harm as full braking, or more. Without such a test, it says
-    in how many worlds the agent does more harm.
+    It names the tests in which the agent does about as much harm as full braking, or more.
     """
     count, harm = compared.harm_count, HARM[compared.harm_count]
     rows, known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
@@ -33,25 +31,14 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
     much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
     words = "about as much harm as" if change == "as much" else f"{much}{change} harm than"
     numbers = f"{impacts}: {value(row, harm)} m²/s² per emergency instead of {value(before, harm)}{best}"
-    fails = _fails(compared, focus, tests)
-    joined = ", but " if fails and change == "less" else ", and "
-    return f"{name} does {words} full braking ({numbers}){joined}{fails or 'in no world more'}."
-
-
-def _fails(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
-    """Return the tests, or the share of worlds, in which the agent does badly; "" if there are none."""
-    harm, reasons = HARM[compared.harm_count], []
+    fails = []
     for title, other in tests.items():
-        rows = {row.agent: row for row in other.table}
-        if {focus, BASELINE} <= rows.keys() and (change := change_of(rows[focus], harm)) != "less":
-            numbers = f"{value(rows[focus], harm)} instead of {value(rows[BASELINE], harm)}"
-            reasons.append(f"{change} in the {title.lower()} ({numbers})")
-    if reasons:
-        return " and ".join(reasons)
-    more = compared.result[focus][harm] - compared.result[BASELINE][harm]
-    share = float((more > ROUNDING).mean())
-    often = f"{100.0 * share:.1f}" if share >= 0.0005 else "less than 0.1"
-    return f"more in {often} % of the worlds, by {max(float(more.max()), 0.01):.2f} at most" if share else ""
+        there = {each.agent: each for each in other.table}
+        if {focus, BASELINE} <= there.keys() and (worse := change_of(there[focus], harm)) != "less":
+            instead = f"{value(there[focus], harm)} instead of {value(there[BASELINE], harm)}"
+            fails.append(f"{worse} in the {title.lower()} ({instead})")
+    joined = ", but " if change == "less" else ", and "
+    return f"{name} does {words} full braking ({numbers}){joined * bool(fails)}{' and '.join(fails)}."
 
 
 def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:

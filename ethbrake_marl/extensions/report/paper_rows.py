@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import NamedTuple
 
 from ethbrake_marl.extensions.report.three_tests import is_as_shipped
-from ethbrake_marl.files.sheet import Row
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.worlds.scenario import Scenario
 
 
-@dataclass(frozen=True, slots=True)
-class PaperRow:
+class PaperRow(NamedTuple):
     """One row of a table of results as printed in the paper.
 
     The paper counts first-impact harm, and gives no confidence intervals.
     """
 
-    table: Literal["random test", "hybrid test"]  # title of the table
     agent: str  # name of the strategy in the paper
     episodes: int  # number of worlds
     collisions: int  # number of worlds with a collision
@@ -28,22 +24,25 @@ class PaperRow:
     harm_decrease: float | None
 
 
-PAPER_ROWS = (
-    PaperRow("random test", "Non-E", 10_000, 9391, 0.9391, 33.5878, 0.0),
-    PaperRow("random test", "E-V2X-BM", 10_000, 8520, 0.852, 9.8772, 0.7059),
-    PaperRow("random test", "Hybrid SAC", 10_000, 5896, 0.5896, 5.7001, 0.8302),
-    PaperRow("random test", "Hybrid PPO", 10_000, 5974, 0.5974, 5.6202, 0.8326),
-    PaperRow("hybrid test", "E-V2X-BM", 5_000, 4263, 0.8526, 9.8514, None),
-    PaperRow("hybrid test", "Standalone DRL", 5_000, 3737, 0.7474, 12.229, None),
-    PaperRow("hybrid test", "Hybrid", 5_000, 2995, 0.599, 7.3641, None),
+RANDOM_TEST = (
+    PaperRow("Non-E", 10_000, 9391, 0.9391, 33.5878, 0.0),
+    PaperRow("E-V2X-BM", 10_000, 8520, 0.852, 9.8772, 0.7059),
+    PaperRow("Hybrid SAC", 10_000, 5896, 0.5896, 5.7001, 0.8302),
+    PaperRow("Hybrid PPO", 10_000, 5974, 0.5974, 5.6202, 0.8326),
 )
 
-PAPER_PARAMETERS = {
-    "random test": (
+HYBRID_TEST = (
+    PaperRow("E-V2X-BM", 5_000, 4263, 0.8526, 9.8514, None),
+    PaperRow("Standalone DRL", 5_000, 3737, 0.7474, 12.229, None),
+    PaperRow("Hybrid", 5_000, 2995, 0.599, 7.3641, None),
+)
+
+PARAMETERS = {
+    RANDOM_TEST: (
         "10,000 worlds; d = 5–10 m; v = 18–22 m/s; braking and driving capacity (6, 7, 6) m/s²; τ2 = 0.5 s, τ3 = 0.8 s;"
         " m = (4.5, 5.5, 5.9) t; not stated: e, time step, horizon, seed"
     ),
-    "hybrid test": (
+    HYBRID_TEST: (
         "5,000 worlds; d = 5–10 m; capacities, latencies and masses as in the random test; not stated: speeds for this"
         " test, e, time step, horizon, seed"
     ),
@@ -69,23 +68,15 @@ def is_papers_test(scenario: Scenario) -> bool:
     return scenario.name in SHOWN_WITH and is_as_shipped(scenario)
 
 
-def paper_rows(names: Sequence[str]) -> list[Row]:
-    """Return the rows of the paper's tables for a table with the columns ``names``; the first has the agent."""
-    rows: list[Row] = []
-    for paper in PAPER_ROWS:
-        section = f"The paper's {paper.table}, as printed"
-        rows += [] if section in rows else [section]
-        cells = {
-            names[0]: paper.agent,
-            "collision_rate": f"{100 * paper.collision_rate:.4g} %",
-            "first_impact_harm": f"{paper.average_harm:.6g}",
-        }
-        if paper.harm_decrease is not None:
-            cells["harm_decrease_first"] = f"{100 * paper.harm_decrease:.4g} %"
-        rows.append([cells.get(name) for name in names])
-    return rows
-
-
-def paper_notes() -> list[str]:
-    """Return the conditions of the paper's tables, and what is odd about them."""
-    return [*(f"Paper, {name}: {text}." for name, text in PAPER_PARAMETERS.items()), PAPER_NOTE]
+def printed_sheet(rows: tuple[PaperRow, ...]) -> Sheet:
+    """Return one of the paper's two tables as printed."""
+    columns = ("Strategy", Column("Collisions"), Column("Rate"), Column("Average harm"), Column("Decrease"))
+    shown = [
+        (
+            *(row.agent, f"{row.collisions:,}", f"{100.0 * row.collision_rate:.4g} %", f"{row.average_harm:g}"),
+            None if row.harm_decrease is None else f"{100.0 * row.harm_decrease:.4g} %",
+        )
+        for row in rows
+    ]
+    sheet = Sheet(f"The paper's {rows[0].episodes:,} worlds, as printed", columns, shown, f"{PARAMETERS[rows]}.")
+    return sheet.only(sheet.filled())

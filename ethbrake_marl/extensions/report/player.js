@@ -24,7 +24,7 @@ class Player {
     const kinds = new Map();
     this.data.worlds.forEach((world, k) => {
       if (!kinds.has(world.kind)) kinds.set(world.kind, make("optgroup", { label: world.kind }));
-      kinds.get(world.kind).append(make("option", { value: k }, `${world.title}${world.why ? ` · ${world.why}` : ""}`));
+      kinds.get(world.kind).append(make("option", { value: k }, `World ${world.number} · ${world.why}`));
     });
     this.find("world").append(...kinds.values());
     this.fillAgents();
@@ -42,13 +42,12 @@ class Player {
   }
 
   listen() {
-    const on = (name, kind, act) => this.find(name)?.addEventListener(kind, act); // some parts may be missing on the page
+    const on = (name, kind, act) => this.find(name).addEventListener(kind, act);
     on("world", "change", (event) => this.choose(Number(event.target.value)));
     on("before", "click", () => this.choose(this.world - 1));
     on("after", "click", () => this.choose(this.world + 1));
     on("scrub", "input", (event) => this.seek(Number(event.target.value)));
     on("speed", "change", (event) => { this.speed = Number(event.target.value); });
-    on("more", "toggle", () => this.build()); // folded parts have no width, so draw again when unfolded
     for (const button of this.root.querySelectorAll("[data-do]")) button.addEventListener("click", () => this.act(button.dataset.do));
     this.root.addEventListener("keydown", (event) => this.press(event));
     document.addEventListener("click", (event) => {
@@ -143,7 +142,7 @@ class Player {
     this.time = Math.min(this.time, this.until);
     const view = roadOf(episodes);
     const ranges = rangesOf(episodes);
-    this.find("conditions").textContent = world.conditions;
+    this.find("conditions").textContent = `World ${world.number}: ${world.conditions}.`;
     const road = this.find("road");
     const traces = this.find("traces");
     road.replaceChildren();

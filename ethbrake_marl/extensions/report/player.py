@@ -4,75 +4,61 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
+from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import EpisodeRecord
 from ethbrake_marl.extensions.rendering.scene import BODY_M
-from ethbrake_marl.extensions.report.page import Part, shown
+from ethbrake_marl.extensions.report.best_known import HARM
+from ethbrake_marl.extensions.report.page import data, fill, shown
 from ethbrake_marl.extensions.report.style import quantities
 from ethbrake_marl.motion.layout import Floats
 
-SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
 DATA = "episode_data"  # id of the data in a page; no section has it
 SAMPLE_S = 0.005  # time between two samples of the motion
 SAME = 1e-8  # a sample is left out if the one before it, continued, is this close to it (m, m/s, m/s2)
 MOST_SHOWN = 3  # agents that are shown at the start
 
 
-@dataclass(frozen=True)
-class Played:
-    """One world of the player, with its episode under every agent."""
+def player(
+    compared: Compared, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
+) -> Markup:
+    """Return the player of some worlds. The agents that it shows first are the first one, ``focus``, and the last.
 
-    number: int  # in its list
-    kind: str  # heading of the group of worlds, which says why the world is shown
-    why: str  # special property of the world, in a few words
-    records: dict[str, EpisodeRecord] = field(default_factory=dict)  # by agent; samples ``SAMPLE_S`` apart
-    title: str = ""  # "": "World" and its number
-
-
-def player(worlds: Sequence[Played], *, focus: str = "", shown_first: Sequence[int] = (), folded: bool = False) -> Part:
-    """Return the player of at least one world, all with the same agents.
-
-    ``shown_first``: indices of the agents that are shown at the start; by default the first agent, ``focus``, and those
-    at the end of the list, up to three. ``folded``: curves over time are hidden until the reader asks for them.
+    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, in which
+    samples are ``SAMPLE_S`` apart.
     """
-    agents, alert = list(worlds[0].records), next(iter(worlds[0].records.values())).initial
-    middle = [agents.index(focus)] if focus in agents else []
-    order = list(dict.fromkeys([*middle, 0, *reversed(range(len(agents)))]))
-    data = [_world_data(each) for each in worlds]
+    result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
+    for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
+        first, total = (result[focus][harm][row] for harm in HARM.values())
+        worlds.append(
+            {
+                "number": int(result.worlds["world"][row]),
+                "kind": shown(kind),
+                "why": shown(f"{focus}: harm {first:.2f} first-impact, {total:.2f} total"),
+                "conditions": quantities(episodes[0].initial),
+                "episodes": [episode_data(record) for record in episodes],
+            }
+        )
+    order = dict.fromkeys([agents.index(focus), 0, *reversed(range(len(agents)))])
     content = {
-        "vehicles": alert.vehicles,
+        "vehicles": compared.scenario.vehicles,
         "agents": [shown(agent) for agent in agents],
-        "shown": list(shown_first) or sorted(order[:MOST_SHOWN]),
-        "worlds": data,
+        "shown": sorted([*order][:MOST_SHOWN]),
+        "worlds": worlds,
     }
-    return Part.template(
+    return fill(
         "player.html.j2",
-        ("player.css",),
-        SCRIPTS,
-        vehicles=alert.vehicles,
-        shielded=any(episode["stepped"] for world in data for episode in world["episodes"]),
-        folded=folded,
+        vehicles=compared.scenario.vehicles,
+        shielded=any(episode["stepped"] for world in worlds for episode in world["episodes"]),
         name=DATA,
-        episodes=Part.data(DATA, content).html,
+        episodes=data(DATA, content),
         body=BODY_M,
     )
-
-
-def _world_data(world: Played) -> Mapping[str, Any]:
-    alert, title = next(iter(world.records.values())).initial, shown(world.title or f"World {world.number}")
-    return {
-        "conditions": f"{title}: {quantities(alert)}.",
-        "episodes": [episode_data(record) for record in world.records.values()],
-        "number": world.number,
-        "title": title,
-        "kind": shown(world.kind),
-        "why": shown(world.why),
-    }
 
 
 def episode_data(record: EpisodeRecord) -> dict[str, Any]:

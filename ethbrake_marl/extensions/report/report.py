@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+from markupsafe import Markup
+
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
-from ethbrake_marl.evaluation.summary import IDENTITY
-from ethbrake_marl.extensions.report.best_known import BestKnown
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.evaluation.summary import IDENTITY, SummaryTable
+from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
+from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.first_sentence import first_sentence
-from ethbrake_marl.extensions.report.harm_figures import harm_by_agent
-from ethbrake_marl.extensions.report.page import Page, Part, Section
-from ethbrake_marl.extensions.report.sections import (
-    avoidable_section,
-    drive_shown,
-    episodes_section,
-    measured,
-    short_table,
-    worst_section,
-)
-from ethbrake_marl.files.sheet import Row
+from ethbrake_marl.extensions.report.harm_figures import harm_above, harm_by_agent
+from ethbrake_marl.extensions.report.page import Section, drawing, part, table, whole_page
+from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.files.store import write_output
+from ethbrake_marl.motion.layout import Bools
 
+SHORT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the first table
 WORDS = {
     "Contact": "Two vehicles, or Vehicle 1 and an obstacle, touch: the gap between them is 0.",
     "Impact": "A contact with a closing speed above 0. The square of that speed is its harm.",
@@ -30,8 +32,7 @@ WORDS = {
 }
 
 
-@dataclass(frozen=True)
-class Test:
+class Test(NamedTuple):
     """Another test of the same agents."""
 
     about: str  # how it differs
@@ -44,77 +45,135 @@ class Report:
 
     title: str
     compared: Compared
+    summary: str  # one or two sentences about the agents
+    settings: Mapping[str, object]  # by name
     focus: str = ""  # agent that the page is mainly about; "": the last one with a policy, or the last one
-    summary: str = ""  # one or two sentences about the agents
     sections: Sequence[Section] = ()  # below the results
-    figures: Sequence[Part] = ()
+    figures: Sequence[Markup] = ()
     tests: Mapping[str, Test] = field(default_factory=dict)  # by title
-    beside: Sequence[Row] = ()  # rows below those of the agents: what somebody else printed
-    notes: Sequence[str] = ()  # about these rows
     remarks: Sequence[str] = ()  # below the first sentence
-    settings: Mapping[str, object] = field(default_factory=dict)  # by name
 
     @property
-    def about(self) -> str:
-        """Name of the agent that the page is mainly about."""
-        table = self.compared.table
-        return self.focus or [row.agent for row in table if row.policies or row is table[-1]][-1]
-
-    @property
-    def page(self) -> Page:
+    def html(self) -> str:
         """The whole page."""
-        compared, focus = self.compared, self.about
-        played = drive_shown(compared, focus)
+        compared, rows = self.compared, self.compared.table
+        focus = self.focus or [row.agent for row in rows if row.policies or row is rows[-1]][-1]
+        kinds = shown_worlds(compared.result, focus)
         others = {title: test.compared for title, test in self.tests.items()}
-        parameters = compared.table.parameters
-        results = [Part.box("Three words", WORDS), *measured(compared.table, self.beside, self.notes)]
+        about = rows.parameters
+        versions = {**about["versions"], **{key: about[key] for key in IDENTITY[:3]}}
         sections = [
-            Section("Results", [self.summary, *results] if self.summary else results),
+            Section("Results", [self.summary, part("box", "Three words", WORDS), *measured(rows)]),
             *self.sections,
-            episodes_section(compared, played, focus),
-            worst_section(compared, focus, played),
+            episodes_section(compared, focus, kinds),
+            worst_section(compared, focus, kinds),
             avoidable_section(compared),
             Section("Figures", self.figures),
-            *(self._test(title, test) for title, test in self.tests.items()),
-            Section("How to read the tables", [Part.facts(compared.table.meanings())]),
-            Section("Settings and seeds", [Part.facts(self.settings)] if self.settings else ()),
-            Section(
-                "Versions", [Part.facts({**parameters["versions"], **{key: parameters[key] for key in IDENTITY[:3]}})]
-            ),
+            *(Section(title, _tested(test)) for title, test in self.tests.items()),
+            Section("How to read the tables", [part("facts", rows.meanings())]),
+            Section("Settings and seeds", [part("facts", self.settings)]),
+            Section("Versions", [part("facts", versions)]),
         ]
         which = "First-impact" if compared.harm_count == "first" else "Total"
-        tables = {title: other.table for title, other in others.items()}
-        bars = harm_by_agent(compared.table, compared.harm_count, BestKnown.of(compared.result), tables)
         marks = "; marks: the other tests" if others else ""
-        drawing = Part.drawing(bars, f"{which} harm of each agent", f"Mean and 95 % interval{marks}.")
-        opening = [
-            Part.remarks([*self.remarks, *compared.table.notes()]),
-            Part.beside([drawing, short_table(compared.table)]),
-        ]
+        bars = harm_by_agent(compared, others)
+        harm = drawing(bars, f"{which} harm of each agent", f"Mean and 95 % interval{marks}.")
+        opening = [part("remarks", [*self.remarks, *rows.notes()]), part("beside", harm, short_table(rows))]
         lead = first_sentence(compared, focus, others)
-        return Page(self.title, [section for section in sections if section.body], lead, opening=opening)
-
-    @staticmethod
-    def _test(title: str, test: Test) -> Section:
-        table = test.compared.table
-        notes = [Part.paragraph(text, "note") for text in table.notes()]
-        return Section(title, [test.about, short_table(table), *notes, *measured(table)])
+        return whole_page(self.title, lead, opening, [section for section in sections if section.body])
 
     def write(self, path: Path, *, force: bool = False) -> None:
         """Write the page. Raises the errors of ``write_output``."""
-        write_output(path, self.page.html.encode("utf-8"), force=force)
+        write_output(path, self.html.encode("utf-8"), force=force)
+
+
+def short_table(agents: SummaryTable) -> Markup:
+    """Return each agent's collision rate and harms."""
+    sheet = agents.sheet()
+    some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in SHORT)
+    return table(replace(some, title="Means with 95 % intervals, m²/s²"))
+
+
+def measured(agents: SummaryTable) -> list[Markup]:
+    """Return the conditions, and folded tables of all measures."""
+    sheet, more = agents.sheet(), agents.measures()
+    whole = replace(sheet.only(sheet.filled()), title="All measures with a column")
+    tables = [table(each) for each in (whole, more) if each is not None]
+    line = part("paragraph", f"{caption(agents.parameters)}. Harm in m²/s².", "quiet")
+    return [line, part("folded", "Every measure", tables)]
+
+
+def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
+    """Return the ten worlds in which an agent did worst; those that the player shows have a button."""
+    result, known = compared.result, BestKnown.of(compared.result)
+    columns = {"First-impact harm": result[focus][HARM["first"]], "Total harm": result[focus][HARM["total"]]}
+    if known is not None:
+        columns |= {"Best known, first": known.harm["first"], "Best known, total": known.harm["total"]}
+        if known.avoidable is not None:
+            columns["Contact"] = np.where(known.avoidable, "avoidable", "unavoidable")
+    columns["Impacts"] = result[focus]["impacts"]
+    rows = []
+    for k in worst_rows(result, focus).tolist():
+        number = int(result.worlds["world"][k])
+        name = Shown(part("watch", number)) if k in watched else number
+        rows.append([name, *(each[k].item() for each in columns.values())])
+    by = "total harm" if known is None else "total harm minus best known total harm"
+    sheet = Sheet(f"Worlds of {focus}", list(map(Column, ("World", *columns))), rows)
+    return Section(
+        "Worst ten worlds", [f"The worlds in which {focus} did worst, by {by}. Harm in m²/s².", table(sheet)]
+    )
+
+
+def avoidable_section(compared: Compared) -> Section:
+    """Return how harm is distributed over the worlds and, if it is proven, what was avoidable."""
+    result, known = compared.result, BestKnown.of(compared.result)
+    if known is None:
+        words = "For each harm x: share of the worlds in which an agent did more harm than x."
+        return Section("World by world", [drawing(harm_above(result), "Harm", words)])
+    body: list[str] = []
+    if known.avoidable is not None:
+        share = rate(known.avoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
+        body.append(
+            f"Contact can be avoided in {share} of the worlds. In the other worlds, no command can avoid it (both"
+            " proven for each world)."
+        )
+        for where, among in (("Contact avoidable", known.avoidable), ("Contact unavoidable", ~known.avoidable)):
+            if among.any():
+                body.append(table(_harm_among(compared, known, where, among)))
+    words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."
+    return Section("What was avoidable", [*body, drawing(harm_above(result), "Regret", words)])
+
+
+def _harm_among(compared: Compared, known: BestKnown, where: str, among: Bools) -> Sheet:
+    result = compared.result
+    some, rows = result.take(among), []
+    for agent, own in some.columns.items():
+        regrets = (known.regret(result, agent, count)[among] for count in HARM)
+        harms = (own[harm] for harm in HARM.values())
+        rows.append(
+            (agent, rate(own["collided"], some.clusters), *(mean(x, some.clusters) for x in (*harms, *regrets)))
+        )
+    collided = Column("Collided", digits=1, scale=100.0, unit=" %")
+    columns = map(Column, ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total"))
+    return Sheet(f"{where}: {count_of(some.n, 'world')}", ["Agent", collided, *columns], rows)
+
+
+def _tested(test: Test) -> list[str]:
+    rows = test.compared.table
+    notes = [part("paragraph", text, "note") for text in rows.notes()]
+    return [test.about, short_table(rows), *notes, *measured(rows)]
 
 
 def write_evaluation(path: Path, compared: Compared, command: str, *, force: bool = False) -> None:
     """Write the page of ``ethbrake evaluate --report``. Raises the errors of ``write_output``."""
-    scenario, table = compared.scenario, compared.table
-    names = ", ".join(row.agent for row in table)
+    scenario, agents = compared.scenario, [row.agent for row in compared.table]
+    names = ", ".join(agents)
     scripts = ", ".join(f"{vehicle} by {role}" for vehicle, role in scenario.roles.items() if role != "learner")
     Report(
-        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(table)} agents compared",
+        f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(agents)} agents compared",
         compared,
-        summary=scenario.title or "Agents on the same worlds.",
-        settings={
+        scenario.title or "Agents on the same worlds.",
+        {
             "Command": command,
             "Agents": names,
             "Harm that agents minimise": "first impacts only" if compared.harm_count == "first" else "every impact",

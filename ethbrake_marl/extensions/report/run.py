@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import count
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.captions import caption
@@ -17,16 +18,23 @@ from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.results import write_results
 from ethbrake_marl.evaluation.summary import BASELINE
 from ethbrake_marl.extensions.report.best_known import HARM, MEASURES
+from ethbrake_marl.extensions.report.curves import curves_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.harm_figures import harm_against_total_gap
 from ethbrake_marl.extensions.report.learners import learners_sheets
-from ethbrake_marl.extensions.report.page import Part, Section
-from ethbrake_marl.extensions.report.paper_rows import is_papers_test, paper_notes, paper_rows
+from ethbrake_marl.extensions.report.page import Section, drawing, table
+from ethbrake_marl.extensions.report.paper_rows import (
+    HYBRID_TEST,
+    PAPER_NOTE,
+    RANDOM_TEST,
+    is_papers_test,
+    printed_sheet,
+)
 from ethbrake_marl.extensions.report.report import Report, Test
-from ethbrake_marl.extensions.report.seed_curves import learning_curve
-from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.report.style import TITLES, write_picture
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests, title_of
 from ethbrake_marl.files.plain import read_object
+from ethbrake_marl.files.sheet import Estimate, Sheet
 from ethbrake_marl.names import open_game
 from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables
@@ -34,6 +42,7 @@ from ethbrake_marl.training.run import RunFolder
 
 MOST_WORLDS = 2_000  # of each of the other two tests
 PAGE = "report.html"
+COURSE = {TITLES["first"]: "first_impact_harm", TITLES["total"]: "total_harm", "Share of collisions": "collision_rate"}
 
 
 class RunReport:
@@ -62,32 +71,41 @@ class RunReport:
         begin("figures")
         figures = write_figures(experiment)
         begin("page and episodes")
-        is_papers = is_papers_test(compared.scenario)
-        page = page_of(experiment, others, figures, [Section("Several learners", list(map(Part.table, learners)))])
-        page.write(folder / PAGE, force=True)
+        page_of(experiment, others, figures, learners).write(folder / PAGE, force=True)
         begin("")
-        more = " and the paper's rows" if is_papers else ""
-        tables = [brief(compared, others), *learners]
-        return tables, f"report with all measures{more}: {folder / PAGE}"
+        more = " and the paper's rows" if is_papers_test(compared.scenario) else ""
+        return [brief(compared, others), *learners], f"report with all measures{more}: {folder / PAGE}"
 
 
-def write_figures(experiment: Experiment) -> list[Part]:
+def write_figures(experiment: Experiment) -> list[Markup]:
     """Write three pictures into the run's folder, and return them as parts of a page."""
-    compared, learned = experiment.compared, experiment.learned
-    recipe, (_, game) = experiment.trained.training.recipe, open_game(compared.scenario)
+    compared, learned, trained = experiment.compared, experiment.learned, experiment.trained
+    recipe, (_, game) = trained.training.recipe, open_game(compared.scenario)
     shown = telling_row(compared, learned)
     world, number = compared.worlds([shown]), int(compared.result.worlds["world"][shown])
-    plan, line = recipe.evaluation, caption(compared.table.parameters)
+    plan = recipe.evaluation
     course = (
         f"{compared.scenario.name}: worlds 0 to {plan.worlds - 1} of the list of seed {plan.seed} at every point;"
-        f" training seed {recipe.seed}. Horizontal lines: {line}."
+        f" training seed {recipe.seed}. Horizontal lines: {caption(compared.table.parameters)}."
     )
     references = [row for row in compared.table if row.agent in TEAM_BASELINES]
+    beside = [agent for agent in compared.teams if agent in (*TEAM_BASELINES, learned)]
     drawn = {
         "learning_curve.png": (
             "Learning curve",
             "Harm and collisions on a fixed list of worlds during the training. The horizontal lines are baselines.",
-            learning_curve(experiment.trained.evaluations, learned=learned, references=references, caption=course),
+            curves_figure(
+                {
+                    title: {learned: {point["steps"]: Estimate(point[key], None) for point in trained.evaluations}}
+                    for title, key in COURSE.items()
+                },
+                "Training steps",
+                course,
+                lines={
+                    title: {row.agent: each.value for row in references if (each := row[key]) is not None}
+                    for title, key in COURSE.items()
+                },
+            ),
         ),
         "harm_against_gap.png": (
             "Harm against the total initial gap",
@@ -98,16 +116,12 @@ def write_figures(experiment: Experiment) -> list[Part]:
             "One episode",
             f"World {number} of the list, driven by these agents. It is a typical world: among the worlds in which full"
             f" braking collides, the harm that the {learned} avoids is the median here.",
-            trajectories({
-                name: record_episode(world, team, game)
-                for name, team in compared.teams.items()
-                if name in (*TEAM_BASELINES, learned)
-            }),
+            trajectories({agent: record_episode(world, compared.teams[agent], game) for agent in beside}),
         ),
     }  # fmt: skip
     for name, (_, _, figure) in drawn.items():
-        write_picture(experiment.trained.directory / name, figure, force=True)
-    return [Part.drawing(figure, title, description) for title, description, figure in drawn.values()]
+        write_picture(trained.directory / name, figure, force=True)
+    return [drawing(figure, title, description) for title, description, figure in drawn.values()]
 
 
 def telling_row(compared: Compared, learned: str) -> int:
@@ -122,7 +136,7 @@ def telling_row(compared: Compared, learned: str) -> int:
 
 
 def page_of(
-    experiment: Experiment, others: dict[str, Compared], figures: Sequence[Part], sections: Sequence[Section]
+    experiment: Experiment, others: Mapping[str, Compared], figures: Sequence[Markup], learners: Sequence[Sheet]
 ) -> Report:
     """Return the page of a run; ``others``: name of another test -> results."""
     trained, compared, learned = experiment.trained, experiment.compared, experiment.learned
@@ -150,19 +164,19 @@ def page_of(
         summary += f" The agent “{HYBRID}” is the trained policy with the paper's shield."
     if others:
         summary += f" {TESTS[name]} The results of the other two tests are further below."
+    sections = [Section("Several learners", [table(sheet) for sheet in learners])]
+    if is_papers_test(compared.scenario):
+        printed = [table(printed_sheet(rows)) for rows in (RANDOM_TEST, HYBRID_TEST)]
+        sections.append(Section("The paper's rows", [*printed, PAPER_NOTE]))
     stopped = f"The training was interrupted. This is the {learned} after {steps:,} steps."
-    papers = is_papers_test(compared.scenario)
-    sheet = compared.table.sheet()
     return Report(
         f"ethbrake run: {name}",
         compared,
+        summary,
+        {key: value for key, value in facts.items() if value},
         focus=learned,
-        summary=summary,
         sections=sections,
         figures=figures,
         tests={title_of(test): Test(TESTS[test], other) for test, other in others.items()},
-        beside=paper_rows(sheet.only(sheet.filled()).names) if papers else (),
-        notes=paper_notes() if papers else (),
         remarks=[stopped] if trained.status == "interrupted" else (),
-        settings={key: value for key, value in facts.items() if value},
     )

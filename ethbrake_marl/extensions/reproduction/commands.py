@@ -64,7 +64,7 @@ def reproduce_command(
         out.note(items.cost(settings, chosen))
         if cost:
             return
-        results = items.reproduce(settings, chosen, str(this_machine()), force=out.force)
+        results = items.reproduce(settings, chosen, this_machine(), force=out.force)
         if results is None:
             out.interrupted(f"interrupted; {REMAINS}")
         out.result(items.plain(results), items.overview(results))

@@ -9,7 +9,9 @@ import numpy as np
 
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.statistics import difference, mean
-from ethbrake_marl.extensions.reproduction.figures import estimates_figure
+from ethbrake_marl.extensions.report.curves import curves_figure
+from ethbrake_marl.extensions.report.style import TITLES
+from ethbrake_marl.extensions.reproduction.learning import unconverged
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Drawn, Made, Settings, about
 from ethbrake_marl.extensions.reproduction.readings import (
     ABOUT_BASELINE,
@@ -28,31 +30,27 @@ from ethbrake_marl.extensions.reproduction.readings import (
     drive,
     driven,
     harms,
+    least_harm,
 )
-from ethbrake_marl.extensions.reproduction.trainings import unconverged
 from ethbrake_marl.extensions.reproduction.verdicts import Less, Verdict, judge_statement
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 
-Groups = Mapping[str, Mapping[str, Floats]]  # group of worlds -> strategy -> harm of each world
-
-HARM_TITLE = "First-impact harm (m²/s²)"
+Groups = Mapping[str, Mapping[str, Floats]]  # group of worlds, or delay -> strategy -> harm of each world
 
 DISTANCE_WORLDS, DELAY_WORLDS = 5_000, 2_000
 
-ENDS_M = (10.0, 12.0, 14.0, 16.0, 18.0, 20.0)  # of the groups, for the sum of both gaps
+ENDS_M = (10, 12, 14, 16, 18, 20)  # of the groups, for the sum of both gaps
 
 ALONE, HYBRID_REALISED, HYBRID_PREDICTED = "policy alone", "hybrid, realised H*", "hybrid, predicted H*"
 
 
-def by_distance(result: Result, harm: Mapping[str, Floats]) -> tuple[list[float], Groups]:
-    """Return the mean sum of both gaps (m) of each group of worlds, and the groups ``10-12 m``, ...; none is empty."""
+def by_distance(result: Result, harm: Mapping[str, Floats]) -> Groups:
+    """Return the groups of worlds with similar sums of both gaps, ``10-12 m``, ...; none is empty."""
     total = np.asarray(result.worlds["gap_1_m"] + result.worlds["gap_2_m"])
-    inner = np.digitize(total, ENDS_M[1:-1])
-    rows = {f"{low:g}-{high:g} m": inner == k for k, (low, high) in enumerate(pairwise(ENDS_M))}
-    rows = {name: mask for name, mask in rows.items() if mask.any()}
-    groups = {name: {who: each[mask] for who, each in harm.items()} for name, mask in rows.items()}
-    return [float(total[mask].mean()) for mask in rows.values()], groups
+    group = np.digitize(total, ENDS_M[1:-1])
+    rows = {f"{ENDS_M[k]}-{ENDS_M[k + 1]} m": group == k for k in np.unique(group).tolist()}
+    return {name: {who: each[some] for who, each in harm.items()} for name, some in rows.items()}
 
 
 def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
@@ -64,46 +62,43 @@ def less_in_each(groups: Groups, smaller: str, *larger: str) -> list[Less]:
     ]
 
 
-def harm_sheet(title: str, groups: Groups, note: str) -> Sheet:
-    """Return mean harms: a row for each strategy, a column for each group."""
-    names = dict.fromkeys(name for harm in groups.values() for name in harm)
-    rows = [(name, *(mean(harm[name]) if name in harm else None for harm in groups.values())) for name in names]
-    columns = [Column(group) for group in groups]
-    return Sheet(title, ("Strategy", *columns), rows, f"First-impact harm, m²/s²; {note} {ABOUT_BASELINE}")
-
-
-def over_distance(
-    stem: str, curves: Mapping[str, tuple[Sequence[float], Groups, str]], lines: Sequence[str]
+def show_harm(
+    stem: str, title: str, readings: Mapping[str, tuple[Groups, str]], lines: Sequence[str], x_label: str
 ) -> tuple[Drawn, list[Sheet]]:
-    """Return the figure of harm against the sum of both gaps, and its tables.
+    """Return a figure of mean harm, with a panel for each reading, and a table for each.
 
-    ``curves`` has distances, groups and a note by reading; ``lines`` are the strategies of the figure.
+    ``readings`` has groups and a note by reading; ``lines`` are the strategies of the figure.
     """
     panels = {
-        reading: {name: {x: mean(harm[name]) for x, harm in zip(at, groups.values(), strict=True)} for name in lines}
-        for reading, (at, groups, _) in curves.items()
+        reading: {line: {group: mean(harm[line]) for group, harm in groups.items()} for line in lines}
+        for reading, (groups, _) in readings.items()
     }
-    worlds = sum(len(next(iter(harm.values()))) for harm in next(iter(curves.values()))[1].values())
-    figure = estimates_figure(
-        panels,
-        HARM_TITLE,
-        f"Means over {worlds:,} worlds in groups of 2 m; bands: 95 % intervals.",
-        "Total distance d1 + d2 at the alert (m)",
-    )
-    text = (
-        "Mean harm of each strategy against the sum of both gaps; left as stated, right with Vehicle 2 acting at 0.2 s."
-    )
-    sheets = [harm_sheet(f"Harm by total distance, {name}", groups, note) for name, (_, groups, note) in curves.items()]
-    return Drawn(stem, "Harm over total distance", text, figure), sheets
+    text = "Mean first-impact harm of each strategy under each reading; bands: 95 % intervals."
+    figure = curves_figure(panels, x_label, f"{title}. {text}", y_label=TITLES["first"])
+    sheets = []
+    for reading, (groups, note) in readings.items():
+        strategies = next(iter(groups.values()))
+        rows = [(strategy, *(mean(harm[strategy]) for harm in groups.values())) for strategy in strategies]
+        columns = [Column(group) for group in groups]
+        below = f"First-impact harm, m²/s²; {note} {ABOUT_BASELINE}"
+        sheets.append(Sheet(f"{title}, {reading}", ("Strategy", *columns), rows, below))
+    return Drawn(stem, title, text, figure), sheets
+
+
+def over_distance(stem: str, readings: Mapping[str, tuple[Groups, str]], lines: Sequence[str]) -> Made:
+    """Return figure and tables of harm against the sum of both gaps."""
+    title, x_label = "Harm by total distance", "Total distance d1 + d2 at the alert"
+    figure, sheets = show_harm(stem, title, readings, lines, x_label)
+    return Made([], sheets, [figure])
 
 
 def reproduce_distance(settings: Settings) -> Made:
     """Reproduce the figure of harm against the sum of both gaps."""
-    curves, verdicts = {}, []
+    readings, verdicts = {}, []
     for reading in READINGS:
-        result = driven(DISTANCE, reading, FOUR, min(DISTANCE_WORLDS, settings.episodes))
-        at, groups = by_distance(result, harms(result, reading.scenario(DISTANCE)))
-        curves[reading.name] = at, groups, about(result)
+        result, least = driven(DISTANCE, reading, tuple(FOUR.items()), min(DISTANCE_WORLDS, settings.episodes))
+        groups = by_distance(result, harms(result, least))
+        readings[reading.name] = groups, about(result)
         claims = {
             "non-ethical: the larger the distance, the larger the harm": [
                 Less.of_lists(f"{one} to {other}", groups[one][NON_ETHICAL], groups[other][NON_ETHICAL])
@@ -117,8 +112,8 @@ def reproduce_distance(settings: Settings) -> Made:
             for name in BASELINES
         }
         verdicts += [judge_statement(f"{claim} ({reading.name})", parts) for claim, parts in claims.items()]
-    figure, sheets = over_distance("harm-distance", curves, [*FOUR, PREDICTED, PROVEN])
-    return Made(verdicts, sheets, [figure], notes=[POLICIES])
+    shown = over_distance("harm-distance", readings, [*FOUR, PREDICTED, PROVEN])
+    return shown._replace(verdicts=verdicts, notes=[POLICIES])
 
 
 DELAYS = ("low", "middle", "high")
@@ -129,43 +124,37 @@ STATE = {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}
 
 def reproduce_delays(settings: Settings) -> Made:
     """Reproduce the figure of harm at three delays: in its single world, and over random worlds beside it."""
-    verdicts, figures, sheets = [], [], []
-    for worlds, changes, episodes, stem in (
-        (ONE, STATE, 1, "world"),
-        (LIST, {}, min(DELAY_WORLDS, settings.episodes), "list"),
-    ):
-        panels = {}
+    verdicts, figures, sheets = list[Verdict](), [], list[Sheet]()
+    many = min(DELAY_WORLDS, settings.episodes)
+    for worlds, changes, episodes, stem in ((ONE, STATE, 1, "world"), (LIST, {}, many, "list")):
+        readings: dict[str, tuple[Groups, str]] = {}
         for reading in READINGS:
-            groups: dict[str, dict[str, Floats]] = {}
+            groups = {}
             for delay in DELAYS:
                 scenario = reading.scenario(f"paper-delay-{delay}", **changes)
                 result = drive(scenario, FOUR, episodes)
                 _, middle, rear = scenario.model_dump()["latency_s"]
-                groups[f"{delay} ({middle:g}, {rear:g} s)"] = harms(result, scenario)
-            where = f"{worlds}; {reading.name}"
-            panels[reading.name] = {
-                name: {at: mean(harm[name]) for at, harm in zip(DELAYS, groups.values(), strict=True)}
-                for name in next(iter(groups.values()))
-            }
-            sheets.append(harm_sheet(where, groups, "one world has no interval." if episodes == 1 else about(result)))
+                groups[f"{delay} ({middle:g}, {rear:g} s)"] = harms(result, least_harm(scenario, episodes))
+            readings[reading.name] = groups, "one world has no interval." if episodes == 1 else about(result)
             verdicts += [  # "consistently achieve the lowest harm values across all tested delay setting"
                 judge_statement(
-                    f"{policy} harms less than non-ethical and E-V2X-BM at every delay ({where})",
+                    f"{policy} harms less than non-ethical and E-V2X-BM at every delay ({worlds}; {reading.name})",
                     less_in_each(groups, policy, NON_ETHICAL, *BASELINES),
                 )
                 for policy in (SAC, PPO)
             ]
-        caption = f"{worlds}. Low, middle, high: τ3 = 0.3, 0.6, 1.2 s; left τ2 = 0.1, 0.3, 0.8 s. Bars: 95 % intervals."
-        text = f"Harm of each strategy at three delays, {worlds}."
-        figure = estimates_figure(panels, HARM_TITLE, caption)
-        figures.append(Drawn(f"harm-delays-{stem}", "Harm at three delays", text, figure))
+        lines = [*FOUR, PREDICTED, PROVEN]
+        x_label = "Delay (τ2, τ3)"
+        figure, own = show_harm(f"harm-delays-{stem}", worlds, readings, lines, x_label)
+        figures.append(figure)
+        sheets += own
     note = f"The delays are our choice. {POLICIES} They were not trained at these delays."
     return Made(verdicts, sheets, figures, notes=[note])
 
 
-def drive_hybrid(name: str, settings: Settings, reading: Reading) -> Result:
+def drive_hybrid(name: str, settings: Settings, reading: Reading) -> tuple[Result, Floats]:
     """Let E-V2X-BM, a policy that has not converged, and Algorithm 1 with both H* drive. Figure and table share it."""
-    policy = unconverged(settings)
+    policy = unconverged(settings.folder)
     agents = {
         REALISED: FOUR[REALISED],
         COUPLED: FOUR[COUPLED],
@@ -173,17 +162,17 @@ def drive_hybrid(name: str, settings: Settings, reading: Reading) -> Result:
         HYBRID_REALISED: f"{policy}+episode",
         HYBRID_PREDICTED: f"{policy}+episode:pairwise",
     }
-    return driven(name, reading, agents, min(DISTANCE_WORLDS, settings.episodes))
+    return driven(name, reading, tuple(agents.items()), min(DISTANCE_WORLDS, settings.episodes))
 
 
 def reproduce_illustration(settings: Settings) -> Made:
     """Reproduce the illustration of the hybrid, which "consistently selects the strategy [of] lower harm"."""
-    curves, verdicts = {}, []
+    readings, verdicts = {}, []
     for reading in READINGS:
-        result = drive_hybrid(DISTANCE, settings, reading)
-        harm = harms(result, reading.scenario(DISTANCE))
-        at, groups = by_distance(result, harm)
-        curves[reading.name] = at, groups, about(result)
+        result, least = drive_hybrid(DISTANCE, settings, reading)
+        harm = harms(result, least)
+        groups = by_distance(result, harm)
+        readings[reading.name] = groups, about(result)
         for name, baseline in ((HYBRID_REALISED, COUPLED), (HYBRID_PREDICTED, REALISED)):
             lower = np.minimum(harm[ALONE], harm[baseline])
             worse = harm[name] > lower + 1e-9
@@ -195,7 +184,7 @@ def reproduce_illustration(settings: Settings) -> Made:
             verdicts.append(Verdict(what, "differs" if worse.any() else "agrees", because))
         for other in (ALONE, COUPLED):
             what = f"the {HYBRID_REALISED} harms no more than {other} at every distance ({reading.name})"
-            verdicts.append(judge_statement(what, less_in_each(groups, HYBRID_REALISED, other), or_equal=True))
+            parts = less_in_each(groups, HYBRID_REALISED, other)
+            verdicts.append(judge_statement(what, parts, or_equal=True))
     lines = [REALISED, COUPLED, ALONE, HYBRID_REALISED, HYBRID_PREDICTED, PREDICTED]
-    figure, sheets = over_distance("hybrid-illustration", curves, lines)
-    return Made(verdicts, sheets, [figure])
+    return over_distance("hybrid-illustration", readings, lines)._replace(verdicts=verdicts)

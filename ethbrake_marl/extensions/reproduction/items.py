@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
@@ -11,18 +10,16 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl import __version__
-from ethbrake_marl.errors import InvalidInput, count_of, unknown_name
+from ethbrake_marl.errors import count_of, unknown_name
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.reproduction.curves import reproduce_delays, reproduce_distance, reproduce_illustration
-from ethbrake_marl.extensions.reproduction.learning import reproduce_curves
+from ethbrake_marl.extensions.reproduction.learning import HIGH, LOW, STOPPED, reproduce_curves, seconds_left, train
 from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Item, Made, Settings
 from ethbrake_marl.extensions.reproduction.register import reproduce_gaps
 from ethbrake_marl.extensions.reproduction.tables import reproduce_hybrid_table, reproduce_random_table
-from ethbrake_marl.extensions.reproduction.trainings import HIGH, LOW, STOPPED, seconds_left, train
 from ethbrake_marl.extensions.reproduction.trajectories import reproduce_accelerations, reproduce_trajectories
-from ethbrake_marl.extensions.studies.folder import StudyFolder
 from ethbrake_marl.files.sheet import Sheet
-from ethbrake_marl.files.store import write_file, write_output
+from ethbrake_marl.files.store import check_folder, write_output
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.progress import Progress
 
@@ -75,7 +72,7 @@ ITEMS = (
     ),
 )  # fmt: skip
 
-RECORD, PAGE = "reproduction.json", "README.md"
+PAGE = "README.md"
 
 PAPER = "*How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning*"
 
@@ -83,14 +80,12 @@ PAPER = "*How to Brake? Ethical Emergency Braking with Deep Reinforcement Learni
 def choose_items(names: Sequence[str]) -> list[Item]:
     """Return the items of these names in the order of the paper; all, if there are none.
 
-    Raises ``UnknownName``, and ``InvalidInput`` for a name that is given twice.
+    Raises ``UnknownName``.
     """
     known = {item.name: item for item in ITEMS}
-    for k, name in enumerate(names):
+    for name in names:
         if name not in known:
             raise unknown_name("item", name, known)
-        if name in names[:k]:
-            raise InvalidInput(f"item {name!r} is given twice; give each item only once")
     return [item for item in ITEMS if not names or item.name in names]
 
 
@@ -113,34 +108,20 @@ def reproduce(
 ) -> dict[Item, Made] | None:
     """Train what is missing, make the items, and write page, figures and tables. None: Ctrl-C stopped a training.
 
-    The folder may have results of the same settings, which are replaced; with ``force``, of others. Trainings stay.
-    Raises ``InvalidInput`` for a folder with other settings, and ``AlreadyExists`` for one with other files.
+    Raises ``AlreadyExists`` if the folder has results, unless ``force`` is true. Trainings in the folder are used.
     """
-    folder = settings.folder
-    question = {"format": "ethbrake-reproduction", "episodes": settings.episodes, "version": __version__}
-    if force and (folder / RECORD).is_file():
-        write_file(folder / RECORD, json.dumps(question, indent=2).encode())
-    study = StudyFolder(
-        folder,
-        "a reproduction",
-        question,
-        record=RECORD,
-        advice="give another folder (--output), or replace its results (--force)",
-        beside=("trainings", PAGE, *(item.name for item in ITEMS)),
-        writes=(PAGE,),
-    )
-    with study.work():
-        if not train(settings, groups_of(settings, items)):
-            return None
-        results = {}
-        for number, item in enumerate(items):
-            settings.tell(Progress(f"items: {item.name}", number, len(items)))
-            results[item] = made = item.make(settings)
-            write_item(folder / item.name, made)
-        today = datetime.now(UTC).date().isoformat()
-        made_by = f"`{command(settings, items)}` on {today} ({machine}; physics {physics_digest()})"
-        write_output(folder / PAGE, page(made_by, results).encode(), force=True)
-        return results
+    folder, results = settings.folder, {}
+    check_folder(folder, (PAGE,), force=force)
+    if not train(settings, groups_of(settings, items)):
+        return None
+    for number, item in enumerate(items):
+        settings.tell(Progress(f"items: {item.name}", number, len(items)))
+        results[item] = made = item.make(settings)
+        write_item(folder / item.name, made)
+    today = datetime.now(UTC).date().isoformat()
+    made_by = f"`{command(settings, items)}` on {today} ({machine}; physics {physics_digest()})"
+    write_output(folder / PAGE, page(made_by, results).encode(), force=True)
+    return results
 
 
 def command(settings: Settings, items: Sequence[Item]) -> str:
@@ -152,7 +133,7 @@ def command(settings: Settings, items: Sequence[Item]) -> str:
 
 def write_item(place: Path, made: Made) -> None:
     """Write figures as SVG and PDF, tables as CSV and LaTeX."""
-    place.mkdir(exist_ok=True)
+    place.mkdir(parents=True, exist_ok=True)
     for drawn in made.figures:
         for ending in (".svg", ".pdf"):
             write_picture(place / f"{drawn.stem}{ending}", drawn.figure, force=True)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,8 +44,7 @@ ABOUT_BASELINE = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(NamedTuple):
     """A reading of the paper's text: the time from which Vehicle 2 acts."""
 
     name: str
@@ -84,34 +81,25 @@ def drive(
         return evaluate(worlds, teams, game, chosen, about=about_scenario(loaded, seed))
 
 
+def least_harm(scenario: Scenario, episodes: int) -> Floats:
+    """Return a lower bound that is proven for every strategy, in the first worlds of the list, [n] m2/s2."""
+    worlds = scenario.sample(episodes, SEED)
+    return lower_bound(worlds, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm
+
+
 @cache
-def _driven(name: str, reading: Reading, agents: tuple[tuple[str, str], ...], episodes: int) -> Result:
-    return drive(reading.scenario(name), dict(agents), episodes)
+def driven(name: str, reading: Reading, agents: tuple[tuple[str, str], ...], episodes: int) -> tuple[Result, Floats]:
+    """Return what agents do in a shipped scenario, and the least possible harm. Items share what is the same.
 
-
-def driven(name: str, reading: Reading, agents: Mapping[str, str], episodes: int) -> Result:
-    """Return what agents do in a shipped scenario. Items that show the same worlds share the result."""
-    return _driven(name, reading, tuple(agents.items()), episodes)
-
-
-def harms(result: Result, scenario: Scenario) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy in the first worlds of its scenario, [n] m2/s2.
-
-    With it stand what E-V2X-BM predicts, where it drives, and a bound that is proven for every strategy.
+    ``agents`` are pairs of a name in tables and a spec.
     """
+    scenario = reading.scenario(name)
+    return drive(scenario, dict(agents), episodes), least_harm(scenario, episodes)
+
+
+def harms(result: Result, least: Floats) -> dict[str, Floats]:
+    """Return the first-impact harm of each strategy, what E-V2X-BM predicts, and the least possible, [n] m2/s2."""
     each = {name: columns["first_impact_harm"] for name, columns in result.columns.items()}
     if REALISED in result.columns:
         each[PREDICTED] = result[REALISED]["predicted_harm"]
-    return each | {PROVEN: least_harm(scenario, result.n)}
-
-
-def least_harm(scenario: Scenario, episodes: int) -> Floats:
-    """Return a lower bound that is proven for every strategy, in the first worlds of the list, [n] m2/s2."""
-    return _least_harm(json.dumps(scenario.declared()), episodes)
-
-
-@cache
-def _least_harm(content: str, episodes: int) -> Floats:
-    scenario = load_scenario(json.loads(content))
-    worlds = scenario.sample(episodes, SEED)
-    return lower_bound(worlds, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm
+    return each | {PROVEN: least}

@@ -9,8 +9,8 @@ from typing import Any
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
-from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings, about
+from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
+from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
 from ethbrake_marl.extensions.reproduction.readings import COUPLED, FOUR, NON_ETHICAL, PPO, RANDOM, REALISED, drive
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT, Verdict, compare_number
 from ethbrake_marl.files.sheet import Column, Sheet
@@ -20,8 +20,6 @@ from ethbrake_marl.worlds.catalogue import load_scenario
 
 WORLDS = 2_000
 SHOWN = (NON_ETHICAL, REALISED, COUPLED, PPO)
-ORDER = (PPO, COUPLED, NON_ETHICAL)  # from little harm to much
-HARMS = {"first": "first_impact_harm", "total": "total_harm", "sampled": "sampled_harm"}  # count -> column
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,7 @@ class Alternative:
     value: str
     changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario
     seed: int = SEED
-    count: str = "first"  # a key of HARMS, or ``predicted``: what E-V2X-BM expects
+    count: str = "first_impact"  # ``total``, ``sampled``, or ``predicted``: what E-V2X-BM expects
     ppo: str = FOUR[PPO]  # what drives as PPO
 
 
@@ -103,55 +101,56 @@ def measure(alternative: Alternative, episodes: int) -> tuple[Result, dict[str, 
     """
     scenario = load_scenario(RANDOM).replace(**alternative.changes)
     agents = {name: FOUR[name] for name in SHOWN} | {PPO: alternative.ppo}
-    measures = ["sampled_harm"] if alternative.count == "sampled" else []
-    result = drive(scenario, agents, episodes, alternative.seed, measures)
-    harm = {name: result[name][HARMS.get(alternative.count, HARMS["first"])] for name in SHOWN}
-    if alternative.count == "predicted":
-        harm[REALISED] = result[REALISED]["predicted_harm"]
+    result = drive(scenario, agents, episodes, alternative.seed, ["sampled_harm"])
+    harm = {}
+    for name, columns in result.columns.items():
+        harm[name] = columns.get(f"{alternative.count}_harm", columns["first_impact_harm"])
     return result, harm
 
 
 def reproduce_gaps(settings: Settings) -> Made:
     """Measure every alternative of the register."""
-    asked = [(gap, each) for gap in GAPS for each in gap.alternatives]
-    measured = []
-    for number, (gap, each) in enumerate([(DEFAULTS, Alternative("")), *asked]):
-        settings.tell(Progress("open quantities", number, len(asked) + 1))
-        measured.append((gap, each, *measure(each, min(WORLDS, settings.episodes))))
-    base, *_ = measured
-    others = {f"{gap.name}: {each.value}": harm for gap, each, _, harm in measured[1:]}
-    printed = {row.agent: row.average_harm for row in PAPER_ROWS if row.table == "random test"}
+    episodes = min(WORLDS, settings.episodes)
+    asked = [(DEFAULTS, Alternative("")), *((gap, each) for gap in GAPS for each in gap.alternatives)]
+    rows, harms = [], dict[str, dict[str, Floats]]()
+    for number, (gap, each) in enumerate(asked):
+        settings.tell(Progress("open quantities", number, len(asked)))
+        result, harm = measure(each, episodes)
+        harms[f"{gap.name}: {each.value}"] = harm
+        rates = (rate(columns["collided"]).value for columns in result.columns.values())
+        rows.append((gap.name, each.value, *map(mean, harm.values()), *rates))
+    base, *others = harms.values()
+    printed = {row.agent: row.average_harm for row in RANDOM_TEST}
     verdicts = [
         compare_number(
             f"{agent}, average harm of Table:Random, one open quantity changed at a time",
             printed[agent],
-            mean(base[3][name]),
-            others={row: mean(harm[name]) for row, harm in others.items()},
+            mean(base[name]),
+            others={row: mean(harm[name]) for row, harm in harms.items() if harm is not base},
         )
         for agent, name in (("Non-E", NON_ETHICAL), ("E-V2X-BM", REALISED), ("Hybrid PPO", PPO))
     ]
-    means = {row: [float(harm[name].mean()) for name in ORDER] for row, harm in others.items()}
-    broken = [row for row, each in means.items() if each != sorted(each)]
-    stays = (
-        f"in {len(means) - len(broken)} of {len(means)} alternatives{'; not with ' * bool(broken)}{'; '.join(broken)}"
+    broken = [
+        row
+        for row, harm in harms.items()
+        if harm is not base and not harm[PPO].mean() <= harm[COUPLED].mean() <= harm[NON_ETHICAL].mean()
+    ]
+    stays = f"in {len(others) - len(broken)} of {len(others)} alternatives"
+    verdicts.append(
+        Verdict(
+            f"the order stays: {PPO} < {COUPLED} < {NON_ETHICAL}",
+            "differs" if broken else "agrees",
+            f"{stays}; not with {'; '.join(broken)}" if broken else stays,
+        )
     )
-    verdicts.append(Verdict(f"the order stays: {' < '.join(ORDER)}", "differs" if broken else "agrees", stays))
     register = [
         (gap.name, gap.paper, gap.ours, "; ".join(each.value for each in gap.alternatives) or gap.otherwise)
         for gap in GAPS
     ]
-    rows = [
-        (
-            *(gap.name, each.value),
-            *(mean(harm[name]) for name in SHOWN),
-            *(rate(result[name]["collided"]).value for name in SHOWN),
-        )
-        for gap, each, result, harm in measured
-    ]
-    rates = [replace(PERCENT, heading=f"Collisions, {name}") for name in SHOWN]
+    collisions = [replace(PERCENT, heading=f"Collisions, {name}") for name in SHOWN]
     note = (
-        f"{about(base[2])} Mean harm (m²/s²) with its 95 % interval, then the collision rate. In the rows of H* inside"
-        f" the hybrid, PPO stands behind Algorithm 1. {POLICIES} They are not trained anew for an alternative."
+        f"{episodes:,} worlds. Mean harm (m²/s²) with its 95 % interval, then the collision rate. In the rows of H*"
+        f" inside the hybrid, PPO stands behind Algorithm 1. {POLICIES} They are not trained anew for an alternative."
     )
     sheets = [
         Sheet(
@@ -160,6 +159,6 @@ def reproduce_gaps(settings: Settings) -> Made:
             register,
             "Labels are those of the paper's source.",
         ),
-        Sheet("The random test with other values", ("Quantity", "Value", *map(Column, SHOWN), *rates), rows, note),
+        Sheet("The random test with other values", ("Quantity", "Value", *map(Column, SHOWN), *collisions), rows, note),
     ]
     return Made(verdicts, sheets)

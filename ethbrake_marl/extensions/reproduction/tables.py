@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import chain
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.statistics import decrease, mean, rate
-from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS, PaperRow
+from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow, printed_sheet
 from ethbrake_marl.extensions.reproduction.curves import ALONE, HYBRID_PREDICTED, HYBRID_REALISED, drive_hybrid
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings, about
 from ethbrake_marl.extensions.reproduction.readings import (
@@ -17,13 +16,10 @@ from ethbrake_marl.extensions.reproduction.readings import (
     DISTANCE,
     FOUR,
     NON_ETHICAL,
-    PREDICTED,
     RANDOM,
     READINGS,
     REALISED,
-    Reading,
     driven,
-    least_harm,
 )
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT, Verdict, compare_number
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
@@ -39,80 +35,61 @@ COLUMNS: Mapping[str, Column] = {
     EXPECTED: Column("Predicted harm", "predicted_harm"),
     DECREASE: replace(PERCENT, heading="Harm decrease", key="harm_decrease"),
 }
+MAY_MEAN = {AVERAGE: (AVERAGE, EXPECTED, TOTAL)}  # a printed quantity -> ours that it may mean; the first is compared
 
 NOBODY = "least possible (proven)"
 UNDERCUT = {RATE: "worlds in which no command avoids an impact", AVERAGE: "harm that no command undercuts"}
 
 Numbers = Mapping[str, Mapping[str, Estimate]]  # strategy -> quantity -> ours
+Meant = Mapping[str, Sequence[str]]  # row of the paper -> our strategies that it may mean; the first is compared
 
 
 def numbers_of(result: Result, least: Floats) -> Numbers:
     """Return our numbers. ``least`` [n] is a proven lower bound of the harm in each world, which becomes a row."""
-    numbers, braking = {}, result.columns.get(NON_ETHICAL)
+    numbers, braking = dict[str, dict[str, Estimate]](), result.columns.get(NON_ETHICAL)
     for name, columns in result.columns.items():
         harm, expected = columns["first_impact_harm"], columns.get("predicted_harm", columns.get("expected_harm"))
-        own = {
-            RATE: rate(columns["collided"]),
-            AVERAGE: mean(harm),
-            TOTAL: mean(columns["total_harm"]),
-            EXPECTED: None if expected is None else mean(expected),
-            DECREASE: None if braking is None else decrease(harm, braking["first_impact_harm"]),
-        }
-        numbers[name] = {quantity: each for quantity, each in own.items() if each is not None}
+        numbers[name] = own = {RATE: rate(columns["collided"]), AVERAGE: mean(harm), TOTAL: mean(columns["total_harm"])}
+        if expected is not None:
+            own[EXPECTED] = mean(expected)
+        if braking is not None and (saved := decrease(harm, braking["first_impact_harm"])) is not None:
+            own[DECREASE] = saved
     return {**numbers, NOBODY: {RATE: rate(least > 0.0), AVERAGE: mean(least), TOTAL: mean(least)}}
 
 
-@dataclass(frozen=True)
-class Beside:
-    """Our numbers under one reading."""
-
-    title: str  # the reading
-    worlds: int
-    numbers: Numbers = field(repr=False)
-    ours: Mapping[str, Sequence[str]]  # row of the paper -> our strategies that it may mean; the first is compared
-
-    def sheet(self) -> Sheet:
-        """Return our numbers as a table."""
-        shown = {name: each for name, each in COLUMNS.items() if any(name in own for own in self.numbers.values())}
-        rows = [(name, *map(own.get, shown)) for name, own in self.numbers.items()]
-        note = f"{self.worlds:,} worlds; 95 % intervals; harm in m²/s². {ABOUT_BASELINE}"
-        return Sheet(self.title, ("Strategy", *shown.values()), rows, note)
-
-    def candidates(self, row: str, quantity: str) -> Iterator[tuple[str, Estimate]]:
-        """Yield our numbers that a printed one may mean, with their names; the first is compared with it."""
-        for name in self.ours[row]:
-            own = self.numbers[name]
-            if quantity in own:
-                yield f"{name} ({self.title})", own[quantity]
-            if quantity == AVERAGE and name == REALISED:
-                yield f"{PREDICTED} ({self.title})", own[EXPECTED]
-        if quantity == AVERAGE:
-            for name in self.ours[row]:
-                yield f"{name}, total harm ({self.title})", self.numbers[name][TOTAL]
+def numbers_sheet(title: str, numbers: Numbers, worlds: int) -> Sheet:
+    """Return our numbers under one reading as a table."""
+    rows = [(name, *map(own.get, COLUMNS)) for name, own in numbers.items()]
+    note = f"{worlds:,} worlds; 95 % intervals; harm in m²/s². {ABOUT_BASELINE}"
+    sheet = Sheet(title, ("Strategy", *COLUMNS.values()), rows, note)
+    return sheet.only(sheet.filled())
 
 
-def compare_rows(printed: Sequence[PaperRow], besides: Sequence[Beside]) -> list[Verdict]:
+def compare_rows(printed: Sequence[PaperRow], readings: Mapping[str, Numbers], ours: Meant) -> list[Verdict]:
     """Compare every number that the paper prints with ours, under each reading."""
     verdicts = []
-    for beside in besides:
-        least = beside.numbers.get(NOBODY, {})
+    for reading, numbers in readings.items():
         for row in printed:
-            numbers = {RATE: row.collision_rate, AVERAGE: row.average_harm, DECREASE: row.harm_decrease}
-            for quantity, number in numbers.items():
+            stated = {RATE: row.collision_rate, AVERAGE: row.average_harm, DECREASE: row.harm_decrease}
+            for quantity, number in stated.items():
                 if not number:  # not printed, or the decrease of the baseline itself
                     continue
-                (_, ours), *own = beside.candidates(row.agent, quantity)
-                others = [other.candidates(row.agent, quantity) for other in besides if other is not beside]
+                strategy, least = ours[row.agent][0], numbers[NOBODY].get(quantity)
+                others = {
+                    f"{name}, {meant} ({title})": every[name][meant]
+                    for title, every in readings.items()
+                    for name in ours[row.agent]
+                    for meant in MAY_MEAN.get(quantity, (quantity,))
+                    if meant in every[name] and (title, name, meant) != (reading, strategy, quantity)
+                }
                 verdicts.append(
                     compare_number(
-                        f"{row.agent}, {quantity} ({beside.title})",
+                        f"{row.agent}, {quantity} ({reading})",
                         number,
-                        ours,
+                        numbers[strategy][quantity],
                         show=COLUMNS[quantity],
-                        least=(UNDERCUT[quantity], least[quantity])
-                        if quantity in least and quantity in UNDERCUT
-                        else None,
-                        others=dict([*own, *chain(*others)]),
+                        least=None if least is None else (UNDERCUT[quantity], least),
+                        others=others,
                     )
                 )
     return verdicts
@@ -129,41 +106,29 @@ def selection_verdict(one: PaperRow, other: PaperRow, chosen: PaperRow) -> Verdi
     return Verdict(what, "agrees" if avoided <= first + second else "cannot agree", text)
 
 
-def printed_sheet(printed: Sequence[PaperRow]) -> Sheet:
-    """Return the paper's rows as a table."""
-    columns = ("Strategy", "Collisions", "Rate", "Average harm", "Decrease")
-    rows = [
-        (
-            *(row.agent, f"{row.collisions:,}", f"{100.0 * row.collision_rate:g} %", f"{row.average_harm:g}"),
-            *([] if row.harm_decrease is None else [f"{100.0 * row.harm_decrease:g} %"]),
-        )
-        for row in printed
-    ]
-    return Sheet("The paper's rows, as printed", columns[: len(rows[0])], rows)
-
-
-def beside(title: str, name: str, reading: Reading, result: Result, ours: Mapping[str, Sequence[str]]) -> Beside:
-    """Return our numbers in a shipped scenario under a reading."""
-    return Beside(title, result.n, numbers_of(result, least_harm(reading.scenario(name), result.n)), ours)
+def made_of(printed: tuple[PaperRow, ...], results: Mapping[str, tuple[Result, Floats]], ours: Meant) -> Made:
+    """Return comparisons and tables; ``results`` are ours, and the least harm, by reading."""
+    readings = {reading: numbers_of(*each) for reading, each in results.items()}
+    sheets = [numbers_sheet(reading, numbers, results[reading][0].n) for reading, numbers in readings.items()]
+    notes = [about(result) for result, _ in results.values()]
+    return Made(compare_rows(printed, readings, ours), [printed_sheet(printed), *sheets], notes=notes)
 
 
 def reproduce_hybrid_table(settings: Settings) -> Made:
     """Reproduce the table of 5,000 worlds. The paper does not say at which of its two sets of speeds: we do both."""
     ours = {"E-V2X-BM": (REALISED, COUPLED), "Standalone DRL": (ALONE,), "Hybrid": (HYBRID_PREDICTED, HYBRID_REALISED)}
-    besides, notes = [], []
-    for name, speeds in ((RANDOM, "speeds 18 to 22 m/s"), (DISTANCE, "speeds 20, 18, 20 m/s")):
-        for reading in READINGS:
-            result = drive_hybrid(name, settings, reading)
-            besides.append(beside(f"{speeds}, {reading.name}", name, reading, result, ours))
-            notes.append(about(result))
-    printed = {row.agent: row for row in PAPER_ROWS if row.table == "hybrid test"}
-    verdicts = [selection_verdict(*(printed[agent] for agent in ours)), *compare_rows([*printed.values()], besides)]
+    results = {
+        f"{speeds}, {reading.name}": drive_hybrid(name, settings, reading)
+        for name, speeds in ((RANDOM, "speeds 18 to 22 m/s"), (DISTANCE, "speeds 20, 18, 20 m/s"))
+        for reading in READINGS
+    }
+    made = made_of(HYBRID_TEST, results, ours)
     note = (
         "The paper does not describe its policy that has not converged. The rows of Standalone DRL and Hybrid are of"
         " ours: whether they agree depends on when a training is stopped."
     )
-    sheets = [printed_sheet([*printed.values()]), *(each.sheet() for each in besides)]
-    return Made(verdicts, sheets, notes=[note, *notes])
+    verdicts = [selection_verdict(*HYBRID_TEST), *made.verdicts]
+    return made._replace(verdicts=verdicts, notes=[note, *made.notes])
 
 
 def reproduce_random_table(settings: Settings) -> Made:
@@ -174,11 +139,6 @@ def reproduce_random_table(settings: Settings) -> Made:
         realised, predicted = f"Hybrid {kind}, realised H*", f"Hybrid {kind}, predicted H*"
         agents |= {realised: f"{kind.lower()}+episode", predicted: f"{kind.lower()}+episode:pairwise"}
         ours[f"Hybrid {kind}"] = realised, predicted
-    besides, notes = [], [POLICIES]
-    for reading in READINGS:
-        result = driven(RANDOM, reading, agents, settings.episodes)
-        besides.append(beside(reading.name, RANDOM, reading, result, ours))
-        notes.append(about(result))
-    printed = [row for row in PAPER_ROWS if row.table == "random test"]
-    sheets = [printed_sheet(printed), *(each.sheet() for each in besides)]
-    return Made(compare_rows(printed, besides), sheets, notes=notes)
+    results = {reading.name: driven(RANDOM, reading, tuple(agents.items()), settings.episodes) for reading in READINGS}
+    made = made_of(RANDOM_TEST, results, ours)
+    return made._replace(notes=[POLICIES, *made.notes])

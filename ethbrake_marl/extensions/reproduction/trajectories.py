@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
-from ethbrake_marl.extensions.reproduction.figures import VEHICLE_2, profiles_figure, road_figure
+from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Drawn, Made, Settings
 from ethbrake_marl.extensions.reproduction.readings import COUPLED, FOUR, NON_ETHICAL, PPO, READINGS, SAC, Reading
 from ethbrake_marl.extensions.reproduction.verdicts import Less, Verdict, judge_statement
@@ -20,6 +21,8 @@ from ethbrake_marl.names import open_game, teams_of
 AGENTS = {name: FOUR[name] for name in (PPO, SAC, COUPLED, NON_ETHICAL)}
 DRL = (PPO, SAC)
 SCENARIOS = (1, 2)
+ARROW_S = 1.0  # between arrows: ten steps, as in the paper
+VEHICLE_2 = 1  # column of arrays
 
 Records = dict[tuple[Reading, int, str], EpisodeRecord]  # (reading, number of the scenario, strategy) -> episode
 
@@ -37,6 +40,40 @@ def record_all() -> Records:
     return records
 
 
+@in_our_style
+def road_figure(records: Mapping[str, EpisodeRecord], caption: str) -> Figure:
+    """Draw vehicles along the road in four episodes, as the paper does: a row each, an arrow every second.
+
+    Dashes join equal times.
+    """
+    figure, panels = new_panels((10.0, 4.8), 2, 2, sharex=True, sharey=True)
+    for axes, (title, record) in zip(panels, records.items(), strict=True):
+        vehicles = np.arange(1, record.positions_m.shape[1] + 1)
+        times = np.arange(0.0, record.time_s[-1] + 1e-9, ARROW_S)
+        at = np.array([np.interp(times, record.time_s, column) for column in record.positions_m.T])
+        axes.plot(at, vehicles, color=GREY, linewidth=0.7, linestyle="--")
+        for number, places in zip(vehicles, at, strict=True):
+            axes.plot(places, np.full(len(times), number), marker=">", color=series_style(number)["color"])
+        axes.set(title=title, xlabel="Position along the road (m)", ylabel="Vehicle", yticks=vehicles, ylim=(0.5, 3.5))
+        axes.label_outer()
+    return finish(figure, caption)
+
+
+@in_our_style
+def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], caption: str) -> Figure:
+    """Draw the command of Vehicle 2 over time: title of one of four panels -> label of a curve -> episode."""
+    figure, every = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
+    for axes, (title, records) in zip(every, panels.items(), strict=True):
+        axes.axhline(0.0, color=GREY, linewidth=0.8)
+        for number, (label, record) in enumerate(records.items()):
+            style = {**series_style(number), "marker": ""}
+            command = record.command_mps2[:, VEHICLE_2]
+            axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)
+        axes.set(title=title, xlabel="Time since Vehicle 1 began to brake (s)", ylabel="Command (m/s²)")
+        axes.label_outer()
+    return finish(figure, caption, every[0], columns=4)
+
+
 def reproduce_trajectories(settings: Settings) -> Made:
     """Reproduce the trajectories."""
     records, figures, verdicts = record_all(), [], []
@@ -45,7 +82,7 @@ def reproduce_trajectories(settings: Settings) -> Made:
         text = f"Positions of the vehicles, {reading.name}; an arrow every second, dashed lines join equal times."
         road = road_figure(own, text)
         figures.append(Drawn(f"trajectories-road-{stem}", f"Trajectories, {reading.name}", text, road))
-        one, two = (apart(records, reading, k, "positions_m", VEHICLE_2) for k in SCENARIOS)
+        one, two = (apart(records, reading, k, "positions_m") for k in SCENARIOS)
         ahead, behind = ([float(gap.mean()) for gap in both(records, reading, 2, "gaps_m", k)] for k in (0, 1))
         claims = {
             "Vehicle 2 of PPO and SAC is nearer together in Scenario 1 than in 2": (
@@ -84,7 +121,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
     text = "Command of Vehicle 2 over time, as the paper states the latencies and with Vehicle 2 acting at 0.2 s."
     figure = Drawn("accelerations", "Acceleration profiles", text, profiles_figure(panels, text))
     for reading in READINGS:
-        one, two = (apart(records, reading, k, "command_mps2", VEHICLE_2) for k in SCENARIOS)
+        one, two = (apart(records, reading, k, "command_mps2") for k in SCENARIOS)
         (first, ppo_changes, _), (_, sac_changes, braking) = (asked[reading, 2, name] for name in DRL)
         claims = {
             "the profiles are more alike in Scenario 1 than in 2": (
@@ -118,20 +155,19 @@ def reproduce_accelerations(settings: Settings) -> Made:
     return Made(verdicts, [sheet], [figure])
 
 
-def both(records: Records, reading: Reading, number: int, what: str, column: int) -> tuple[Floats, Floats]:
+def both(records: Records, reading: Reading, number: int, what: str, column: int) -> list[Floats]:
     """Return a recorded quantity under PPO, and under SAC at the same times; an episode that has ended stays as it is.
 
     ``number`` is that of the scenario, ``what`` an attribute of ``EpisodeRecord``, ``column`` a vehicle or pair from 0.
     """
     pair = [records[reading, number, name] for name in DRL]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
-    one, other = (np.interp(times, each.time_s, getattr(each, what)[:, column]) for each in pair)
-    return one, other
+    return [np.interp(times, each.time_s, getattr(each, what)[:, column]) for each in pair]
 
 
-def apart(records: Records, reading: Reading, number: int, what: str, column: int) -> float:
-    """Return the root mean square over time of the difference between PPO and SAC."""
-    one, other = both(records, reading, number, what, column)
+def apart(records: Records, reading: Reading, number: int, what: str) -> float:
+    """Return the root mean square over time of the difference between PPO and SAC, of Vehicle 2."""
+    one, other = both(records, reading, number, what, VEHICLE_2)
     return float(np.sqrt(np.mean((one - other) * (one - other))))
 
 
@@ -151,5 +187,4 @@ def asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
     """
     acting = record.time_s >= float(record.initial.latency_s[0, VEHICLE_2])
     command, moving = record.command_mps2[acting, VEHICLE_2], record.speeds_mps[acting, VEHICLE_2] > 0.0
-    braking = float((command[moving] < 0.0).mean()) if moving.any() else 0.0
-    return float(command[0]), float(np.abs(np.diff(command)).sum()), braking
+    return float(command[0]), float(np.abs(np.diff(command)).sum()), float((command[moving] < 0.0).mean())

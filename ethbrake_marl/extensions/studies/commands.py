@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +9,6 @@ import typer
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, ScenarioOption, SettingsOption, example
 from ethbrake_marl.files.sheet import Sheet, csv_text
-
-REMAINS = "the same command continues the work in this folder"
-
-FolderOption = Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")]
 
 study_group = typer.Typer(
     rich_markup_mode=None,
@@ -96,7 +91,7 @@ def falsify_command(
             "median": float(np.median(good)),
             "worst": float(good.max()),
             "worlds": [{**row, "state": state} for row, state in zip(rows, states, strict=True)],
-            "machine": asdict(this_machine()),
+            "machine": this_machine(),
             "versions": versions(),
         }
         shown = [

@@ -7,7 +7,6 @@ from itertools import islice
 
 import numpy as np
 
-from ethbrake_marl.errors import check_whole_number
 from ethbrake_marl.motion.layout import Floats, Ints
 
 Score = Callable[[Floats], Floats]  # points [n, d] of [0, 1) -> scores [n]; minus infinity: the point is invalid
@@ -22,13 +21,7 @@ _LAST = np.nextafter(1.0, 0.0)
 
 
 def search(
-    score: Score,
-    dimensions: int,
-    budget: int,
-    seed: int,
-    *,
-    adaptive: bool = True,
-    on_round: Callable[[int], None] | None = None,
+    score: Score, dimensions: int, budget: int, seed: int, on_round: Callable[[int], None]
 ) -> tuple[Floats, Floats]:
     """Search the unit cube for points with a high score; return all tried points, [budget, d], and their scores.
 
@@ -43,27 +36,20 @@ def search(
         dimensions: number of coordinates, d.
         budget: number of points to try.
         seed: seed of the random numbers.
-        adaptive: False: all points are uniform random points.
         on_round: called after each round with the number of points tried so far.
 
     """
-    check_whole_number("search: budget", budget, 1)
-    check_whole_number("search: seed", seed, 0)
     rng, spread = np.random.default_rng([seed, dimensions]), _spread(dimensions, seed)
     points, scores = np.empty((0, dimensions)), np.empty(0)
     while len(points) < budget:
         count = min(ROUND, budget - len(points))
-        if adaptive:
-            good = scores[np.isfinite(scores)]
-            above = np.where(scores > np.median(good), scores, -np.inf) if len(good) else scores
-            parents = points[far_apart(points, above, _PARENTS)]
-            steps = int(count * (1.0 - _EXPLORING)) if len(parents) else 0
-            new = np.vstack([_children(parents, steps, rng), *islice(spread, count - steps)])
-        else:
-            new = rng.random((count, dimensions))
+        good = scores[np.isfinite(scores)]
+        above = np.where(scores > np.median(good), scores, -np.inf) if len(good) else scores
+        parents = points[far_apart(points, above, _PARENTS)]
+        steps = int(count * (1.0 - _EXPLORING)) if len(parents) else 0
+        new = np.vstack([_children(parents, steps, rng), *islice(spread, count - steps)])
         points, scores = np.vstack([points, new]), np.concatenate([scores, score(new)])
-        if on_round is not None:
-            on_round(len(points))
+        on_round(len(points))
     return points, scores
 
 

@@ -77,13 +77,7 @@ class Measure(NamedTuple):
         return Measured(harm - reference, harm, reference)
 
     def falsify(
-        self,
-        budget: int,
-        seed: int,
-        *,
-        most: int = 20,
-        adaptive: bool = True,
-        on_round: Callable[[int], None] | None = None,
+        self, budget: int, seed: int, *, most: int = 20, on_round: Callable[[int], None] | None = None
     ) -> tuple[State, Measured, Floats]:
         """Search all worlds that the scenario can draw for those in which the agent does worst.
 
@@ -96,7 +90,6 @@ class Measure(NamedTuple):
             budget: number of worlds to try.
             seed: of the search.
             most: largest number of worlds in the result; any two of them differ clearly.
-            adaptive: False: all worlds are uniform random worlds.
             on_round: called with the number of worlds tried so far.
 
         """
@@ -109,7 +102,7 @@ class Measure(NamedTuple):
                 scores[rows] = self(worlds.take(rows)).score
             return scores
 
-        points, scores = search(score, len(cube.places), budget, seed, adaptive=adaptive, on_round=on_round)
+        points, scores = search(score, len(cube.places), budget, seed, on_round or (lambda done: None))
         if not np.isfinite(scores).any():
             raise InvalidInput(
                 f"scenario {self.scenario.name!r}: in all {budget:,} tried worlds an impact happens before any agent"

@@ -8,8 +8,9 @@ import re
 import pytest
 
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.extensions.report import page as page_module
-from ethbrake_marl.extensions.report.page import Part, Section, read_file
+from ethbrake_marl.extensions.report.harm_figures import SLIM_IN
+from ethbrake_marl.extensions.report.page import Section, data, drawing, part, table, whole_page as page_of
+from ethbrake_marl.extensions.report.style import finish, new_figure
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
 
@@ -18,16 +19,16 @@ def whole_page(text: str) -> str:
     """A page in which the text stands in every place that a text can have."""
     body = [
         text,
-        Part.paragraph(text, "note"),
-        Part.heading(text),
-        Part.table(Sheet(text, [text, text], [[text, Shown(text, text)], text, [text, text]])),
-        Part.table(Sheet("", [text, Column(text)], [[text, text]])),
-        Part.facts({text: text}),
-        Part.remarks([text]),
-        Part.box(text, {text: text}),
-        Part.opened(text, [Part.paragraph(text)]),
+        part("paragraph", text, "note"),
+        table(Sheet(text, [text, text], [[text, Shown(text, text)], text, [text, text]])),
+        table(Sheet("", [text, Column(text)], [[text, text]])),
+        part("facts", {text: text}),
+        part("remarks", [text]),
+        part("box", text, {text: text}),
+        part("folded", text, [part("paragraph", text)]),
+        part("drawing", text, text, "slim", "", text),
     ]
-    return page_module.Page(text, [Section(text, body), Section(text, [text]), Section(text, [])], lead=text).html
+    return page_of(text, text, [part("beside", part("watch", text), "")], [Section("Worst ten worlds", body)])
 
 
 HARMLESS = Page(whole_page("Harmless"))
@@ -39,31 +40,35 @@ def test_page__no_text_becomes_markup(text: str) -> None:
     found = Page(html)
     assert (found.shape, found.open) == (HARMLESS.shape, []) and not set(html) & UNSEEN
     assert " ".join(plain_text(text, keep="\u00a0").split()) in found.text
-    for _, attributes in found.tags:
-        assert (attributes.get("href") or "#").startswith("#")
-        assert not any(name.startswith("on") for name in attributes)
-        assert re.fullmatch(r"[a-z0-9-]+", attributes.get("id") or "x")
+    assert not any(name.startswith("on") for _, attributes in found.tags for name in attributes)
 
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_data__stays_data(text: str) -> None:
-    html = str(Part.data("x", {text: [text, 1.5, None]}).html)
+    html = str(data("x", {text: [text, 1.5, None]}))
     inner = html.removeprefix('<script type="application/json" id="x">').removesuffix("</script>\n")
     assert inner.isascii() and not set("<>&") & set(inner)
     assert json.loads(inner) == {text: [text, 1.5, None]}
 
 
-def test_page__names_no_two_sections_alike() -> None:
-    ids = [attributes["id"] for tag, attributes in Page(whole_page("Results!")).tags if tag == "section"]
-    assert ids == ["results", "results-2", "results-3"]
-
-
 def test_page__allows_its_own_style_and_script_alone() -> None:
     html = whole_page("x")
-    style = re.search(r"<style>(.*?)</style>", html, re.DOTALL)
-    assert style is not None and style[1] == read_file("page.css")
-    sha = base64.b64encode(hashlib.sha256(style[1].encode()).digest()).decode()
-    policy = next(attributes["content"] for _, attributes in Page(html).tags if "http-equiv" in attributes)
-    assert f"style-src 'sha256-{sha}'" in policy
-    assert "default-src 'none'" in policy and "script-src 'none'" in policy
+    policy = next(attributes["content"] for _, attributes in HARMLESS.tags if "http-equiv" in attributes)
+    for kind in ("style", "script"):
+        (text,) = re.findall(f"<{kind}>(.*?)</{kind}>", html, re.DOTALL)
+        sha = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{kind}-src 'sha256-{sha}';" in policy and len(text) > 1000
+    assert "default-src 'none'" in policy
     assert " style=" not in html and "url(" not in html and "@import" not in html
+    ids = [attributes["id"] for tag, attributes in HARMLESS.tags if tag == "section"]
+    assert ids == ["worst-ten-worlds"] and 'href="#worst-ten-worlds"' in html
+
+
+@pytest.mark.parametrize(("width_in", "kind"), [(SLIM_IN, "slim"), (5.0, ""), (10.0, "broad")])
+def test_drawing__is_as_wide_as_a_phone_shows_it_and_its_caption_is_text(width_in: float, kind: str) -> None:
+    figure = finish(new_figure(width_in, 1.0), "A long caption, " * 9)
+    html = str(drawing(figure, "Title", "words"))
+    (picture,) = (attributes for tag, attributes in Page(html).tags if tag == "img")
+    assert picture["class"] == kind and picture["alt"] == "Title. words"
+    assert "A long caption, A long caption" in Page(html).text and figure.get_supxlabel() == ""
+    assert base64.b64decode(picture["src"].removeprefix("data:image/svg+xml;base64,")).startswith(b"<?xml")

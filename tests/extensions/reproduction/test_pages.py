@@ -9,7 +9,6 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.extensions.report.paper_rows import PAPER_ROWS
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.readings import NON_ETHICAL, READINGS, drive
@@ -46,27 +45,18 @@ def committed(heading: str, agent: str) -> list[str]:
     return [cell.split(" [")[0] for cell in row[1:]]
 
 
-def test_results__the_5000_worlds_cannot_come_from_the_speeds_of_the_figure_of_distances() -> None:
-    printed = next(row for row in PAPER_ROWS if row.table == "hybrid test" and row.agent == "E-V2X-BM").average_harm
-    at_figure, at_random = (
-        pairwise(eb.load_scenario(name).sample(5_000, 7), 2).harm.mean() for name in ("paper-distance", "paper-random")
-    )
-    assert (f"{at_figure:.2f}", f"{at_random:.2f}") == ("3.07", "9.38") and printed > 3.0 * at_figure
-    for heading, cells in {"### Speeds 20, 18, 20 m/s, as stated": ("67.7 %", "12.88", "3.07"),
-                           "### Speeds 18 to 22 m/s, as stated": ("65.5 %", "19.13", "9.38")}.items():  # fmt: skip
-        row = committed(heading, "E-V2X-BM, realised")
-        assert [row[column] for column in (0, 1, 3)] == list(cells)
-
-
-def test_results__full_braking_is_as_committed() -> None:
-    agents = {NON_ETHICAL: "full_brake"}
+def test_results__are_as_committed() -> None:
+    for name, heading, predicted in (("paper-distance", "### Speeds 20, 18, 20 m/s, as stated", "3.07"),
+                                     ("paper-random", "### Speeds 18 to 22 m/s, as stated", "9.38")):  # fmt: skip
+        assert f"{pairwise(eb.load_scenario(name).sample(5_000, 7), 2).harm.mean():.2f}" == predicted
+        assert committed(heading, "E-V2X-BM, realised")[3] == predicted
     for reading, heading in zip(READINGS, ("### As stated", "### Vehicle 2 acts at 0.2 s"), strict=True):
-        own = drive(reading.scenario("paper-random"), agents, 10_000)[NON_ETHICAL]
+        own = drive(reading.scenario("paper-random"), {NON_ETHICAL: "full_brake"}, 10_000)[NON_ETHICAL]
         told = PERCENT.show(rate(own["collided"])).value, f"{mean(own['first_impact_harm']).value:.2f}"
         assert tuple(committed(heading, NON_ETHICAL)[:2]) == told
     scenario = eb.load_scenario("paper-distance")
     groups = np.digitize(scenario.sample(5_000, 7).gaps_m.sum(axis=1), (12.0, 14.0, 16.0, 18.0))
-    harm = drive(scenario, agents, 5_000)[NON_ETHICAL]["first_impact_harm"]
+    harm = drive(scenario, {NON_ETHICAL: "full_brake"}, 5_000)[NON_ETHICAL]["first_impact_harm"]
     told = committed("### Harm by total distance, as stated", NON_ETHICAL)
     assert told == [f"{harm[groups == group].mean():.2f}" for group in range(5)]
 

@@ -40,14 +40,12 @@ def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds() -> None:
     assert in_hole(worlds).all() and worlds.n >= 3
     assert (np.diff(measured.score) <= 0.0).all() and measured.score[-1] > 0.0
     assert (measured.score == measured.harm - measured.reference).all()
-    at_random = measure.falsify(4_000, 0, adaptive=False)
-    assert (scores > 0.0).mean() > 20.0 * (at_random[2] > 0.0).mean()
-    assert measured.score[0] > 0.98 * at_random[1].score[0]
+    at_random = measure(SCENARIO.sample(4_000, 3)).score
+    assert (scores > 0.0).mean() > 20.0 * (at_random > 0.0).mean() and measured.score[0] > 0.98 * at_random.max()
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
-def test_bound__of_the_shield_holds_where_it_is_tightest(count: str) -> None:
-    measure = Measure.of("bound", "coast+step", None, SCENARIO, count)
+def test_bound__of_the_shield_holds_where_it_is_tightest() -> None:
+    measure = Measure.of("bound", "coast+step", None, SCENARIO, "total")
     worlds, measured, _ = measure.falsify(256, 1)
     assert measured.score.max() <= 0.0 and worlds.n > 3 and measured.harm.max() > 0.0
     listed = SCENARIO.sample(200, 3)
@@ -63,10 +61,7 @@ def test_harm__is_the_score_that_an_evaluation_gives() -> None:
     assert (result["full_brake"]["total_harm"] == measured.harm).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "coordinates"),
-    [("paper-random", 5), ("stress-wide", 18), ("realistic-mixed", 17), ("cooperation-2-five", 9)],
-)
+@pytest.mark.parametrize(("name", "coordinates"), [("paper-random", 5), ("stress-wide", 18), ("realistic-mixed", 17)])
 def test_cube__points_are_as_likely_as_a_list(name: str, coordinates: int) -> None:
     """Worlds of even points have the means and spreads of a list, in every quantity."""
     scenario = eb.load_scenario(name).replace(early_impacts="keep")
@@ -91,13 +86,12 @@ def test_cube__rejects_what_the_scenario_rejects() -> None:
     assert np.array_equal(accepted, ~early)
 
 
-def peak(points: Floats) -> Floats:
-    return -np.abs(points - 0.7).sum(axis=1)
-
-
 def test_search__climbs_a_peak_that_random_points_stay_away_from() -> None:
-    adaptive, at_random = (search(peak, 6, 2_000, 3, adaptive=how)[1].max() for how in (True, False))
-    assert adaptive > 0.6 * at_random
+    def peak(points: Floats) -> Floats:
+        return -np.abs(points - 0.7).sum(axis=1)
+
+    found = search(peak, 6, 2_000, 3, lambda done: None)[1].max()
+    assert found > 0.6 * peak(np.random.default_rng(0).random((2_000, 6))).max()
 
 
 def test_search__finds_several_peaks_that_are_apart_and_is_repeated_to_the_bit() -> None:
@@ -106,7 +100,7 @@ def test_search__finds_several_peaks_that_are_apart_and_is_repeated_to_the_bit()
     def hills(points: Floats) -> Floats:
         return -np.abs(points[:, np.newaxis] - centres).max(axis=2).min(axis=1)
 
-    points, scores = search(hills, 3, 1_500, 0)
+    points, scores = search(hills, 3, 1_500, 0, lambda done: None)
     rows = far_apart(points, scores, 3)
     nearest = np.abs(points[rows][:, np.newaxis] - centres).max(axis=2)
     assert sorted(nearest.argmin(axis=1)) == [0, 1, 2] and (nearest.min(axis=1) < 0.04).all()
@@ -114,7 +108,7 @@ def test_search__finds_several_peaks_that_are_apart_and_is_repeated_to_the_bit()
     for k, point in enumerate(chosen):
         assert (np.abs(np.delete(chosen, k, axis=0) - point).max(axis=1) >= APART).all()
     assert ((points > 0.0) & (points < np.nextafter(1.0, 0.0))).all()  # reflected at the faces, not cut off there
-    again = search(hills, 3, 1_500, 0)
+    again = search(hills, 3, 1_500, 0, lambda done: None)
     assert again[0].tobytes() == points.tobytes()
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.extensions.report.harm_figures import harm_against_total_gap
-from ethbrake_marl.extensions.report.page import Part
+from ethbrake_marl.extensions.report.page import drawing
 from ethbrake_marl.extensions.report.report import Report
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -67,7 +67,7 @@ def wait_until(page: Any, condition: str) -> None:
 @pytest.fixture(scope="session")
 def report_file(compared: Compared, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The report of ``compared``."""
-    figure = Part.drawing(harm_against_total_gap(compared.result), "Harm against the gap", "Mean harm by gap.")
+    figure = drawing(harm_against_total_gap(compared.result), "Harm against the gap", "Mean harm by gap.")
     path = tmp_path_factory.mktemp("report") / "report.html"
-    Report("paper-random: four agents", compared, figures=[figure], settings={"Seed": 7}).write(path)
+    Report("paper-random: four agents", compared, "Four agents.", {"Seed": 7}, figures=[figure]).write(path)
     return path

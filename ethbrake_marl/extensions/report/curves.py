@@ -1,0 +1,67 @@
+"""Figure of estimates along an axis: harm over distance, training steps or delay."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from ethbrake_marl.extensions.report.style import band, finish, in_our_style, label_text, new_panels, series_style
+from ethbrake_marl.files.sheet import Estimate
+
+Curve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
+
+
+def over_seeds(trainings: Sequence[Mapping[int, float]]) -> Curve:
+    """Return the mean of several training runs, with plus and minus one standard deviation over the seeds.
+
+    ``trainings`` has a mapping from training step to value for each run. The curve has the steps that all runs have.
+    """
+    curve = {}
+    for step in sorted(set.intersection(*map(set, trainings))):
+        values = [training[step] for training in trainings]
+        mean, spread = np.mean(values), np.std(values, ddof=1) if len(values) > 1 else 0.0
+        curve[float(step)] = Estimate(float(mean), (float(mean - spread), float(mean + spread)))
+    return curve
+
+
+@in_our_style
+def curves_figure(
+    panels: Mapping[str, Mapping[str, Curve]],
+    x_label: str,
+    caption: str,
+    *,
+    lines: Mapping[str, Mapping[str, float]] | None = None,
+    y_label: str = "",
+) -> Figure:
+    """Draw curves with a band between the ends of their intervals, in a panel for each title.
+
+    Args:
+        panels: title -> label of a curve -> curve.
+        x_label: label of the horizontal axes.
+        caption: text below the figure.
+        lines: title -> label -> value of a horizontal line.
+        y_label: label of a vertical axis that all panels share; "": each has its own.
+
+    """
+    figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
+    for axes, (title, curves) in zip(every, panels.items(), strict=True):
+        for number, (label, curve) in enumerate(curves.items()):
+            style, x = series_style(number), list(curve)
+            axes.plot(x, [each.value for each in curve.values()], label=label_text(label), **style)
+            low, high = zip(*(each.ends for each in curve.values()), strict=True)
+            band(axes, x, low, high, style)
+        for number, (label, value) in enumerate((lines or {}).get(title, {}).items(), len(curves)):
+            style = series_style(number) | {"marker": ""}
+            axes.axhline(value, label=label_text(label), **style)
+        axes.set(title=title, xlabel=x_label)
+        if axes.dataLim.xmax >= 1000.0:
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    for axes in every:  # after all curves are drawn
+        if axes.dataLim.ymin >= 0.0:
+            axes.set_ylim(bottom=0.0)
+    every[0].set_ylabel(y_label)
+    return finish(figure, caption, every[0], columns=5)

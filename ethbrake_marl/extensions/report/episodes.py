@@ -1,0 +1,83 @@
+"""The section of episodes to watch: the worst worlds, the avoidable, the typical and some at random."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.compared import Compared
+from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.evaluation.record import record_episodes
+from ethbrake_marl.evaluation.summary import BASELINE
+from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
+from ethbrake_marl.extensions.report.page import Section, part
+from ethbrake_marl.extensions.report.player import SAMPLE_S, player
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
+from ethbrake_marl.names import open_game
+
+MOST_WORLDS = 50
+WORST = 10
+EACH = 5  # worlds of every kind except the worst and the random ones
+TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
+
+
+def shown_worlds(result: Result, focus: str) -> dict[int, str]:
+    """Return at most ``MOST_WORLDS`` rows to show, each once, in order of their kinds: row -> why it is shown."""
+    total, known, chosen = result[focus][HARM["total"]], BestKnown.of(result), dict[int, str]()
+
+    def add(kind: str, rows: Iterable[int] | Ints, most: int = EACH) -> None:
+        fresh = [int(row) for row in rows if int(row) not in chosen]
+        chosen.update(dict.fromkeys(fresh[: min(most, MOST_WORLDS - len(chosen))], kind))
+
+    add(f"Where {focus} did worst", worst_rows(result, focus), WORST)
+    if known is not None and known.avoidable is not None:
+        avoidable = result[focus]["collided"] & known.avoidable
+        add(f"Avoidable, and {focus} collided", largest(total, avoidable))
+    if BASELINE in result.columns and focus != BASELINE:
+        saved = result[BASELINE][HARM["total"]] - total
+        add(f"Where {focus} saved most against {BASELINE}", largest(saved, saved > 0.0))
+        add(f"Where {focus} did more harm than {BASELINE}", largest(-saved, saved < 0.0))
+    order = np.argsort(total, kind="stable")
+    add(f"Typical of {focus}", [order[int(q * (result.n - 1))] for q in TYPICAL])
+    add("Drawn at random", np.random.default_rng(0).permutation(result.n), MOST_WORLDS)
+    return chosen
+
+
+def worst_rows(result: Result, focus: str) -> Ints:
+    """Return at most ten rows in which an agent did worst, the worst first: by total harm minus the best known."""
+    known = BestKnown.of(result)
+    value = result[focus][HARM["total"]] if known is None else known.regret(result, focus, "total")
+    return largest(value, value > 0.0)[:WORST]
+
+
+def largest(value: Floats, among: Bools) -> Ints:
+    """Return the rows that are true in ``among``, those with the largest value first."""
+    order: Ints = np.argsort(-value, kind="stable")
+    return order[among[order]]
+
+
+def episodes_section(compared: Compared, focus: str, kinds: dict[int, str]) -> Section:
+    """Let every team drive some worlds once more (row -> why it is shown), and return the player of these episodes.
+
+    A note names each agent that drove differently in these episodes than in the evaluation.
+    """
+    rows, worlds, (_, game) = [*kinds], compared.worlds(kinds), open_game(compared.scenario)
+    records = {agent: record_episodes(worlds, team, game, SAMPLE_S) for agent, team in compared.teams.items()}
+    moving = sum(not all(record.at_rest for record in world) for world in zip(*records.values(), strict=True))
+    until = "from the alert until all vehicles are at rest"
+    if moving:
+        until += (
+            f", or until the horizon of {compared.scenario.horizon_s:g} s. In {count_of(moving, 'world')}, vehicles"
+            " still moved at the horizon under some agent; the player names this agent"
+        )
+    n = compared.result.n
+    body: list[str] = [f"{f'{len(rows)} of the {n:,}' if len(rows) < n else f'All {n}'} worlds, {until}."]
+    for agent, own in records.items():
+        again = np.array([[record.last.harm(count)[0] for count in HARM] for record in own])
+        before = np.column_stack([compared.result[agent][harm][rows] for harm in HARM.values()])
+        if other := int((again != before).any(axis=1).sum()):
+            text = f"In {count_of(other, 'world')} of these, {agent} drove differently the second time: the player"
+            body.append(part("paragraph", f"{text} shows another episode than the tables.", "note"))
+    return Section("Episodes", [*body, player(compared, focus, kinds, records)])
