@@ -9,8 +9,7 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import unknown_name
-from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.drive import MET, drive
+from ethbrake_marl.motion.drive import drive
 from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
 from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats, scratch_for
 
@@ -81,32 +80,16 @@ def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
     return injured
 
 
-@large
-def drive_again(line, car, wanted, start, until, scratch, out):
-    """Write each vehicle's largest change of speed at its front and rear in an interval to ``out`` [n, 2, N] (m/s).
-
-    ``line`` is used up.
-    """
-    for k in range(len(out)):
-        out[k] = 0.0
-        if drive(line[k], car[k], wanted[k], scratch, start[k], until[k]) == MET:
-            for i in range(1, line.shape[2]):
-                out[k, 0, i - 1] = scratch[FRONT_CHANGE, i]
-                out[k, 1, i - 1] = scratch[REAR_CHANGE, i]
-
-
 def speed_changes(before: State, after: State) -> Floats:
     """Return each vehicle's largest change of speed by one impact between two states, at its front and rear.
 
     [n, 2, N] m/s. No decision lies between the states. A push by a vehicle in contact is no impact.
     """
-    out = np.zeros((after.n, 2, after.vehicles))
-    rows = np.flatnonzero((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
-    some = np.empty((len(rows), 2, after.vehicles))
-    times = before.time_s[rows], after.time_s[rows]
-    scratch = scratch_for(after.wanted.shape[1])
-    drive_again(before.line[rows], before.car[rows], after.wanted[rows], *times, scratch, some)
-    out[rows] = some
+    out, scratch = np.zeros((after.n, 2, after.vehicles)), scratch_for(after.vehicles + 1)
+    for k in np.flatnonzero((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1)):
+        line, car, wanted = (np.array(array[k]) for array in (before.line, before.car, after.wanted))
+        drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
+        out[k] = scratch[[FRONT_CHANGE, REAR_CHANGE], 1:]
     return out
 
 

@@ -243,12 +243,7 @@ def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
 def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
     """Return proposed actions in memory of their own, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for others."""
     actions = numbers_of(rules, actions, n)
-    size = np.abs(actions)
-    if not (size > 1.0).any():
-        return actions.copy()
-    beyond = (size > LARGEST_ACTION).any(axis=1)
-    if beyond.any():
-        row = actions[beyond][0]
+    for row in actions[(np.abs(actions) > LARGEST_ACTION).any(axis=1)]:
         _check_actions(rules, np.where(np.isnan(row), 0.0, row))
     return np.clip(actions, -1.0, 1.0)
 

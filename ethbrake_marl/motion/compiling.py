@@ -46,7 +46,7 @@ def _compile(function: Function, **options: Any) -> Function:
     before, config.CACHE_DIR = config.CACHE_DIR, str(folder_of(function.__code__.co_filename))
     try:
         compiled: Function = numba.njit(
-            cache=True, nogil=True, error_model="numpy", boundscheck=False, _nrt=False, **options
+            cache=True, nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True, _nrt=False, **options
         )(function)
     finally:
         config.CACHE_DIR = before

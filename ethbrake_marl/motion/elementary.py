@@ -202,42 +202,30 @@ def normal_probability(x: float) -> float:
 
 
 @large
-def _exp_each(values, out):
+def _each(values, which, out):
     for i in range(len(out)):
-        out[i] = exp(values[i])
+        out[i] = exp(values[i]) if which == 0 else log(values[i]) if which == 1 else normal_quantile(values[i])
 
 
-@large
-def _log_each(values, out):
-    for i in range(len(out)):
-        out[i] = log(values[i])
-
-
-@large
-def _normal_quantile_each(values, out):
-    for i in range(len(out)):
-        out[i] = normal_quantile(values[i])
+def _of_each(values: Floats, which: int) -> Floats:
+    out = np.empty(values.size)
+    _each(np.array(values).ravel(), which, out)
+    return out.reshape(values.shape)
 
 
 def exp_each(values: Floats) -> Floats:
     """Return ``exp`` of each entry, in the same shape."""
-    out = np.empty(values.size)
-    _exp_each(np.ascontiguousarray(values).ravel(), out)
-    return out.reshape(values.shape)
+    return _of_each(values, 0)
 
 
 def log_each(values: Floats) -> Floats:
     """Return ``log`` of each entry, in the same shape."""
-    out = np.empty(values.size)
-    _log_each(np.ascontiguousarray(values).ravel(), out)
-    return out.reshape(values.shape)
+    return _of_each(values, 1)
 
 
 def normal_quantile_each(values: Floats) -> Floats:
     """Return ``normal_quantile`` of each entry, in the same shape."""
-    out = np.empty(values.size)
-    _normal_quantile_each(np.ascontiguousarray(values).ravel(), out)
-    return out.reshape(values.shape)
+    return _of_each(values, 2)
 
 
 def logistic(values: Floats) -> Floats:
