@@ -87,7 +87,7 @@ def speed_changes(before: State, after: State) -> Floats:
     """
     out, scratch = np.zeros((after.n, 2, after.vehicles)), scratch_for(after.vehicles + 1)
     for k in np.flatnonzero((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1)):
-        line, car, wanted = (np.array(array[k]) for array in (before.line, before.car, after.wanted))
+        line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
         drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
         out[k] = scratch[[FRONT_CHANGE, REAR_CHANGE], 1:]
     return out

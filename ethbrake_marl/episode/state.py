@@ -190,7 +190,7 @@ class State(NamedTuple):
     def borne_harm(self, count: str = "first") -> Floats:
         """Return the harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
         out = np.empty((self.n, self.vehicles))
-        split_harm(np.array(self.line[:, TOTAL if count == "total" else FIRST]), np.array(self.car[:, MASS]), out)
+        split_harm(self.line[:, TOTAL if count == "total" else FIRST].copy(), self.car[:, MASS].copy(), out)
         return out
 
 
