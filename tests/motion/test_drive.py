@@ -287,6 +287,18 @@ def test_bounces__end_after_the_sum_of_their_flights(e: float) -> None:
     assert run(line, car, [-16.0, 4.0], [flights - 1e-3])[0][at.COUNT, 1] == len(closing) - 1
 
 
+def test_rattling__between_two_heavy_ones_ends_in_one_impact_that_conserves_momentum() -> None:
+    # e = 0: the gaps shrink below the smallest double
+    mass, commands = [31.0, 0.65, 12.5], [-1.44, -6.02, -8.25]
+    line, car = lines([1.0, 1.0], [9.05, 9.29, 15.95], mass_t=mass)
+    momentum = np.array(mass) @ line[0, at.SPEED, 1:]
+    for start in np.arange(0.0, 1.0, 0.01):
+        line, _, _ = driven(line, car, commands, start, start + 0.01)
+        momentum += 0.01 * np.array(mass) @ np.array(commands)
+        assert np.array(mass) @ line[0, at.SPEED, 1:] == pytest.approx(momentum, rel=1e-12)
+    assert line[0, at.COUNT, 1:3].sum() == 10.0
+
+
 def test_changes_of_speed__are_the_largest_of_one_impact_at_each_side() -> None:
     # 8 m/s into 2 t at rest with 1 t: both at 8/3; then the pair, 3 t, is struck by 3 t at 8 m/s: all at 16/3
     line, car = lines([0.0, 6.0], [0.0, 8.0, 8.0], mass_t=[2.0, 1.0, 3.0])
