@@ -22,8 +22,8 @@ from ethbrake_marl.episode.terms import (
     collision,
     component,
     components_of,
+    growth,
     jerk,
-    objective_term,
     risk,
 )
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -213,7 +213,7 @@ class Rewarding(NamedTuple):
             **{name: TERMS[name].value for name in params.terms},
         }
         if not whole:
-            functions = {"harm": objective_term(objectives, params.harm_count), **functions}
+            functions = {"harm": partial(growth, objectives, params.harm_count), **functions}
         terms = [(name, params.weights[name], function) for name, function in functions.items() if params.weights[name]]
         shaping = Shaping(rules, params.shaping_discount) if params.shaping else None
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.functions import called, check_finite, described
-from ethbrake_marl.episode.objectives import Objective, amounts
+from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.play import descend
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
@@ -151,12 +151,8 @@ class Shaping(NamedTuple):
         return value, new
 
 
-def objective_term(objectives: Sequence[Objective], count: str) -> TermFunction:
+def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
     """Return the term harm of vehicles with objectives, [n, N]."""
-    return partial(_objective_term, objectives, count)
-
-
-def _objective_term(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
     return -amounts(objectives, before, after, count)
 
 
@@ -165,17 +161,15 @@ def component(name: str, vehicles: int, count: str) -> TermFunction | None:
     row = TOTAL if count == "total" else FIRST
     for k in range(vehicles):
         if name == f"harm_{k + 1}":
-            return partial(_borne, k, row, count)
+            return partial(_borne, k, row)
     pairs = {"obstacle": 0, **{f"pair_{p}_{p + 1}": p for p in range(1, vehicles)}}
     if name not in pairs:
         return None
     return partial(_of_pair, pairs[name], row)
 
 
-def _borne(vehicle: int, row: int, count: str, before: State, step: Step, after: State) -> Floats:
-    since = after.line.copy()
-    since[:, row] -= before.line[:, row]
-    return 0.0 - after._replace(line=since).borne_harm(count)[:, vehicle]
+def _borne(vehicle: int, row: int, before: State, step: Step, after: State) -> Floats:
+    return 0.0 - Harm.of(after.line[:, row] - before.line[:, row], after.car).borne[:, vehicle]
 
 
 def _of_pair(pair: int, row: int, before: State, step: Step, after: State) -> Floats:

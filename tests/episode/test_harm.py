@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.episode.injury import injured, injury_probability, speed_changes
+from ethbrake_marl.episode.injury import injured, risks, speed_changes
 from ethbrake_marl.episode.objectives import amounts, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput
@@ -152,18 +152,22 @@ def test_injuries__by_hand() -> None:
 @pytest.mark.parametrize(
     ("curve", "side", "dv", "probability"),
     [
-        ("lr4s", "front", 10.0, 1 / (1 + np.exp(4.457 - 1.77))),
-        ("lr4s", "rear", -10.0, 1 / (1 + np.exp(4.888 - 1.77))),
-        ("gidas", "front", 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
-        ("gidas", "rear", 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
-        ("reference", "front", 10.0, (10 / 51.287) ** 1.531),
-        ("reference", "rear", 10.0, (10 / 66.956) ** 1.531),
-        ("reference", "front", 60.0, 1.0),
-        ("reference", "rear", 0.0, 0.0),
+        ("lr4s", 0, 10.0, 1 / (1 + np.exp(4.457 - 1.77))),
+        ("lr4s", 1, 10.0, 1 / (1 + np.exp(4.888 - 1.77))),
+        ("gidas", 0, 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
+        ("gidas", 1, 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
+        ("reference", 0, 10.0, (10 / 51.287) ** 1.531),
+        ("reference", 1, 10.0, (10 / 66.956) ** 1.531),
+        ("reference", 0, 60.0, 1.0),
+        ("reference", 1, 0.0, 0.0),
     ],
 )
-def test_probability__of_an_injury_by_hand(curve: str, side: Any, dv: float, probability: float) -> None:
-    assert injury_probability(np.array([dv]), side, curve)[0] == pytest.approx(probability, rel=1e-12)
+def test_probability__of_an_injury_by_hand(curve: str, side: int, dv: float, probability: float) -> None:
+    changes = np.zeros((1, 2, 1))
+    changes[0, side] = dv
+    assert risks(changes, curve)[0, :, 0].tolist() == pytest.approx(
+        [0.0] * side + [probability] + [0.0] * (1 - side), rel=1e-12
+    )
 
 
 def test_injured__by_the_larger_change_of_each_vehicle() -> None:

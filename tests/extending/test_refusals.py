@@ -110,7 +110,7 @@ def test_name__is_unknown(message: str) -> None:
 )
 def test_feature__gives_a_finite_number_per_world(given: Any, message: str) -> None:
     eb.register_feature("mine", gives(given), **SCALED)
-    with pytest.raises(InvalidInput, match=f"feature 'mine' of vehicle_2: .*{message}"):
+    with pytest.raises(InvalidInput, match=f"feature 'mine' of vehicle_1: .*{message}"):
         eb.parallel_env(scenario=PAPER, observation=["mine"]).reset(seed=1)
 
 
