@@ -1,7 +1,8 @@
 """Attacks on the shield: harm must equal the certified harm to the bit, and never exceed the bound at the alert.
 
-PettingZoo, vector, VecEnv and evaluation (the other interfaces agree with these), one to four learners, with and without obstacle,
-brakes that build up, scripts that react, both counts of harm, every way to propose of ``tests/shields/attack.py``.
+PettingZoo, vector, VecEnv and evaluation (the other interfaces agree with these), one to four learners, with and
+without obstacle, brakes that build up, scripts that react, both counts of harm, every way to propose of
+``tests/shields/attack.py``.
 """
 
 from functools import partial
