@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -37,6 +37,9 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
 from ethbrake_marl.motion.layout import FIRST, TOTAL, Floats
 from ethbrake_marl.registry import Registry
+
+if TYPE_CHECKING:
+    from ethbrake_marl.episode.reward import RewardParams
 
 TermFunction = Callable[[State, Step, State], Floats]
 
@@ -93,9 +96,9 @@ BUILT_IN = {  # name -> (unit, meaning)
 }
 
 
-def collision(k_energy: float, before: State, step: Step, after: State) -> Floats:
+def collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
     """Return the term collision, [n]."""
-    return -k_energy * step.total_harm
+    return -params.k_energy * step.total_harm
 
 
 def jerk(before: State, step: Step, after: State) -> Floats:
@@ -104,15 +107,14 @@ def jerk(before: State, step: Step, after: State) -> Floats:
     return -rate * rate
 
 
-def risk(settings: tuple[float, float, float, float], before: State, step: Step, after: State) -> Floats:
-    """Return the term risk, [n, N]; tau, d_safe, d_target and k_d are the settings, in this order."""
-    ttc_scale_s, safety_buffer_m, target_gap_m, distance_slope_per_m = settings
+def risk(params: RewardParams, before: State, step: Step, after: State) -> Floats:
+    """Return the term risk, [n, N]."""
     closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
-    room = np.maximum(after.gaps_m - safety_buffer_m, 0.0)
+    room = np.maximum(after.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0
     time_to_collision = room / np.where(approaching, closing, 1.0)
-    urgency = np.where(approaching, logistic(-time_to_collision / ttc_scale_s), 0.0)
-    pair_risk = -(urgency + logistic(distance_slope_per_m * (target_gap_m - after.gaps_m)))
+    urgency = np.where(approaching, logistic(-time_to_collision / params.ttc_scale_s), 0.0)
+    pair_risk = -(urgency + logistic(params.distance_slope_per_m * (params.target_gap_m - after.gaps_m)))
     total = np.zeros(after.speeds_mps.shape)
     total[:, :-1] += pair_risk
     total[:, 1:] += pair_risk
@@ -156,16 +158,10 @@ def growth(objectives: Sequence[Objective], count: str, before: State, step: Ste
     return -amounts(objectives, before, after, count)
 
 
-def component(name: str, vehicles: int, count: str) -> TermFunction | None:
-    """Return the term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]; None for another name."""
-    row = TOTAL if count == "total" else FIRST
-    for k in range(vehicles):
-        if name == f"harm_{k + 1}":
-            return partial(_borne, k, row)
-    pairs = {"obstacle": 0, **{f"pair_{p}_{p + 1}": p for p in range(1, vehicles)}}
-    if name not in pairs:
-        return None
-    return partial(_of_pair, pairs[name], row)
+def component(name: str, count: str) -> TermFunction:
+    """Return the term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]."""
+    row, number = TOTAL if count == "total" else FIRST, int(name.rpartition("_")[2]) if "_" in name else 1
+    return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, row)
 
 
 def _borne(vehicle: int, row: int, before: State, step: Step, after: State) -> Floats:

@@ -166,6 +166,9 @@ def test_components__of_vehicles_add_up_to_the_reward() -> None:
         assert step.vector is not None and step.vector.shape == (30, 3, 3)
         assert step.vector.sum(axis=2) == near(step.reward, abs=1e-9)
     assert state.collided.any()
+    _, game = game_of("paper-random", reward="harm", reward_vector=["harm", "harm_2"])
+    _, step = game.step(game.start(3, 1, 0), np.zeros((3, 1)))
+    assert step.vector is not None and step.vector.shape == (3, 3, 2) and [*step.terms] == ["harm"]
 
 
 # ---------------------------------------------------------------- what a reward says
