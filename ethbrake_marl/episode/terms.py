@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,9 +37,6 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
 from ethbrake_marl.motion.layout import FIRST, TOTAL, Floats
 from ethbrake_marl.registry import Registry
-
-if TYPE_CHECKING:
-    from ethbrake_marl.episode.reward import RewardParams
 
 TermFunction = Callable[[State, Step, State], Floats]
 
@@ -96,8 +93,8 @@ BUILT_IN = {  # name -> (unit, meaning)
 }
 
 
-def collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
-    """Return the term collision, [n]."""
+def collision(params: Any, before: State, step: Step, after: State) -> Floats:
+    """Return the term collision, [n]; ``params`` are ``RewardParams``."""
     return -params.k_energy * step.total_harm
 
 
@@ -107,8 +104,8 @@ def jerk(before: State, step: Step, after: State) -> Floats:
     return -rate * rate
 
 
-def risk(params: RewardParams, before: State, step: Step, after: State) -> Floats:
-    """Return the term risk, [n, N]."""
+def risk(params: Any, before: State, step: Step, after: State) -> Floats:
+    """Return the term risk, [n, N]; ``params`` are ``RewardParams``."""
     closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
     room = np.maximum(after.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0
