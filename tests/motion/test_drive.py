@@ -8,6 +8,7 @@ import pytest
 
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.motion.drive import FAILED, MET
+from ethbrake_marl.motion.forces import stopping_distances
 from ethbrake_marl.motion.layout import Floats
 from tests.motion.lines import driven, lines
 
@@ -314,6 +315,8 @@ def test_vehicle__stops_after_its_way_with_brakes_that_build_up(speed: float, ra
     # v b / (2 r) - b^3 / (24 r^2) + v^2 / (2 b) with b = 7; from 1 m/s it stops before its brakes have full force
     after, _ = run(*lines([100.0], [0.0, speed], brake_rate_mps3=rate), [0.0, -7.0], [10.0])
     assert 100.0 - after[at.GAP, 1] == pytest.approx(way, abs=1e-5) and after[at.SPEED, 2] == 0.0
+    of_formula = stopping_distances(*(np.array([x]) for x in (speed, 0.5, 7.0, rate)))
+    assert of_formula == pytest.approx(way + 0.5 * speed, abs=1e-5)
 
 
 def test_command__that_ends_at_the_latency_never_acts() -> None:
