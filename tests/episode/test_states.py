@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import hold, price
+from ethbrake_marl.episode.play import descend, hold, price
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
@@ -137,3 +137,13 @@ def test_hold__is_the_harm_of_constant_commands() -> None:
         while not now.ended.all():
             now, _ = game.step(now, np.full((N, 1), share))
         np.testing.assert_allclose(found[:, :, c], [now.harm("total"), now.harm("first")], rtol=1e-9, atol=1e-9)
+
+
+def test_descend__returns_the_commands_whose_harm_it_tells() -> None:
+    scenario, game = game_of("cooperation-3-pair")
+    state, shares, learners = scenario.sample(50, 3), np.linspace(0.0, 1.0, 5), game.rules.learners.tolist()
+    wanted, least = descend(state, learners, shares, 2, 8.0, "first")
+    found = hold(state, wanted, learners, wanted[:, np.newaxis, learners], 8.0, "first")[0, :, 0]
+    assert found.tolist() == least.tolist()
+    alone = descend(state, learners[:1], shares, 1, 8.0, "first")[1]
+    assert (least <= alone).all() and (least < alone - 1.0).any()
