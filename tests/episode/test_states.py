@@ -145,5 +145,5 @@ def test_descend__returns_the_commands_whose_harm_it_tells() -> None:
     wanted, least = descend(state, learners, shares, 2, 8.0, "first")
     found = hold(state, wanted, learners, wanted[:, np.newaxis, learners], 8.0, "first")[0, :, 0]
     assert found.tolist() == least.tolist()
-    alone = descend(state, learners[:1], shares, 1, 8.0, "first")[1]
+    alone = descend(state, learners[1:], shares, 1, 8.0, "first")[1]
     assert (least <= alone).all() and (least < alone - 1.0).any()
