@@ -74,6 +74,7 @@ def test_harm_of_the_obstacle__is_that_of_vehicle_1() -> None:
     assert state.obstacle_gap_m.tolist() == [0.0] and not state.speeds_mps.any()
     alone = later(state_of([50.0], [20.0, 0.0], obstacle_gap_m=10.0), 0.0, 1.0)
     assert alone.collided.tolist() == [True] and not alone.pair_hit.any()
+    assert np.isinf(state_of([50.0], [20.0, 0.0]).obstacle_gap_m).all()
 
 
 # ---------------------------------------------------------------- objectives
