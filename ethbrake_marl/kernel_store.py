@@ -10,23 +10,43 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
+LEAST_FREE_BYTES = 50_000_000
 _TEMPORARY = "ethbrake_marl-"
 _tellers: list[Callable[[Path, bool], None]] = []
 
 
-@cache
-def cache_folder() -> Path:
-    """Return the folder of the compiled kernels: the user's cache, or a temporary folder if the cache is read-only."""
+def home_folder() -> Path | None:
+    """Return the folder under ``$NUMBA_CACHE_DIR`` or the user's cache; None for a user without a home folder."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(home) / "ethbrake_marl"
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except (OSError, RuntimeError):  # RuntimeError: no HOME, and the user id has no name
-        temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
-        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-        return temporary
+    except RuntimeError:
+        return None
+    return Path(home) / "ethbrake_marl"
+
+
+@cache
+def cache_folder() -> Path:
+    """Return the folder of the compiled kernels: ``home_folder``, or a temporary folder.
+
+    It is temporary if the folder cannot be written, its disk is full, or it belongs to somebody else.
+    """
+    folder = home_folder()
+    try:
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                if can_be_trusted(folder) and shutil.disk_usage(folder).free >= LEAST_FREE_BYTES:
+                    return folder
+    except OSError:
+        pass
+    temporary = Path(tempfile.mkdtemp(prefix=_TEMPORARY))
+    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+    return temporary
+
+
+def can_be_trusted(folder: Path) -> bool:
+    """Return whether this user or root owns a folder: its machine code will be run."""
+    return not hasattr(os, "getuid") or folder.stat().st_uid in (0, os.getuid())
 
 
 def is_temporary(folder: Path) -> bool:
@@ -35,18 +55,14 @@ def is_temporary(folder: Path) -> bool:
 
 
 def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
-    """Call ``tell(folder, was_empty)`` once, just before this process compiles its first kernel.
+    """Call ``tell(folder, is_empty)`` once, just before this process compiles its first kernel.
 
-    ``folder`` is the cache folder of the compiled kernels. ``was_empty`` is true if this process has not loaded any
-    kernel from the cache yet. If a kernel is loaded from the cache, ``tell`` is not called.
+    ``folder`` is the cache folder, and ``is_empty`` whether no compiled kernel is stored in it.
     """
     _tellers.append(tell)
 
 
-def tell_compilation(nothing_kept: bool) -> None:
-    """Call each callback of ``on_first_compilation`` once, before a kernel is compiled.
-
-    ``nothing_kept``: true if this process has not loaded any compiled kernel from the cache folder yet.
-    """
+def tell_compilation() -> None:
+    """Call each callback of ``on_first_compilation`` once, before a kernel is compiled."""
     while _tellers:
-        _tellers.pop()(cache_folder(), nothing_kept)
+        _tellers.pop()(cache_folder(), not any(cache_folder().rglob("*.nbi")))

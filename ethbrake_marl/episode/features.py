@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from ethbrake_marl.episode.functions import described
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, RELEASE_RATE, WEIGHT, Floats, Ints
@@ -142,17 +143,13 @@ def register_feature(
         unknown: value for a neighbour that is not known, in ``unit``.
 
     """
-    if not isinstance(name, str) or re.fullmatch(r"[a-z][a-z0-9_]{0,63}", name) is None:
-        raise InvalidInput(
-            f"feature {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter"
-        )
+    meaning = described("feature", name, function, r"[a-z][a-z0-9_]{0,63}", "a-z, 0-9 and _, beginning with a letter")
     if name in WHOLE_GROUPS or name in GROUPS or SIDE.fullmatch(name):
         raise InvalidInput(f"feature {name!r}: this is the name of a group; give another name")
-    inside = [group for group, features in {**WHOLE_GROUPS, "front_1": NEIGHBOUR}.items() if name in names_in(features)]
+    groups = {**WHOLE_GROUPS, "front_1": NEIGHBOUR}
+    inside = [group for group, features in groups.items() if name in [feature.name for feature in features]]
     if inside:
         raise InvalidInput(f"feature {name!r}: the group {inside[0]} has a feature of this name; give another name")
-    if not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"feature {name!r}: must be a function with a docstring that describes the feature")
     numbers = {"scale": scale, "low": low, "high": high, "unknown": unknown}
     for key, value in numbers.items():
         if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
@@ -164,14 +161,8 @@ def register_feature(
         )
     if of not in get_args(Of):
         raise InvalidInput(f"feature {name!r}: of = {of!r}: must be 'own' or 'neighbour'")
-    meaning = " ".join(str(function.__doc__).split())
     entry = Own(Feature(name, str(unit), float(scale), float(low), float(high), meaning), of, function, float(unknown))
     FEATURES.add(name, entry, lambda other: other == entry)
-
-
-def names_in(features: Sequence[Feature]) -> list[str]:
-    """Return the names of features in their group."""
-    return [feature.name for feature in features]
 
 
 def register_feature_group(
@@ -189,16 +180,16 @@ def register_feature_group(
     GROUPS.add(name, group, lambda other: other == group)
 
 
-def _place(state: State, body: int) -> Floats:
-    return np.full(state.n, body - 1.0)
-
-
 FEATURES: Registry[Own] = Registry(
     "feature",
     "features",
     register_feature,
     {
-        "place": Own(Feature("place", "1", 1.0, 0.0, 63.0, "number of vehicles ahead in the line"), "own", _place),
+        "place": Own(
+            Feature("place", "1", 1.0, 0.0, 63.0, "number of vehicles ahead in the line"),
+            "own",
+            lambda state, body: np.full(state.n, body - 1.0),
+        ),
         **_of_both("build_up_time", "s", 4.0, _build_up_s, "time until brakes are fully applied; 0 if at once"),
         **_of_both("release_time", "s", 4.0, _release_s, "time until full brakes are released; 0 if at once"),
         **_of_both("harm_weight", "1", 1.0, _weight_share, "share in the weights of harm (objective: preference)"),

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import unknown_name
-from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.drive import MET, drive
+from ethbrake_marl.motion.drive import drive
 from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
 from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats, scratch_for
 
@@ -48,17 +46,13 @@ CURVES = {
 }  # fmt: skip
 
 
-def injury_probability(speed_change_mps: Floats, side: Literal["front", "rear"], curve: str = "lr4s") -> Floats:
-    """Return the probability of an injury in impacts that change a vehicle's speed by ``speed_change_mps`` (m/s).
+def risks(changes: Floats, curve: str) -> Floats:
+    """Return each vehicle's probability of an injury, [n, 2, N], by changes of speed at its front and rear (m/s).
 
-    ``side`` is where it is hit. At a change of 0 the logistic curves are above 0: do not ask for a vehicle that was not
-    hit. Raises ``UnknownName``.
+    It is 0 on a side that was not hit, where the logistic curves would be above 0.
     """
-    if curve not in CURVES:
-        raise unknown_name("injury curve", curve, CURVES)
-    if side not in ("front", "rear"):
-        raise unknown_name("side", side, ("front", "rear"))
-    return getattr(CURVES[curve], side)(np.abs(np.asarray(speed_change_mps, np.float64)))
+    each = [CURVES[curve].front(changes[:, 0].copy()), CURVES[curve].rear(changes[:, 1].copy())]
+    return np.where(changes > 0.0, np.stack(each, axis=1), 0.0)
 
 
 def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
@@ -70,29 +64,10 @@ def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
     rebound = (1.0 + car[:, RESTITUTION, :-1]) * np.sqrt(pairs[:, :-1])
     mass = car[:, MASS, 1:]
     both = mass[:, :-1] + mass[:, 1:]
-    front, rear = rebound.copy(), np.zeros(mass.shape)
-    rear[:, :-1] = mass[:, 1:] / both * rebound[:, 1:]
-    front[:, 1:] *= mass[:, :-1] / both
-    injured = np.zeros(len(front))
-    for j in range(front.shape[1]):
-        by_front = np.where(front[:, j] > 0.0, injury_probability(front[:, j], "front", curve), 0.0)
-        by_rear = np.where(rear[:, j] > 0.0, injury_probability(rear[:, j], "rear", curve), 0.0)
-        injured = injured + 1_000.0 * np.maximum(by_front, by_rear)
-    return injured
-
-
-@large
-def drive_again(line, car, wanted, start, until, scratch, out):
-    """Write each vehicle's largest change of speed at its front and rear in an interval to ``out`` [n, 2, N] (m/s).
-
-    ``line`` is used up.
-    """
-    for k in range(len(out)):
-        out[k] = 0.0
-        if drive(line[k], car[k], wanted[k], scratch, start[k], until[k]) == MET:
-            for i in range(1, line.shape[2]):
-                out[k, 0, i - 1] = scratch[FRONT_CHANGE, i]
-                out[k, 1, i - 1] = scratch[REAR_CHANGE, i]
+    changes = np.stack([rebound, np.zeros(mass.shape)], axis=1)  # front, rear
+    changes[:, 1, :-1] = mass[:, 1:] / both * rebound[:, 1:]
+    changes[:, 0, 1:] *= mass[:, :-1] / both
+    return np.cumsum(1_000.0 * risks(changes, curve).max(axis=1), axis=1)[:, -1]
 
 
 def speed_changes(before: State, after: State) -> Floats:
@@ -100,13 +75,11 @@ def speed_changes(before: State, after: State) -> Floats:
 
     [n, 2, N] m/s. No decision lies between the states. A push by a vehicle in contact is no impact.
     """
-    out = np.zeros((after.n, 2, after.vehicles))
-    rows = np.flatnonzero((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
-    some = np.empty((len(rows), 2, after.vehicles))
-    times = before.time_s[rows], after.time_s[rows]
-    scratch = scratch_for(after.wanted.shape[1])
-    drive_again(before.line[rows], before.car[rows], after.wanted[rows], *times, scratch, some)
-    out[rows] = some
+    out, scratch = np.zeros((after.n, 2, after.vehicles)), scratch_for(after.vehicles + 1)
+    for k in np.flatnonzero((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1)):
+        line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
+        drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
+        out[k] = scratch[[FRONT_CHANGE, REAR_CHANGE], 1:]
     return out
 
 
@@ -115,7 +88,5 @@ def injured(changes: Floats, curve: str) -> Floats:
 
     The side with the larger change counts.
     """
-    front, rear = changes[:, 0].ravel(), changes[:, 1].ravel()
-    by_front, by_rear = injury_probability(front, "front", curve), injury_probability(rear, "rear", curve)
-    probability = np.where(rear >= front, by_rear, by_front) * ((front > 0.0) | (rear > 0.0))
-    return 1_000.0 * probability.reshape(changes.shape[0], changes.shape[2])
+    front, rear = np.moveaxis(risks(changes, curve), 1, 0)
+    return 1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front)

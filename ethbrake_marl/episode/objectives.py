@@ -19,7 +19,6 @@ All but ``maximin``, ``injury`` and registered ones are weighted sums of the veh
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import lru_cache
@@ -27,9 +26,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.functions import called, described
 from ethbrake_marl.episode.injury import CURVES, injured_by_harm
 from ethbrake_marl.episode.state import State, split_harm
-from ethbrake_marl.errors import InvalidInput, describe_error, unknown_name
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.motion.layout import FIRST, MASS, TOTAL, WEIGHT, Floats
 from ethbrake_marl.registry import Registry
@@ -51,7 +51,7 @@ class Harm(NamedTuple):
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             whole = whole + pairs[:, p]
-        split_harm(pairs, car[:, MASS], borne)
+        split_harm(pairs.copy(), car[:, MASS].copy(), borne)
         return cls(pairs, borne, whole, car)
 
     def weighted(self, weights: Floats) -> Floats:
@@ -194,29 +194,17 @@ def register_objective(name: str, function: Callable[[Harm, int], Floats]) -> No
     ``function(harm, vehicle)`` returns what ``vehicle`` (from 0) should minimise, [n]; its docstring says what that is.
     Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring.
     """
-    if not isinstance(name, str) or re.fullmatch(r"[a-z0-9][a-z0-9_-]{0,63}", name) is None:
-        raise InvalidInput(
-            f"objective {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9, - and _, beginning with a letter or"
-            " digit"
-        )
-    if not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"objective {name!r}: must be a function with a docstring that describes the objective")
+    form = "a-z, 0-9, - and _, beginning with a letter or digit"
+    meaning = described("objective", name, function, r"[a-z0-9][a-z0-9_-]{0,63}", form)
 
     def amount(harm: Harm, vehicle: int, numbers: tuple[float, ...], curve: str) -> Floats:
-        try:
-            value = np.asarray(function(harm, vehicle))
-        except Exception as error:
-            raise InvalidInput(
-                f"objective {name!r}: its function fails for vehicle_{vehicle + 1}: {describe_error(error)}"
-            ) from error
-        if value.shape != harm.whole.shape or value.dtype.kind not in "fiub" or not np.isfinite(value).all():
-            raise InvalidInput(
-                f"objective {name!r}: its function returned {value.dtype} values of shape {value.shape} for"
-                f" vehicle_{vehicle + 1}; must return finite numbers of shape {harm.whole.shape}, one per world"
-            )
+        what = f"objective {name!r} of vehicle_{vehicle + 1}"
+        value = called(what, function, (harm, vehicle), harm.whole.shape)
+        if not np.isfinite(value).all():
+            raise InvalidInput(f"{what}: its value is not finite in row {int(np.argmin(np.isfinite(value)))}")
         return value.astype(np.float64)
 
-    kind = Kind(name, " ".join(str(function.__doc__).split()), amount, function=function)
+    kind = Kind(name, meaning, amount, function=function)
     OBJECTIVES.add(name, kind, lambda other: other.function is function)
 
 

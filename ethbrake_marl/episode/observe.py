@@ -16,7 +16,6 @@ from ethbrake_marl.episode.features import (
     OBSTACLE,
     OWN,
     ROLE,
-    WHOLE_GROUPS,
     Feature,
     Group,
     Own,
@@ -25,8 +24,8 @@ from ethbrake_marl.episode.features import (
     listed_features,
     side_of,
 )
+from ethbrake_marl.episode.functions import called, check_finite
 from ethbrake_marl.episode.state import TIME, State
-from ethbrake_marl.errors import InvalidInput, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import (
     BRAKING,
@@ -53,11 +52,10 @@ class Plan(NamedTuple):
     offsets: Ints  # of the observed neighbours: -1 is the next vehicle ahead
     role: bool
     obstacle: bool
-    scaling: Floats  # [3, F] 1 / scale, low and high of the kernel's features
-    groups: tuple[tuple[Group, int, Floats], ...]  # groups of other packages: group, first column, scaling
-    width: int  # number of all these features
-    picked: Ints | None  # columns of the view among them; None: all, in this order
-    own: tuple[tuple[int, Own, int, int], ...]  # column, feature, offset, column of the neighbour's `known`
+    places: Ints  # [F] of each feature among the kernel's values; -1: it is computed by one of the next two
+    groups: tuple[tuple[Group, list[int], list[int]], ...]  # of other packages: group, columns, features in the group
+    own: tuple[tuple[int, Own, int], ...]  # column, feature, offset (0: of the vehicle itself)
+    scaling: Floats  # [3, F] 1 / scale, low and high
 
 
 class View:
@@ -85,48 +83,53 @@ class View:
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
         """Return the observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
         plan = self.plan
-        whole = np.empty((state.n, len(observers), plan.width), np.float32)
+        seen = np.empty((state.n, len(observers), len(self.names)), np.float32)
         observe_worlds(
             state.line, state.car, state.clock, state.know, observers, plan.offsets, plan.role, plan.obstacle,
-            plan.scaling, np.empty(plan.scaling.shape[1]), whole,
+            plan.places, plan.scaling, np.empty(N_OWN + N_NEIGHBOUR * len(plan.offsets) + N_ROLE + N_OBSTACLE), seen,
         )  # fmt: skip
-        if plan.picked is None:
-            return whole
-        values = {
-            function: function(state, observers, time_step_s) for function in {g.function for g, *_ in plan.groups}
-        }
-        for group, at, scaling in plan.groups:
-            whole[:, :, at : at + scaling.shape[1]] = scaled(values[group.function][..., group.columns], scaling)
-        seen: Observations = whole.take(plan.picked, axis=2)
-        for column, own, offset, known in plan.own:
+        functions = {group.function for group, *_ in plan.groups}
+        values = {function: function(state, observers, time_step_s) for function in functions}
+        for group, columns, places in plan.groups:
+            parts = values[group.function][..., group.columns][..., places]
+            seen[:, :, columns] = scaled(parts, plan.scaling[:, columns])
+        for column, own, offset in plan.own:
             for o, body in enumerate(observers.tolist()):
-                seen[:, o, column] = own_feature(own, state, body, offset, whole[:, o, known] == 1.0)
+                seen[:, o, column] = own_feature(own, state, body, offset, knows(state, body, body + offset))
         return seen
 
     @cached_property
     def plan(self) -> Plan:
         """How this view is computed."""
         listed = list(dict.fromkeys(name.partition(".")[0] for name in self.names if "." in name))
-        sides = [offset for name in listed if (offset := side_of(name)) is not None]
-        front, rear = max([0, *(-s for s in sides)]), max([0, *sides])
-        groups = ["own", *(f"front_{k + 1}" for k in range(front)), *(f"rear_{k + 1}" for k in range(rear))]
-        groups += [name for name in ("role", "obstacle") if name in listed]
-        others = [name for name in listed if name not in WHOLE_GROUPS and side_of(name) is None]
-        names = [f"{group}.{f.name}" for group in (*groups, *others) for f in group_named(group) or ()]
-        kernel_features = [feature_named(name) for name in names if name.partition(".")[0] not in others]
-        offsets = [offset for name in groups if (offset := side_of(name)) is not None]
-        place = {name: c for c, name in enumerate(names)}
-        own = []
-        for column, name in enumerate(self.names):
-            if name not in place:
-                side, _, last = name.rpartition(".")
-                own.append((column, FEATURES[last], side_of(side) or 0, place.get(f"{side}.known", 0)))
-        packages = [(GROUPS[name], place[f"{name}.{GROUPS[name].features[0].name}"]) for name in others]
-        picked = None if list(self.names) == names and not others else np.array([place.get(n, 0) for n in self.names])
+        offsets = [offset for name in listed if (offset := side_of(name)) is not None]
+        inside = ["own", *(name for name in listed if side_of(name) is not None)]
+        inside += [name for name in ("role", "obstacle") if name in listed]
+        known = [f"{group}.{feature.name}" for group in inside for feature in group_named(group) or ()]
+        place = {name: number for number, name in enumerate(known)}
+        groups = []
+        for group in (name for name in listed if name in GROUPS):
+            names = [f"{group}.{feature.name}" for feature in GROUPS[group].features]
+            columns = [column for column, name in enumerate(self.names) if name in names]
+            groups.append((GROUPS[group], columns, [names.index(self.names[column]) for column in columns]))
+        split = [name.rpartition(".") for name in self.names]
+        own = [
+            (column, FEATURES[last], side_of(side) or 0)
+            for column, (side, _, last) in enumerate(split)
+            if self.names[column] not in place and side not in GROUPS
+        ]
         return Plan(
-            np.array(offsets, np.int64), "role" in groups, "obstacle" in groups, scaling_of(kernel_features),
-            tuple((group, at, scaling_of(group.features)) for group, at in packages), len(names), picked, tuple(own),
+            np.array(offsets, np.int64), "role" in listed, "obstacle" in listed,
+            np.array([place.get(name, -1) for name in self.names]), tuple(groups), tuple(own),
+            scaling_of(self.features),
         )  # fmt: skip
+
+
+def knows(state: State, body: int, other: int) -> NDArray[np.bool_]:
+    """Return whether a body may act on news of another one, which exists, [n]."""
+    if not 0 < other <= state.vehicles:
+        return np.zeros(state.n, np.bool_)
+    return np.asarray(state.time_s >= state.know[:, body, other])
 
 
 def scaling_of(features: Sequence[Feature]) -> Floats:
@@ -144,29 +147,14 @@ def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[n
 
     ``offset`` is that of the neighbour, who is ``known`` [n] or not; 0: a feature of the vehicle itself.
     """
-    name = own.feature.name
+    what = f"feature {own.feature.name!r} of vehicle_{body}"
     if offset and not known.any():
         value = np.full(state.n, own.unknown)
     else:
-        of = (body, body + offset) if offset else (body,)
-        try:
-            value = np.asarray(own.function(state.read_only(), *of))
-        except Exception as error:
-            raise InvalidInput(
-                f"feature {name!r}: its function fails for vehicle_{body}: {describe_error(error)}"
-            ) from error
-        if value.shape != (state.n,) or value.dtype.kind not in "fiub":
-            raise InvalidInput(
-                f"feature {name!r}: its function returned {value.dtype} values of shape {value.shape}; must return"
-                f" numbers of shape ({state.n},), one per world"
-            )
+        given = (state.read_only(), body, body + offset) if offset else (state.read_only(), body)
+        value = called(what, own.function, given, (state.n,))
         value = np.where(known, value, own.unknown) if offset else value
-    if not np.isfinite(value).all():
-        k = int(np.argmin(np.isfinite(value)))
-        raise InvalidInput(
-            f"feature {name!r}: its value is {value[k]} for vehicle_{body} in row {k} at {state.time_s[k]:g} s; must be"
-            " finite"
-        )
+    check_finite(what, value, state.time_s)
     return scaled(value, scaling_of([own.feature])[:, 0])
 
 
@@ -188,8 +176,11 @@ def fitting_deceleration(speed, latency_left, room):
 
 
 @large
-def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, scaling, value, out):
-    """Write the groups own, neighbours, role and obstacle, scaled, to ``out`` [n, observers, F]."""
+def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out):
+    """Write the features of the groups own, neighbours, role and obstacle, scaled, to ``out`` [n, observers, F].
+
+    They are computed in this order in ``value``, of which ``places`` [F] are written; none where it is -1.
+    """
     bodies = line.shape[2]
     for k in range(len(out)):
         w, c, time = line[k], car[k], clock[k, TIME]
@@ -227,5 +218,6 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, s
                         gap += w[GAP, p]
                     value[f], value[f + 1], value[f + 2] = 1.0, gap, w[HIT, 0]
                     value[f + 3], value[f + 4] = gap - own, fitting_deceleration(w[SPEED, i], left, gap)
-            for f in range(scaling.shape[1]):
-                out[k, o, f] = min(max(value[f] * scaling[0, f], scaling[1, f]), scaling[2, f])
+            for f in range(len(places)):
+                if places[f] >= 0:
+                    out[k, o, f] = min(max(value[places[f]] * scaling[0, f], scaling[1, f]), scaling[2, f])

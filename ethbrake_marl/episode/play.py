@@ -29,13 +29,6 @@ def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
 
 
 @large
-def copy(source, target):
-    """Copy one row."""
-    for i in range(target.shape[0]):
-        target[i] = source[i]
-
-
-@large
 def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, total, scratch, out):
     """Follow every plan [T, L], in place; write the harm to ``out`` [n]; stop above ``most`` [n]."""
     for k in range(len(out)):
@@ -52,10 +45,12 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, total, memory, ou
     """Write both counts of harm to ``out`` [2, n, C], if ``bodies`` hold the commands ``tried`` [n, C, B]."""
     scratch, here, commands = memory
     for k in range(tried.shape[0]):
-        copy(wanted[k], commands)
+        for i in range(len(commands)):
+            commands[i] = wanted[k, i]
         for j in range(tried.shape[1]):
             for row in range(here.shape[0]):
-                copy(line[k, row], here[row])
+                for i in range(len(commands)):
+                    here[row, i] = line[k, row, i]
             for b in range(len(bodies)):
                 commands[bodies[b]] = tried[k, j, b]
             failed = drive(here, car[k], commands, scratch, time[k], until) == FAILED
@@ -102,8 +97,8 @@ def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, unt
     """
     out = np.empty((2, *tried.shape[:2]))
     hold_worlds(
-        state.line, state.car, wanted, np.asarray(bodies, np.int64), tried, np.ascontiguousarray(state.time_s), until_s,
-        count == "total", working_memory(wanted.shape[1]), out,
+        state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(tried),
+        state.time_s.copy(), until_s, count == "total", working_memory(wanted.shape[1]), out,
     )  # fmt: skip
     return out
 

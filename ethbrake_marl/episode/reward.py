@@ -22,8 +22,8 @@ from ethbrake_marl.episode.terms import (
     collision,
     component,
     components_of,
+    growth,
     jerk,
-    objective_term,
     risk,
 )
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -174,9 +174,9 @@ class Rewarding(NamedTuple):
 
     params: RewardParams
     counted: tuple[str, ...]  # names of the terms whose weight is not 0
-    terms: tuple[tuple[str, float, TermFunction], ...]  # name, weight and function
+    terms: tuple[tuple[str, TermFunction], ...]  # name and function
     shaping: Shaping | None
-    components: tuple[tuple[str, TermFunction], ...]  # of a vector reward
+    components: tuple[str, ...]  # of a vector reward
 
     @classmethod
     def of(
@@ -205,21 +205,20 @@ class Rewarding(NamedTuple):
             whole = True
         total = params.harm_count == "total"
         rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, total)
-        settings = params.ttc_scale_s, params.safety_buffer_m, params.target_gap_m, params.distance_slope_per_m
+        counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
+        components = () if vector is None else components_of(vector, counted, vehicles)
         functions: dict[str, TermFunction] = {
-            "collision": partial(collision, params.k_energy),
-            "risk": partial(risk, settings),
+            "harm": partial(growth, objectives, params.harm_count),
+            "collision": partial(collision, params),
+            "risk": partial(risk, params),
             "jerk": jerk,
             **{name: TERMS[name].value for name in params.terms},
+            **{name: component(name, params.harm_count) for name in components if name not in counted},
         }
-        if not whole:
-            functions = {"harm": objective_term(objectives, params.harm_count), **functions}
-        terms = [(name, params.weights[name], function) for name, function in functions.items() if params.weights[name]]
+        needed = {*counted, *components} - ({"harm"} if whole else set())
+        terms = tuple((name, function) for name, function in functions.items() if name in needed)
         shaping = Shaping(rules, params.shaping_discount) if params.shaping else None
-        counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
-        names = () if vector is None else components_of(vector, counted, vehicles)
-        parts = [(name, component(name, vehicles, params.harm_count) or partial(_value, name)) for name in names]
-        return cls(params, counted, tuple(terms), shaping, tuple(parts)), rules
+        return cls(params, counted, terms, shaping, components), rules
 
     @property
     def is_compiled(self) -> bool:
@@ -228,18 +227,19 @@ class Rewarding(NamedTuple):
 
     def complete(self, before: State, step: Step, after: State) -> tuple[State, Step]:
         """Return the state with the memory of the reward, and the step with the whole reward."""
-        values = {name: function(before, step, after) for name, _, function in self.terms}
+        values = {name: function(before, step, after) for name, function in self.terms}
         if self.shaping is not None:
             values["shaping"], memory = self.shaping.value(before, step, after)
             after = after._replace(memories={**after.memories, "shaping": memory})
         extra, weights = np.zeros(step.reward.shape), self.params.weights
         for name, value in values.items():
-            extra += weights[name] * _wide(value)
+            if name in self.counted:
+                extra += weights[name] * _wide(value)
         extra[before.ended] = 0.0
-        step = step._replace(reward=step.reward + extra, terms={**self.shared(step), **values})
+        known = {**self.shared(step), **values}
+        step = step._replace(reward=step.reward + extra, terms={n: v for n, v in known.items() if n in self.counted})
         if self.components:
-            parts = [np.broadcast_to(_wide(each(before, step, after)), extra.shape) for _, each in self.components]
-            vector = np.stack(parts, axis=2)
+            vector = np.stack([np.broadcast_to(_wide(known[name]), extra.shape) for name in self.components], axis=2)
             vector[before.ended] = 0.0
             step = step._replace(vector=vector)
         return after, step
@@ -253,7 +253,3 @@ class Rewarding(NamedTuple):
 
 def _wide(value: Floats) -> Floats:
     return value if value.ndim == 2 else value[:, np.newaxis]
-
-
-def _value(name: str, before: State, step: Step, after: State) -> Floats:
-    return step.terms[name]

@@ -22,18 +22,18 @@ obstacle    minus the harm of impacts with the obstacle
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.objectives import Objective, amounts
+from ethbrake_marl.episode.functions import called, check_finite, described
+from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.play import descend
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, describe_error, unknown_name
+from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
 from ethbrake_marl.motion.layout import FIRST, TOTAL, Floats
 from ethbrake_marl.registry import Registry
@@ -53,26 +53,11 @@ class Term(NamedTuple):
 
     def value(self, before: State, step: Step, after: State) -> Floats:
         """Return the value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns something else."""
-        what = f"term {self.name!r}"
-        try:
-            value = np.asarray(self.function(before.read_only(), step, after.read_only()))
-        except Exception as error:
-            raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
-        right = (after.n,), (after.n, after.vehicles)
-        if value.shape not in right or value.dtype.kind not in "fiub":
-            raise InvalidInput(
-                f"{what}: its function returned {value.dtype} of shape {value.shape}; must return numbers of shape"
-                f" {right[0]}, one per world, or {right[1]}, one per vehicle"
-            )
+        what, given = f"term {self.name!r}", (before.read_only(), step, after.read_only())
+        value = called(what, self.function, given, (after.n,), (after.n, after.vehicles))
         running = ~before.ended
         value = np.where(running if value.ndim == 1 else running[:, np.newaxis], value, 0.0)
-        if not np.isfinite(value).all():
-            row, *vehicle = np.argwhere(~np.isfinite(value))[0]
-            whose = "".join(f" for vehicle_{i + 1}" for i in vehicle)
-            raise InvalidInput(
-                f"{what}: its value is {value[(row, *vehicle)]}{whose} in row {row} at step {after.steps[row]}; must be"
-                " finite"
-            )
+        check_finite(what, value, after.time_s)
         return value
 
 
@@ -88,16 +73,11 @@ def register_term(name: str, function: TermFunction, *, unit: str = "1") -> None
         unit: unit of the value.
 
     """
-    if not isinstance(name, str) or re.fullmatch(r"(?!.*_[0-9]+\Z)[a-z][a-z0-9_]{0,63}", name) is None:
-        raise InvalidInput(
-            f"term {name!r:.80}: the name must be 1 to 64 characters a-z, 0-9 and _, beginning with a letter and not"
-            " ending in _ and a number"
-        )
-    if not callable(function) or not (function.__doc__ or "").strip():
-        raise InvalidInput(f"term {name!r}: must be a function with a docstring that describes the term")
+    form = "a-z, 0-9 and _, beginning with a letter and not ending in _ and a number"
+    meaning = described("term", name, function, r"(?!.*_[0-9]+\Z)[a-z][a-z0-9_]{0,63}", form)
     if name in BUILT_IN:
         raise AlreadyExists(f"term {name!r}: this name is already in use; give another name")
-    term = Term(name, function, str(unit), " ".join(str(function.__doc__).split()))
+    term = Term(name, function, str(unit), meaning)
     TERMS.add(name, term, lambda other: other == term)
 
 
@@ -113,9 +93,9 @@ BUILT_IN = {  # name -> (unit, meaning)
 }
 
 
-def collision(k_energy: float, before: State, step: Step, after: State) -> Floats:
-    """Return the term collision, [n]."""
-    return -k_energy * step.total_harm
+def collision(params: Any, before: State, step: Step, after: State) -> Floats:
+    """Return the term collision, [n]; ``params`` are ``RewardParams``."""
+    return -params.k_energy * step.total_harm
 
 
 def jerk(before: State, step: Step, after: State) -> Floats:
@@ -124,15 +104,14 @@ def jerk(before: State, step: Step, after: State) -> Floats:
     return -rate * rate
 
 
-def risk(settings: tuple[float, float, float, float], before: State, step: Step, after: State) -> Floats:
-    """Return the term risk, [n, N]; tau, d_safe, d_target and k_d are the settings, in this order."""
-    ttc_scale_s, safety_buffer_m, target_gap_m, distance_slope_per_m = settings
+def risk(params: Any, before: State, step: Step, after: State) -> Floats:
+    """Return the term risk, [n, N]; ``params`` are ``RewardParams``."""
     closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
-    room = np.maximum(after.gaps_m - safety_buffer_m, 0.0)
+    room = np.maximum(after.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0
     time_to_collision = room / np.where(approaching, closing, 1.0)
-    urgency = np.where(approaching, logistic(-time_to_collision / ttc_scale_s), 0.0)
-    pair_risk = -(urgency + logistic(distance_slope_per_m * (target_gap_m - after.gaps_m)))
+    urgency = np.where(approaching, logistic(-time_to_collision / params.ttc_scale_s), 0.0)
+    pair_risk = -(urgency + logistic(params.distance_slope_per_m * (params.target_gap_m - after.gaps_m)))
     total = np.zeros(after.speeds_mps.shape)
     total[:, :-1] += pair_risk
     total[:, 1:] += pair_risk
@@ -171,31 +150,19 @@ class Shaping(NamedTuple):
         return value, new
 
 
-def objective_term(objectives: Sequence[Objective], count: str) -> TermFunction:
+def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
     """Return the term harm of vehicles with objectives, [n, N]."""
-    return partial(_objective_term, objectives, count)
-
-
-def _objective_term(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
     return -amounts(objectives, before, after, count)
 
 
-def component(name: str, vehicles: int, count: str) -> TermFunction | None:
-    """Return the term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]; None for another name."""
-    row = TOTAL if count == "total" else FIRST
-    for k in range(vehicles):
-        if name == f"harm_{k + 1}":
-            return partial(_borne, k, row, count)
-    pairs = {"obstacle": 0, **{f"pair_{p}_{p + 1}": p for p in range(1, vehicles)}}
-    if name not in pairs:
-        return None
-    return partial(_of_pair, pairs[name], row)
+def component(name: str, count: str) -> TermFunction:
+    """Return the term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]."""
+    row, number = TOTAL if count == "total" else FIRST, int(name.rpartition("_")[2]) if "_" in name else 1
+    return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, row)
 
 
-def _borne(vehicle: int, row: int, count: str, before: State, step: Step, after: State) -> Floats:
-    since = after.line.copy()
-    since[:, row] -= before.line[:, row]
-    return 0.0 - after._replace(line=since).borne_harm(count)[:, vehicle]
+def _borne(vehicle: int, row: int, before: State, step: Step, after: State) -> Floats:
+    return 0.0 - Harm.of(after.line[:, row] - before.line[:, row], after.car).borne[:, vehicle]
 
 
 def _of_pair(pair: int, row: int, before: State, step: Step, after: State) -> Floats:

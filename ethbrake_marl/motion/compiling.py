@@ -9,11 +9,8 @@ machine code is therefore named by the digest of the core's kernels and of all k
 
 from __future__ import annotations
 
-import atexit
 import hashlib
-import os
 import shutil
-import tempfile
 import warnings
 from collections.abc import Callable
 from functools import cache
@@ -23,22 +20,20 @@ from typing import Any, TypeVar
 import numba
 from numba.core import config, event
 
-from ethbrake_marl.kernel_store import tell_compilation
+from ethbrake_marl.kernel_store import cache_folder, can_be_trusted, home_folder, is_temporary, tell_compilation
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).parents[1]
 SOURCES = ("motion", "episode")  # folders with the core's kernels
 _MARK = b"motion.compiling import"  # in every other file with kernels
-LEAST_FREE_BYTES = 50_000_000
-TEMPORARY = "ethbrake_marl-"
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
     """Says so when this process compiles its first kernel; one that is loaded says nothing."""
 
     def on_start(self, happened: event.Event) -> None:
-        tell_compilation(not any(cache_home().rglob("*.nbi")))
+        tell_compilation()
 
     def on_end(self, happened: event.Event) -> None:
         pass
@@ -51,7 +46,7 @@ def _compile(function: Function, **options: Any) -> Function:
     before, config.CACHE_DIR = config.CACHE_DIR, str(folder_of(function.__code__.co_filename))
     try:
         compiled: Function = numba.njit(
-            cache=True, nogil=True, error_model="numpy", boundscheck=False, _nrt=False, **options
+            cache=True, nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True, _nrt=False, **options
         )(function)
     finally:
         config.CACHE_DIR = before
@@ -72,63 +67,36 @@ def large(function: Function) -> Function:
 def folder_of(file: str) -> Path:
     """Return the folder with the machine code of the kernels in ``file``, which may call those of the files beside it.
 
-    If the user's cache cannot be written, or its disk is full, this is a temporary folder, to which machine code that
-    may only be read (a container's image) is copied. Warns if there is none to copy.
+    If the cache folder is temporary, machine code that may only be read (a container's image) is copied into it. Warns
+    if there is none to copy.
     """
     digest = hashlib.sha256()
     beside = {path for path in Path(file).parent.glob("*.py") if _MARK in path.read_bytes()}
     core = {path for name in SOURCES for path in (PACKAGE / name).glob("*.py")}
     for path in sorted({Path(file)} | beside | core):
         digest.update(path.name.encode() + path.read_bytes())
-    kept, temporary = cache_home() / digest.hexdigest()[:16], _temporary() / digest.hexdigest()[:16]
-    if _has_room(kept):
-        return kept
+    folder = cache_folder() / digest.hexdigest()[:16]
+    if is_temporary(cache_folder()) and not _has_copied(home_folder(), folder):
+        _warn_once()
+    return folder
+
+
+def _has_copied(home: Path | None, folder: Path) -> bool:
+    """Copy the machine code for a temporary ``folder``; return False if there is none that may be read and trusted."""
     try:
-        if _is_ours(kept) and any(kept.iterdir()):
-            shutil.copytree(kept, temporary, dirs_exist_ok=True)
-            return temporary
+        kept = None if home is None or not can_be_trusted(home) else home / folder.name
+        if kept is None or not any(kept.rglob("*.nbi")):
+            return False
+        shutil.copytree(kept, folder, dirs_exist_ok=True)
     except OSError:
-        pass
-    _warn_once()
-    return temporary
+        return False
+    return True
 
 
 @cache
 def _warn_once() -> None:
     warnings.warn(
-        f"{cache_home()}: cannot be written, or its disk is full, so every process compiles the physics again (20 s);"
+        f"{home_folder()}: cannot be written, or its disk is full, so every process compiles the physics again (20 s);"
         " set NUMBA_CACHE_DIR to a folder that can be written",
         stacklevel=2,
     )
-
-
-@cache
-def cache_home() -> Path:
-    """Return the folder for the machine code of this package, under ``$NUMBA_CACHE_DIR`` or the user's cache."""
-    try:
-        root = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    except RuntimeError:  # no HOME, and the user id has no name
-        return _temporary()
-    return Path(root) / "ethbrake_marl"
-
-
-def _has_room(folder: Path) -> bool:
-    """Return whether this user can write into a folder, which nobody else can have filled, and the disk is not full."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return _is_ours(folder) and shutil.disk_usage(folder).free >= LEAST_FREE_BYTES
-    except OSError:
-        return False
-
-
-def _is_ours(folder: Path) -> bool:
-    """Return whether this user or root owns a folder: its machine code will be run."""
-    return not hasattr(os, "getuid") or folder.stat().st_uid in (0, os.getuid())
-
-
-@cache
-def _temporary() -> Path:
-    folder = Path(tempfile.gettempdir()) / f"{TEMPORARY}{os.getpid()}-{os.urandom(4).hex()}"
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder

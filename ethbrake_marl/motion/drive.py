@@ -280,29 +280,12 @@ def move_apart(line, car, scratch, duration, ahead, builds):
 
 
 @kernel
-def move_by_events(line, car, scratch, duration, ahead, builds):
-    """Move the line to the end of the interval from event to event; return False if a check failed."""
-    now = 0.0
-    for _ in range(MOST_EVENTS):
-        if resolve_impacts(line, car, scratch, now, ahead):
-            continue
-        if now >= duration:
-            return True
-        parting = accelerate(line, car, scratch, ahead, builds)
-        passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
-        if not move(line, scratch, passed, ahead, builds):
-            return False
-        for i in range(ahead, line.shape[1]):
-            if scratch[ONSET, i] - now <= passed:
-                scratch[ACTIVE, i] = 1.0
-        now = duration if passed >= duration - now else now + passed
-    return False
-
-
-@kernel
 def through_interval(line, car, scratch, start, until, ahead, builds):
-    """Do the work of ``drive``. ``builds`` must be a constant."""
-    bodies, duration, met = line.shape[1], until - start, APART
+    """Do the work of ``drive``: at once if no two bodies touch, otherwise from event to event.
+
+    ``builds`` must be a constant.
+    """
+    bodies, duration, met, now = line.shape[1], until - start, APART, 0.0
     for i in range(ahead, bodies):
         scratch[ONSET, i] = car[LATENCY, i] - start
         scratch[ACTIVE, i] = 1.0 if scratch[ONSET, i] <= 0.0 else 0.0
@@ -317,7 +300,21 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
             scratch[CONTACT_SPEED, i] = scratch[NEW_FIRST, i] = scratch[NEW_TOTAL, i] = scratch[NEW_COUNT, i] = 0.0
             scratch[NEXT_TIME, i], scratch[NEXT_CLOSING, i] = math.inf, 0.0
             scratch[FRONT_CHANGE, i] = scratch[REAR_CHANGE, i] = 0.0
-        met = MET if move_by_events(line, car, scratch, duration, ahead, builds) else FAILED
+        met = FAILED
+        for _ in range(MOST_EVENTS):
+            if resolve_impacts(line, car, scratch, now, ahead):
+                continue
+            if now >= duration:
+                met = MET
+                break
+            parting = accelerate(line, car, scratch, ahead, builds)
+            passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
+            if not move(line, scratch, passed, ahead, builds):
+                break
+            for i in range(ahead, bodies):
+                if scratch[ONSET, i] - now <= passed:
+                    scratch[ACTIVE, i] = 1.0
+            now = duration if passed >= duration - now else now + passed
         for p in range(ahead, bodies - 1):
             line[FIRST, p] += scratch[NEW_FIRST, p]
             line[TOTAL, p] += scratch[NEW_TOTAL, p]

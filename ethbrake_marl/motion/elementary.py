@@ -1,9 +1,9 @@
-"""Exponential, logarithm and normal quantile, computed with + - * / and sqrt only, so all machines get the same bits.
+"""Exponential, logarithm and normal quantile by exact operations, + - * / and sqrt, so all machines get the same bits.
 
 The C library and numpy have several implementations of exp, log and pow, and choose one by the processor. The results
 of these implementations differ in the last bits. The functions of this module do the same IEEE operations in the same
 order on every machine, so worlds drawn from a seed have the same bits everywhere. Each error bound in this module is
-the largest error, rounded up, that a comparison with values of 40 digits has shown (tests/motion/test_elementary.py).
+the largest error, rounded up, that a comparison with values of 40 digits has shown.
 """
 
 from __future__ import annotations
@@ -16,61 +16,43 @@ from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import Floats
 
 PER_LN2 = 1.4426950408889634
-
 _LN2_HIGH = 0.693147180369123816490  # its last 32 bits are 0, so its product with a whole number below 2^32 is exact
-
 _LN2_LOW = 1.90821492927058770002e-10
-
-_SQRT2 = 1.4142135623730951
-
+_SQRT_HALF = 0.7071067811865476
 _PER_SQRT_2PI = 0.3989422804014327
-
 _LARGEST_EXPONENT = 709.782712893384  # e to this power, or more, overflows a double
-
 _LEAST_EXPONENT = -708.0  # below this exp returns 0 instead of a number under 3e-308
-
 _EXP = tuple(1.0 / math.factorial(k) for k in range(13, -1, -1))  # Taylor's series, highest power first
-
 _LOG = tuple(2.0 / k for k in range(25, 1, -2))  # series of 2 artanh(s) / s - 2 in s^2, highest power first
 
 # x = q (sqrt(2 pi) + q^2 P(q^2)) for q = p - 1/2 up to 1/4; else x = C - t N(t) / Q(t) - r for r = sqrt(-2 ln p): one
 # set for t = r - 1.65 up to r = 4, one for t = r - 4 up to 10.3. Fitted to quantiles of 60 digits at Chebyshev nodes.
 _SQRT_2PI = 2.5066282746310005
-
 _SQRT_2PI_LOW = -1.8328579980459168e-16
-
 _CENTRE = (
     *(18944880.09719004886, -2601371.67573968287, 693994.2277388069859, 43161.61138466289868, 22235.96413435671455),
     *(5825.684752120609166, 1690.927397560813073, 496.2580620421304563, 149.8299419042506391, 47.03578667872906836),
     *(15.66760896558029334, 5.772533538609159947, 2.624934990953737101),
 )
-
 _NEAR_N = (
     *(6.1185316165014996e-7, 0.00008261143491068899677, 0.002322868125000261793, 0.02490544383476077933),
     *(0.1311039275523617481, 0.3712863146520682371, 0.5402166937189504813, 0.3135851649710710218),
 )
-
 _NEAR_Q = (
     *(6.147238663971861779e-7, 0.0000873801370475760379, 0.002763799911765273603, 0.03519014821667497178),
     *(0.2297472124395027504, 0.8540322507157666525, 1.833041457545810481, 2.108039519865067479, 1.0),
 )
-
 _FAR_N = (
     *(7.698177493540387221e-10, 2.577566285595523487e-7, 0.00001747840342402818464, 0.0004218995970155167333),
     *(0.004540379350103703873, 0.02472412625213424433, 0.0718366187418152831, 0.09339620476270569954),
 )
-
 _FAR_Q = (
     *(1.285585017040169419e-9, 4.476251633827289854e-7, 0.00003350272214316739949, 0.000953171528510754796),
     *(0.0129777876898960319, 0.09549439826703192372, 0.4028001940673617521, 0.951490915339779628, 1.0),
 )
-
 _NEAR, _NEAR_C = 1.65, 0.9953300906244928
-
 _FAR, _FAR_C = 4.0, 0.5988073438553344
-
 _LEAST_PROBABILITY = 1e-22  # scenarios draw no smaller probability: 2^-53 times the least mass of a normal
-
 _FRACTIONS = 150  # terms of the continued fraction: for x >= 2 its remainder is below 1e-17
 
 
@@ -81,19 +63,6 @@ def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
     for coefficient in coefficients:
         total = total * x + coefficient
     return total
-
-
-@kernel
-def power_of_two(k: int) -> float:
-    """Return ``2^k`` exactly, for k from -1022 to 1023."""
-    base, power = (2.0, k) if k >= 0 else (0.5, -k)
-    result = 1.0
-    while power > 0:
-        if power % 2:
-            result *= base
-        base *= base
-        power //= 2
-    return result
 
 
 @kernel
@@ -117,7 +86,7 @@ def exp(x: float) -> float:
     if x < _LEAST_EXPONENT:
         return 0.0
     k = math.floor(x * PER_LN2 + 0.5)
-    return exp_rest(x, k) * power_of_two(k - 1) * 2.0
+    return math.ldexp(exp_rest(x, k), k)
 
 
 @kernel
@@ -128,13 +97,9 @@ def _log_parts(x: float) -> tuple[float, float]:
     ``ln 2``; this product is exact. The second number is the rest of ``k ln 2``, plus the series of
     ``ln m = 2 artanh((m - 1) / (m + 1))``.
     """
-    k, m = 0, x
-    while m >= _SQRT2:
-        m *= 0.5
-        k += 1
-    while m < 0.5 * _SQRT2:
-        m *= 2.0
-        k -= 1
+    m, k = math.frexp(x)
+    if m < _SQRT_HALF:
+        m, k = 2.0 * m, k - 1
     f = m - 1.0
     s = f / (2.0 + f)
     half = 0.5 * f * f
@@ -202,42 +167,30 @@ def normal_probability(x: float) -> float:
 
 
 @large
-def _exp_each(values, out):
+def _each(values, which, out):
     for i in range(len(out)):
-        out[i] = exp(values[i])
+        out[i] = exp(values[i]) if which == 0 else log(values[i]) if which == 1 else normal_quantile(values[i])
 
 
-@large
-def _log_each(values, out):
-    for i in range(len(out)):
-        out[i] = log(values[i])
-
-
-@large
-def _normal_quantile_each(values, out):
-    for i in range(len(out)):
-        out[i] = normal_quantile(values[i])
+def _of_each(values: Floats, which: int) -> Floats:
+    out = np.empty(values.size)
+    _each(np.array(values).ravel(), which, out)
+    return out.reshape(values.shape)
 
 
 def exp_each(values: Floats) -> Floats:
     """Return ``exp`` of each entry, in the same shape."""
-    out = np.empty(values.size)
-    _exp_each(np.ascontiguousarray(values).ravel(), out)
-    return out.reshape(values.shape)
+    return _of_each(values, 0)
 
 
 def log_each(values: Floats) -> Floats:
     """Return ``log`` of each entry, in the same shape."""
-    out = np.empty(values.size)
-    _log_each(np.ascontiguousarray(values).ravel(), out)
-    return out.reshape(values.shape)
+    return _of_each(values, 1)
 
 
 def normal_quantile_each(values: Floats) -> Floats:
     """Return ``normal_quantile`` of each entry, in the same shape."""
-    out = np.empty(values.size)
-    _normal_quantile_each(np.ascontiguousarray(values).ravel(), out)
-    return out.reshape(values.shape)
+    return _of_each(values, 2)
 
 
 def logistic(values: Floats) -> Floats:

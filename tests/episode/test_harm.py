@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.episode.injury import injured, injury_probability, speed_changes
+from ethbrake_marl.episode.injury import injured, risks, speed_changes
 from ethbrake_marl.episode.objectives import amounts, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State, split_harm
-from ethbrake_marl.errors import InvalidInput, UnknownName
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.worlds.game import game_of
 from tests.episode.lines import later, state_of
@@ -74,6 +74,7 @@ def test_harm_of_the_obstacle__is_that_of_vehicle_1() -> None:
     assert state.obstacle_gap_m.tolist() == [0.0] and not state.speeds_mps.any()
     alone = later(state_of([50.0], [20.0, 0.0], obstacle_gap_m=10.0), 0.0, 1.0)
     assert alone.collided.tolist() == [True] and not alone.pair_hit.any()
+    assert np.isinf(state_of([50.0], [20.0, 0.0]).obstacle_gap_m).all()
 
 
 # ---------------------------------------------------------------- objectives
@@ -115,10 +116,6 @@ def test_objective__by_hand(objective: Any, harm: list[float]) -> None:
     assert of_objective(objective, met()) == pytest.approx(harm, abs=1e-8)
 
 
-def test_objective__of_total_harm() -> None:
-    assert of_objective(("total", "own", "maximin"), met(), "total") == [42.0, 14.0, 20.0]  # pair 2 gives 10 and 20
-
-
 @pytest.mark.parametrize("objective", ["own", "maximin", "social:30", "weighted:1,4,2", "injury:lr4s"])
 def test_objective__of_some_time_is_what_it_has_grown_by(objective: str) -> None:
     before, after = met((12.0, 0.0)), met((12.0, 9.0))
@@ -153,34 +150,25 @@ def test_injuries__by_hand() -> None:
     assert of_objective("injury:lr4s", met()) == pytest.approx([expected] * 3, abs=1e-8)
 
 
-def test_injuries__grow_with_a_harder_impact() -> None:
-    # though a hit at the rear counts for less than one in front
-    each = [of_objective("injury:lr4s", met((400.0, w * w)))[0] for w in (19.9, 20.0, 20.1)]
-    assert each == sorted(set(each))
-
-
 @pytest.mark.parametrize(
     ("curve", "side", "dv", "probability"),
     [
-        ("lr4s", "front", 10.0, 1 / (1 + np.exp(4.457 - 1.77))),
-        ("lr4s", "rear", -10.0, 1 / (1 + np.exp(4.888 - 1.77))),
-        ("gidas", "front", 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
-        ("gidas", "rear", 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
-        ("reference", "front", 10.0, (10 / 51.287) ** 1.531),
-        ("reference", "rear", 10.0, (10 / 66.956) ** 1.531),
-        ("reference", "front", 60.0, 1.0),
-        ("reference", "rear", 0.0, 0.0),
+        ("lr4s", 0, 10.0, 1 / (1 + np.exp(4.457 - 1.77))),
+        ("lr4s", 1, 10.0, 1 / (1 + np.exp(4.888 - 1.77))),
+        ("gidas", 0, 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
+        ("gidas", 1, 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
+        ("reference", 0, 10.0, (10 / 51.287) ** 1.531),
+        ("reference", 1, 10.0, (10 / 66.956) ** 1.531),
+        ("reference", 0, 60.0, 1.0),
+        ("reference", 1, 0.0, 0.0),
     ],
 )
-def test_probability__of_an_injury_by_hand(curve: str, side: Any, dv: float, probability: float) -> None:
-    assert injury_probability(np.array([dv]), side, curve)[0] == pytest.approx(probability, rel=1e-12)
-
-
-def test_probability__names_what_is_there() -> None:
-    with pytest.raises(UnknownName, match="lr4s"):
-        injury_probability(np.ones(1), "front", "lr4")
-    with pytest.raises(UnknownName, match="front"):
-        injury_probability(np.ones(1), "left")  # type: ignore[arg-type]
+def test_probability__of_an_injury_by_hand(curve: str, side: int, dv: float, probability: float) -> None:
+    changes = np.zeros((1, 2, 1))
+    changes[0, side] = dv
+    assert risks(changes, curve)[0, :, 0].tolist() == pytest.approx(
+        [0.0] * side + [probability] + [0.0] * (1 - side), rel=1e-12
+    )
 
 
 def test_injured__by_the_larger_change_of_each_vehicle() -> None:

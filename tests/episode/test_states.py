@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import hold, price
+from ethbrake_marl.episode.play import descend, hold, price
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.worlds.game import game_of
 
@@ -137,3 +137,32 @@ def test_hold__is_the_harm_of_constant_commands() -> None:
         while not now.ended.all():
             now, _ = game.step(now, np.full((N, 1), share))
         np.testing.assert_allclose(found[:, :, c], [now.harm("total"), now.harm("first")], rtol=1e-9, atol=1e-9)
+
+
+def test_descend__returns_the_commands_whose_harm_it_tells() -> None:
+    scenario, game = game_of("cooperation-3-pair")
+    state, shares, learners = scenario.sample(50, 3), np.linspace(0.0, 1.0, 5), game.rules.learners.tolist()
+    wanted, least = descend(state, learners, shares, 2, 8.0, "first")
+    found = hold(state, wanted, learners, wanted[:, np.newaxis, learners], 8.0, "first")[0, :, 0]
+    assert found.tolist() == least.tolist()
+    alone = descend(state, learners[1:], shares, 1, 8.0, "first")[1]
+    assert (least <= alone).all() and (least < alone - 1.0).any()
+
+
+class Counts:
+    """A script that adds to its memory in place."""
+
+    name = "counts"
+
+    def begin(self, alert: State, body: int) -> Any:
+        return np.zeros(alert.n)
+
+    def act(self, state: State, memory: Any, body: int) -> Any:
+        memory += 1.0
+        return np.zeros(state.n), memory
+
+
+def test_memory_of_a_script__cannot_be_changed_in_place_because_plays_share_it() -> None:
+    _, game = game_of("paper-random")
+    with pytest.raises(AgentFailed, match="vehicle_3: act fails: ValueError: output array is read-only"):
+        game._replace(scripts={3: Counts()}).start(2, 7, 0)

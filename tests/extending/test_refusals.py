@@ -110,16 +110,16 @@ def test_name__is_unknown(message: str) -> None:
 )
 def test_feature__gives_a_finite_number_per_world(given: Any, message: str) -> None:
     eb.register_feature("mine", gives(given), **SCALED)
-    with pytest.raises(InvalidInput, match=f"feature 'mine': .*{message}"):
+    with pytest.raises(InvalidInput, match=f"feature 'mine' of vehicle_1: .*{message}"):
         eb.parallel_env(scenario=PAPER, observation=["mine"]).reset(seed=1)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (1.0, "its function returned float64 values of shape () for vehicle_1; must return finite numbers"),
-        (lambda harm, vehicle: np.full(len(harm.whole), np.nan), "its function returned float64 values"),
-        (lambda harm, vehicle: harm.pears, "its function fails for vehicle_1: AttributeError"),
+        (1.0, "its function returned float64 of shape (); must return numbers of shape (1,), one per world"),
+        (lambda harm, vehicle: np.full(len(harm.whole), np.nan), "its value is not finite in row 0"),
+        (lambda harm, vehicle: harm.pears, "its function fails: AttributeError"),
     ],
     ids=["shape", "nan", "error"],
 )
@@ -127,7 +127,7 @@ def test_objective__gives_a_finite_number_per_world(given: Any, message: str) ->
     eb.register_objective("mine", gives(given))
     env = eb.parallel_env(scenario=PAPER, reward={"harm": 1.0, "objective": "mine"})
     env.reset(seed=1)
-    with refused(f"objective 'mine': {message}"):
+    with refused(f"objective 'mine' of vehicle_1: {message}"):
         env.step({"vehicle_2": [0.0]})
 
 

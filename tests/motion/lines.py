@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import drive
 from ethbrake_marl.motion.layout import Floats, scratch_for
 
@@ -44,21 +43,14 @@ def lines(
     return line, car
 
 
-@large
-def _drive_each(line, car, wanted, scratch, start, until, met, rows):
-    for k in range(len(met)):
-        met[k] = drive(line[k], car[k], wanted[k], scratch, start[k], until[k])
-        for row in range(scratch.shape[0]):
-            for i in range(scratch.shape[1]):
-                rows[k, row, i] = scratch[row, i]
-
-
 def driven(line: Floats, car: Floats, command: Any, start: Any, until: Any) -> tuple[Floats, Floats, Floats]:
     """Return the lines after an interval, what ``drive`` met, and its scratch memory [n, ROWS, N + 1]."""
     n, bodies = len(line), line.shape[2]
-    wanted, after, met = np.zeros((n, bodies)), line.copy(), np.zeros(n, np.int64)
+    wanted, after, met, scratch = np.zeros((n, bodies)), line.copy(), np.zeros(n, np.int64), scratch_for(bodies)
     wanted[:, 1:] = command
     rows = np.zeros((n, at.ROWS, bodies))
-    times = (np.broadcast_to(np.float64(time), (n,)).copy() for time in (start, until))
-    _drive_each(after, car, wanted, scratch_for(bodies), *times, met, rows)
+    times = np.broadcast_to(np.float64(start), n).tolist(), np.broadcast_to(np.float64(until), n).tolist()
+    for k in range(n):
+        met[k] = drive(after[k], car[k], wanted[k], scratch, times[0][k], times[1][k])
+        rows[k] = scratch
     return after, met, rows

@@ -104,9 +104,9 @@ def exactly(runs: Runs, k: int) -> Floats:
         world = exact.Line(
             gaps, speeds, rationals(command), left, mass, limit, Fraction(float(car[at.RESTITUTION, 0])), obstacle
         )
-        gaps, speeds, hits, _, obstacle = exact.simulate(world, Fraction(end - start), bits=160)
-        for hit in hits:
-            harm, p = float(hit.closing) ** 2, hit.pair + 1
+        gaps, speeds, hits, obstacle = exact.Run(world).to(Fraction(end - start))
+        for pair, closing in hits:
+            harm, p = float(closing) ** 2, pair + 1
             line[at.FIRST, p] += 0.0 if line[at.HIT, p] else harm
             line[at.HIT, p] = 1.0
             line[at.TOTAL, p] += harm

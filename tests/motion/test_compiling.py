@@ -1,12 +1,20 @@
-"""Where machine code is kept, and what happens where it cannot be. Each case compiles one small kernel in a process."""
+"""Where machine code is kept, and what happens where it cannot be."""
 
 import os
 import shutil
 import subprocess
 import sys
+import tempfile
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
+
+from ethbrake_marl import kernel_store
+from ethbrake_marl.motion import compiling
 
 KERNELS = """\
 from ethbrake_marl.motion.compiling import folder_of, kernel, large
@@ -19,117 +27,91 @@ def twice(x):
 def answer(x):
     return twice(x) + 2.0
 """
-ASK = "import kernels; print(kernels.answer(20.0), kernels.folder_of(kernels.__file__), {state})"
-HITS = "sum(kernels.answer.stats.cache_hits.values())"
-ROOT = Path(__file__).parents[2]
+ASK = """\
+import sys, ethbrake_marl.kernel_store as store
+store.on_first_compilation(lambda folder, is_empty: print("compiles", is_empty))
+import kernels
+print(kernels.answer(20.0), kernels.folder_of(kernels.__file__))
+"""
 
 
-class Place:
-    """A folder with a module of kernels, and the environment of the processes that use it."""
+def test_machine_code__is_loaded_until_a_source_changes(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.getcwd()}"}
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.cache = folder, folder / "cache"
-        self.cache.mkdir()
-        self.environment = {
-            **{name: value for name, value in os.environ.items() if name not in ("HOME", "XDG_CACHE_HOME")},
-            "NUMBA_CACHE_DIR": str(self.cache), "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}", "HOME": str(folder),
-            "TMPDIR": str(folder),
-        }  # fmt: skip
-        self.write(2.0)
+    def ask(factor: float) -> list[str]:
+        (tmp_path / "kernels.py").write_text(KERNELS.format(factor=factor))
+        done = subprocess.run([sys.executable, "-c", ASK], env=environment, text=True, capture_output=True, check=True)
+        assert done.stderr == ""
+        return done.stdout.split()
 
-    def write(self, factor: float) -> None:
-        (self.folder / "kernels.py").write_text(KERNELS.format(factor=factor))
-
-    def begin(self, first: str = "", **changes: str | None) -> subprocess.Popen[str]:
-        environment = {name: value for name, value in {**self.environment, **changes}.items() if value is not None}
-        return subprocess.Popen(
-            [sys.executable, "-c", first + ASK.format(state=HITS)],
-            env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        )  # fmt: skip
-
-    def ask(self, first: str = "", **changes: str | None) -> tuple[float, Path, bool, str]:
-        """Return the kernel's answer, the folder of its machine code, whether it was loaded, and what was warned."""
-        return told(self.begin(first, **changes))
+    *said, answer, folder = ask(2.0)
+    assert (said, answer) == (["compiles", "True"], "42.0") and Path(folder).is_relative_to(cache)
+    assert ask(2.0) == ["42.0", folder]
+    *said, answer, other = ask(3.0)  # what another kernel contains
+    assert (said, answer) == (["compiles", "False"], "62.0") and other != folder
 
 
-def told(process: subprocess.Popen[str]) -> tuple[float, Path, bool, str]:
-    out, error = process.communicate(timeout=300)
-    assert process.returncode == 0, error
-    answer, folder, hits = out.split()
-    return float(answer), Path(folder), hits != "0", error
+def test_folder__depends_on_the_kernels_beside(tmp_path: Path) -> None:
+    file, folder_of = tmp_path / "kernels.py", compiling.folder_of.__wrapped__
+    file.write_text(KERNELS.format(factor=2.0))
+    folder = folder_of(str(file))
+    (tmp_path / "beside.py").write_text("no kernels")
+    assert folder_of(str(file)) == folder
+    (tmp_path / "beside.py").write_text(KERNELS.format(factor=5.0))
+    assert folder_of(str(file)) != folder
 
 
 @pytest.fixture
-def place(tmp_path: Path) -> Place:
-    return Place(tmp_path)
+def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[Path, list[str]]]:
+    """Ask for the folder of a file's machine code, as in a new process; also return what was warned."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(compiling, "_warn_once", compiling._warn_once.__wrapped__)
+
+    def ask() -> tuple[Path, list[str]]:
+        folder = kernel_store.cache_folder.__wrapped__()
+        monkeypatch.setattr(compiling, "cache_folder", lambda: folder)
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            return compiling.folder_of.__wrapped__(__file__), [str(each.message) for each in warned]
+
+    return ask
 
 
-def test_machine_code__is_loaded_until_a_source_changes(place: Place) -> None:
-    answer, folder, loaded, warned = place.ask()
-    assert (answer, loaded, warned) == (42.0, False, "")
-    assert folder.is_relative_to(place.cache)
-    assert place.ask() == (42.0, folder, True, "")
-    place.write(3.0)  # also what another kernel contains
-    answer, other, loaded, warned = place.ask()
-    assert (answer, loaded, warned) == (62.0, False, "")
-    assert other != folder
-    (place.folder / "beside.py").write_text(KERNELS.format(factor=5.0))  # a kernel that it may call
-    assert place.ask()[1] != other
+def cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "TemporaryFile", Mock(side_effect=PermissionError))
 
 
-def test_first_compilation__is_told_once_and_a_load_is_not(place: Place) -> None:
-    told = "print('told', nothing_kept, file=sys.stderr)"
-    first = f"import sys, ethbrake_marl.kernel_store as k; k.on_first_compilation(lambda _, nothing_kept: {told}); "
-    assert place.ask(first)[2:] == (False, "told True\n")
-    assert place.ask(first)[2:] == (True, "")
-    place.write(3.0)
-    assert place.ask(first)[2:] == (False, "told False\n")
+def is_full(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=10_000_000))
 
 
-def test_two_processes__may_compile_at_once(place: Place) -> None:
-    together = [place.begin() for _ in range(3)]
-    assert {told(each)[0] for each in together} == {42.0}
-    assert place.ask()[::2] == (42.0, True)
+def is_of_somebody_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+    os.chown(os.environ["NUMBA_CACHE_DIR"] + "/ethbrake_marl", 54321, -1)
 
 
-@pytest.mark.parametrize("of_home", [{"HOME": None}, {"HOME": "/nowhere"}])
-def test_user_without_a_home__compiles(place: Place, of_home: dict[str, str | None]) -> None:
-    answer, _, loaded, _ = place.ask(NUMBA_CACHE_DIR=None, **of_home)
-    assert (answer, loaded) == (42.0, False)
+def has_no_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError))
 
 
-READ_ONLY = "import ethbrake_marl.motion.compiling as c; c._has_room = lambda folder: False; "  # as for a plain user
-
-
-def test_machine_code_that_may_only_be_read__is_used_without_a_word(place: Place) -> None:
-    folder = place.ask()[1]
-    answer, copied, loaded, warned = place.ask(READ_ONLY)
-    assert (answer, loaded, warned) == (42.0, True, "")
-    assert copied.name == folder.name
-    assert not copied.is_relative_to(place.cache)
-    assert not copied.exists()  # deleted with the process
-
-
-def test_cache_that_cannot_be_written__warns_once(place: Place) -> None:
-    answer, _, loaded, warned = place.ask(READ_ONLY)
-    assert (answer, loaded) == (42.0, False)
-    assert warned.count("cannot be written") == 1
-    assert "NUMBA_CACHE_DIR" in warned
-
-
-def test_full_disk__warns_once(place: Place) -> None:
-    full = "import shutil, types; shutil.disk_usage = lambda folder: types.SimpleNamespace(free=0); "
-    answer, _, _, warned = place.ask(full)
-    assert answer == 42.0
-    assert warned.count("its disk is full") == 1
-
-
-@pytest.mark.skipif(not hasattr(os, "getuid") or os.getuid() != 0, reason="only root can give files away")
-def test_machine_code_of_somebody_else__is_not_run(place: Place) -> None:
-    folder = place.ask()[1]
-    os.chown(folder, 12345, -1)
-    answer, other, loaded, warned = place.ask()
-    assert (answer, loaded) == (42.0, False)
-    assert other != folder
-    assert warned.count("cannot be written") == 1
-    shutil.rmtree(folder)
+@pytest.mark.parametrize("kept", [False, True])
+@pytest.mark.parametrize("what", [cannot_be_written, is_full, is_of_somebody_else, has_no_home])
+def test_cache__that_cannot_be_used(what: Callable, kept: bool, asked: Callable, tmp_path: Path, monkeypatch) -> None:
+    """Machine code that may be read is used without a word. Otherwise one warning says what to do."""
+    folder, warned = asked()
+    assert folder.is_relative_to(tmp_path / "cache") and warned == []
+    if kept:
+        folder.mkdir()
+        (folder / "kernel.nbi").touch()
+    if what is is_of_somebody_else and os.getuid() != 0:
+        pytest.skip("only root can give files away")
+    what(monkeypatch)
+    temporary, warned = asked()
+    assert temporary.name == folder.name and kernel_store.is_temporary(temporary.parent)
+    is_used = kept and what in (cannot_be_written, is_full)
+    assert (temporary / "kernel.nbi").exists() == is_used
+    assert len(warned) == (not is_used) and all("set NUMBA_CACHE_DIR to a folder" in text for text in warned)
+    shutil.rmtree(temporary.parent)

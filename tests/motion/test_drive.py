@@ -8,6 +8,7 @@ import pytest
 
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.motion.drive import FAILED, MET
+from ethbrake_marl.motion.forces import stopping_distances
 from ethbrake_marl.motion.layout import Floats
 from tests.motion.lines import driven, lines
 
@@ -287,6 +288,18 @@ def test_bounces__end_after_the_sum_of_their_flights(e: float) -> None:
     assert run(line, car, [-16.0, 4.0], [flights - 1e-3])[0][at.COUNT, 1] == len(closing) - 1
 
 
+def test_rattling__between_two_heavy_ones_ends_in_one_impact_that_conserves_momentum() -> None:
+    # e = 0: the gaps shrink below the smallest double
+    mass, commands = [31.0, 0.65, 12.5], [-1.44, -6.02, -8.25]
+    line, car = lines([1.0, 1.0], [9.05, 9.29, 15.95], mass_t=mass)
+    momentum = np.array(mass) @ line[0, at.SPEED, 1:]
+    for start in np.arange(0.0, 1.0, 0.01):
+        line, _, _ = driven(line, car, commands, start, start + 0.01)
+        momentum += 0.01 * np.array(mass) @ np.array(commands)
+        assert np.array(mass) @ line[0, at.SPEED, 1:] == pytest.approx(momentum, rel=1e-12)
+    assert line[0, at.COUNT, 1:3].sum() == 10.0
+
+
 def test_changes_of_speed__are_the_largest_of_one_impact_at_each_side() -> None:
     # 8 m/s into 2 t at rest with 1 t: both at 8/3; then the pair, 3 t, is struck by 3 t at 8 m/s: all at 16/3
     line, car = lines([0.0, 6.0], [0.0, 8.0, 8.0], mass_t=[2.0, 1.0, 3.0])
@@ -302,6 +315,8 @@ def test_vehicle__stops_after_its_way_with_brakes_that_build_up(speed: float, ra
     # v b / (2 r) - b^3 / (24 r^2) + v^2 / (2 b) with b = 7; from 1 m/s it stops before its brakes have full force
     after, _ = run(*lines([100.0], [0.0, speed], brake_rate_mps3=rate), [0.0, -7.0], [10.0])
     assert 100.0 - after[at.GAP, 1] == pytest.approx(way, abs=1e-5) and after[at.SPEED, 2] == 0.0
+    of_formula = stopping_distances(*(np.array([x]) for x in (speed, 0.5, 7.0, rate)))
+    assert of_formula == pytest.approx(way + 0.5 * speed, abs=1e-5)
 
 
 def test_command__that_ends_at_the_latency_never_acts() -> None:

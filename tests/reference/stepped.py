@@ -35,7 +35,7 @@ class Line(NamedTuple):
     restitution: float
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, no_cfunc_wrapper=True)
 def rest_of_block(mass, speeds, forces, limit, h, i, j):
     """The speed that minimises the sum of the bodies i to j."""
     momentum, weight = 0.0, 0.0
@@ -72,7 +72,7 @@ def rest_of_block(mass, speeds, forces, limit, h, i, j):
     return best
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, no_cfunc_wrapper=True)
 def regression(gaps, mass, speeds, forces, limit, h, out):
     """Speeds after a step of ``h`` (0: the speeds of a plastic impact): pools of touching bodies, front to rear."""
     n = len(speeds)
@@ -93,7 +93,7 @@ def regression(gaps, mass, speeds, forces, limit, h, out):
             out[k] = values[block]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, no_cfunc_wrapper=True)
 def impacts(gaps, mass, speeds, limit, restitution, book):
     """Resolve impacts, round after round; ``book`` [4, N]: hit, first harm, total harm, count."""
     n = len(speeds)
@@ -131,7 +131,7 @@ MASS, LIMIT, BRAKE_RATE, RELEASE_RATE = range(4)  # rows of `car`
 GAP, SPEED, FORCE, MEAN = range(4)  # rows of `now` and of what comes next; mean force of the step
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, no_cfunc_wrapper=True)
 def build_up(now, wanted, car, h, new):
     """The forces after a step of ``h``, and their means."""
     for k in range(len(wanted)):
@@ -147,7 +147,7 @@ def build_up(now, wanted, car, h, new):
             new[MEAN, k] = 0.5 * (now[FORCE, k] + new[FORCE, k])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, no_cfunc_wrapper=True)
 def trial(now, wanted, car, h, new):
     """One step of ``h``; return the smallest new gap."""
     build_up(now, wanted, car, h, new)
@@ -163,7 +163,7 @@ def trial(now, wanted, car, h, new):
     return least
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, no_cfunc_wrapper=True)
 def through(now, wanted, car, restitution, duration, step_s, book):
     """Through an interval without an onset, in place; return False if there are too many steps."""
     new, time, steps = now.copy(), 0.0, 0

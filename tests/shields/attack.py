@@ -7,8 +7,7 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.faces.gymnasium import EthBrakeEnv
-from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
+from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
@@ -108,35 +107,6 @@ def parallel(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -
         yield Episode(np.array([first]), np.array([bound]), np.array([harm_of(info, count)]), rises, k)
 
 
-def turns(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -> Iterator[Episode]:
-    env, rng = shield(raw_env(scenario, agents="learners"), harm_count=count), np.random.default_rng(seed)
-    for episode in range(worlds):
-        env.reset(seed=seed if episode == 0 else None)
-        first, k, L = env.infos[env.agents[0]]["shield_bound_harm"], 0, len(env.possible_agents)
-        for agent in env.agent_iter():
-            *_, ended, cut, info = env.last()
-            if ended or cut:
-                env.step(None)
-                continue
-            u = way(rng, k // L, (1, L))[0, env.possible_agents.index(agent)]
-            env.step(None if np.isnan(u) else [u])
-            k += 1
-        bound = info["shield_bound_harm"]
-        yield Episode(np.array([first]), np.array([bound]), np.array([harm_of(info, count)]), 0, k // L)
-
-
-def single(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -> Iterator[Episode]:
-    env, rng = shield(EthBrakeEnv(scenario), harm_count=count), np.random.default_rng(seed)
-    for episode in range(worlds):
-        info, over, k, rises = env.reset(seed=seed if episode == 0 else None)[1], False, 0, 0
-        first = bound = info["shield_bound_harm"]
-        while not over:
-            *_, ended, cut, info = env.step(way(rng, k, (1, 1))[0])
-            over = ended or cut
-            rises, bound, k = rises + (info["shield_bound_harm"] > bound), info["shield_bound_harm"], k + 1
-        yield Episode(np.array([first]), np.array([bound]), np.array([harm_of(info, count)]), rises, k)
-
-
 def vector(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -> Iterator[Episode]:
     n, rng = min(worlds, 256), np.random.default_rng(seed)
     env = shield(EthBrakeVectorEnv(n, scenario, autoreset_mode="SameStep"), harm_count=count)
@@ -223,14 +193,12 @@ def searched(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -
 Play = Callable[[Scenario, str, Way, int, int], Iterator[Episode]]
 PLAYS: dict[str, Play] = {
     "parallel": parallel,
-    "AEC": turns,
-    "Gymnasium": single,
     "vector": vector,
     "VecEnv": vec_env,
     "drive": driven,
     "search": searched,
 }
-ONLY_ONE = ("Gymnasium", "vector")  # interfaces for one learner
+ONLY_ONE = ("vector",)  # interfaces for one learner
 
 
 class Total(NamedTuple):

@@ -11,7 +11,7 @@ from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.names import make_agent, open_game, team_of
+from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from tests.shields.attack import LINES
@@ -36,14 +36,6 @@ def test_the_harm_is_the_smaller_one_to_the_bit(agent: Agent, name: str, count: 
     memory = last.memories["shield"]
     assert (last.harm(count) == np.minimum(memory.policy_harm, memory.bound_harm)).all()
     assert (memory.chosen == (memory.policy_harm <= memory.bound_harm)).all()
-
-
-@pytest.mark.parametrize(("spec", "bound"), [("ppo+episode", "coupled"), ("ppo+episode:pairwise", "pairwise")])
-def test_the_wrapper_has_the_bound_of_its_argument(spec: str, bound: str) -> None:
-    scenario, game = open_game("paper-random")
-    named, (_, alert, team) = team_of(make_agent(spec, scenario=scenario), scenario), hybrid(PPO, n=20, bound=bound)
-    found, expected = (drive(game, alert, each).memories["shield"].bound_harm for each in (named, team))
-    assert found.tolist() == expected.tolist()
 
 
 def test_a_better_policy_drives_as_if_alone() -> None:

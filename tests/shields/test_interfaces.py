@@ -1,6 +1,5 @@
 """One wrapper for all interfaces: the bound holds in each, the caller's environment stays, infos are flat, refusals."""
 
-import copy
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -37,14 +36,20 @@ INFOS = {
     "margin": float,
 }
 COAST = Held("coast")
-CELLS = [(play, name) for play in PLAYS for name in LINES if not (play in ONLY_ONE and name in TEAMS)]
+SCRIPTED = load_scenario("paper-random").replace(roles={f"vehicle_{i}": "coast" for i in (1, 2, 3)})
+CELLS = [  # each interface in a few lines, each line through a few interfaces
+    (play, name)
+    for k, play in enumerate(PLAYS)
+    for name in list(LINES)[k % 4 :: 4]
+    if not (play in ONLY_ONE and name in TEAMS)
+]
 
 
 @pytest.mark.parametrize(("play", "name"), CELLS)
 def test_harm_is_the_certified_harm(play: str, name: str) -> None:
     k = CELLS.index((play, name))
     count, way = ("first", "total")[k % 2], list(WAYS)[k % len(WAYS)]
-    assert attack(play, name, count, way, 2 if play in ("parallel", "AEC", "Gymnasium") else 12).held
+    assert attack(play, name, count, way, 2 if play == "parallel" else 12).held
 
 
 def shield_infos(info: dict[str, Any]) -> dict[str, Any]:
@@ -86,34 +91,20 @@ def push(env: Any, u: float = 1.0) -> Any:
 
 
 @pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
-def test_the_callers_environment_stays_as_it_is(make: Callable[[], Any]) -> None:
+def test_the_callers_environment_stays_as_it_is_and_the_copy_starts_with_reset(make: Callable[[], Any]) -> None:
     env, other = make(), make()
     begin(env)
     begin(other)
-    game, episode = env.unwrapped.game, copy.deepcopy(env.unwrapped.episode)
-    guarded = shield(env)
-    begin(guarded)
-    for _ in range(3):
-        push(guarded)
-    assert env.unwrapped.game is game and game.shield is None
-    np.testing.assert_array_equal(env.unwrapped.episode.line, episode.line)
-    push(env)
-    push(other)
-    np.testing.assert_array_equal(env.unwrapped.episode.line, other.unwrapped.episode.line)
-    assert (guarded.unwrapped.episode.line != env.unwrapped.episode.line).any()
-
-
-@pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
-def test_it_is_the_same_kind_of_environment_and_starts_with_reset(make: Callable[[], Any]) -> None:
-    env = make()
-    begin(env)
     guarded = shield(env)
     assert type(guarded) is type(env) and type(guarded.unwrapped) is type(env.unwrapped)
     with pytest.raises(InvalidInput, match="no episode is running; call reset first"):
         push(guarded)
     begin(guarded)
     push(guarded)
-    assert guarded.unwrapped.episode.memories["shield"].intervened.any()
+    assert guarded.unwrapped.episode.memories["shield"].intervened.any() and env.unwrapped.game.shield is None
+    push(env)
+    push(other)
+    np.testing.assert_array_equal(env.unwrapped.episode.line, other.unwrapped.episode.line)
 
 
 @pytest.mark.filterwarnings("ignore::ethbrake_marl.faces.stream.UnknownResetOption")
@@ -141,30 +132,6 @@ def test_policies_propose_what_the_caller_leaves_out() -> None:
         over = ended or cut
         assert not info["shield_intervened"]
     assert info["world_first_impact_harm"] == first
-
-
-def test_without_a_policy_the_plan_is_followed() -> None:
-    env = shield(EthBrakeParallelEnv("paper-random"))
-    first = env.reset(seed=7)[1]["vehicle_2"]["shield_bound_harm"]
-    while env.agents:
-        info = env.step({})[4]["vehicle_2"]
-    assert info["world_first_impact_harm"] == first and first > 0.0
-
-
-def test_every_new_episode_of_a_vec_env_reports_its_own_bound() -> None:
-    env = shield(make_sb3_vec_env("paper-random", 8, 3))
-    env.reset()
-    first = [info["shield_bound_harm"] for info in env.reset_infos]
-    numbers = [info["world"] for info in env.reset_infos]
-    for _ in range(60):
-        _, _, over, _ = env.step(np.ones((8, 1)))
-        again = env.reset_infos
-        for row in range(8):
-            if over[row]:
-                first[row], numbers[row] = again[row]["shield_bound_harm"], again[row]["world"]
-            assert again[row]["shield_bound_harm"] == first[row]
-            assert again[row]["shield_reason"] == ShieldReason.NO_DECISION
-    assert numbers != list(range(8))
 
 
 @pytest.mark.parametrize("policy", [None, "ppo"])
@@ -253,6 +220,7 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     ),
     (lambda: shield(EthBrakeEnv(), {2: COAST}), InvalidInput, "2: must be the name of a vehicle"),
     (lambda: shield(EthBrakeEnv(), allowance=-1), InvalidInput, "allowance = -1"),
+    (lambda: shield(EthBrakeParallelEnv(SCRIPTED)), InvalidInput, "has no learner to shield"),
 ]
 
 
@@ -260,23 +228,3 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
 def test_refusals(call: Callable[[], Any], error: type[Exception], text: str) -> None:
     with pytest.raises(error, match=text):
         call()
-
-
-def test_a_line_without_learners() -> None:
-    scenario = load_scenario("paper-random")
-    scripted = scenario.replace(roles={**scenario.roles, "vehicle_2": "coast"})
-    with pytest.raises(InvalidInput, match="has no learner; pass learners"):
-        shield(EthBrakeParallelEnv(scripted))
-
-
-@pytest.mark.parametrize(
-    ("action", "text"), [([1.5], "= 1.5"), ([0.0, 0.0], "shape"), ("1", "must be a number"), ([np.inf], "= inf")]
-)
-def test_bad_actions_change_nothing(action: Any, text: str) -> None:
-    env = shield(EthBrakeParallelEnv("paper-random"))
-    env.reset(seed=7)
-    before = env.episode
-    with pytest.raises(InvalidInput, match=text):
-        env.step({"vehicle_2": action})
-    assert env.episode is before
-    env.step({"vehicle_2": [1.0]})

@@ -161,7 +161,7 @@ class PieceView(View):
     def plan(self) -> Plan:
         """How this view is computed."""
         plan = View(self.names).plan
-        return plan._replace(own=tuple((c, _or_unknown(own), offset, known) for c, own, offset, known in plan.own))
+        return plan._replace(own=tuple((column, _or_unknown(own), offset) for column, own, offset in plan.own))
 
 
 def _or_unknown(own: Own) -> Own:

@@ -1,0 +1,47 @@
+"""Functions that users register (features, terms, objectives): what is asked of their names, docstrings and results."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput, describe_error
+from ethbrake_marl.motion.layout import Floats
+
+
+def described(kind: str, name: object, function: object, pattern: str, form: str) -> str:
+    """Return the docstring of a function that is to be registered, on one line.
+
+    Raises ``InvalidInput`` for a bad name (``form`` is the ``pattern`` in words), or a function without a docstring.
+    """
+    if not isinstance(name, str) or re.fullmatch(pattern, name) is None:
+        raise InvalidInput(f"{kind} {name!r:.80}: the name must be 1 to 64 characters {form}")
+    if not callable(function) or not (function.__doc__ or "").strip():
+        raise InvalidInput(f"{kind} {name!r}: must be a function with a docstring that describes the {kind}")
+    return " ".join(str(function.__doc__).split())
+
+
+def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *shapes: tuple[int, ...]) -> Floats:
+    """Return the numbers that ``function(*given)`` returns, in one of the ``shapes``. Raises ``InvalidInput``."""
+    try:
+        value = np.asarray(function(*given))
+    except Exception as error:
+        raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
+    if value.shape not in shapes or value.dtype.kind not in "fiub":
+        right = " or ".join(f"{shape}, one per {'world' if len(shape) == 1 else 'vehicle'}" for shape in shapes)
+        raise InvalidInput(
+            f"{what}: its function returned {value.dtype} of shape {value.shape}; must return numbers of shape {right}"
+        )
+    return value
+
+
+def check_finite(what: str, value: Floats, times_s: Floats) -> None:
+    """Raise ``InvalidInput`` unless all values, [n] or [n, N], are finite. ``times_s`` [n] are the worlds' times."""
+    for row, *vehicle in np.argwhere(~np.isfinite(value))[:1]:
+        whose = "".join(f" for vehicle_{i + 1}" for i in vehicle)
+        raise InvalidInput(
+            f"{what}: its value is {value[(row, *vehicle)]}{whose} in row {row} at {times_s[row]:g} s; must be finite"
+        )
