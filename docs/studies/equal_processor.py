@@ -47,10 +47,9 @@ def job_of(test: str, count: str, name: str, seconds: int, folder: Path) -> Job:
 
 def curve_of(run: RunFolder, count: str) -> SeedCurve:
     """Return harm against the processor time of the training, without evaluations (s)."""
-    spent = read_object(run.status)["cpu_s"]
-    rows = [row for row in run.rows() if row.get("eval/total_harm")]
-    harm = [float(row[f"eval/{HARM[count]}"]) for row in rows]
-    return SeedCurve(np.array([spent[str(int(row["steps"]))] for row in rows]), np.array([harm]))
+    evaluations = read_object(run.status)["evaluations"]
+    spent, harm = ([each[key] for each in evaluations] for key in ("cpu_s", HARM[count]))
+    return SeedCurve(np.array(spent), np.array([harm]))
 
 
 if __name__ == "__main__":

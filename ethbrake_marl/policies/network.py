@@ -46,30 +46,27 @@ class NetworkSpec(FileModel):
 
     @model_validator(mode="after")
     def _settings_fit(self) -> NetworkSpec:
-        if (self.networks > 1) != bool(self.gate_hidden):
+        mixture, choice = self.networks > 1, self.output == "choice"
+        if mixture != bool(self.gate_hidden):
             raise ValueError(
                 f"gate_hidden = {list(self.gate_hidden)}: must have a layer if networks is above 1, and must be left"
                 f" out if networks is 1; networks is {self.networks}"
             )
-        if self.networks > 1 and self.value_hidden:
-            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty if networks is above 1")
-        if (self.output == "choice") != (self.choices is not None):
+        if choice != (self.choices is not None):
             raise ValueError(
                 f"choices = {self.choices}: must be a number if output is 'choice', and must be left out otherwise;"
                 f" output is {self.output!r}"
             )
-        if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
-            raise ValueError("output = 'choice': needs networks = 1, action_size = 1 and an empty value_hidden")
+        if (mixture or choice) and self.value_hidden:
+            raise ValueError("value_hidden: must be empty if networks is above 1 or output is 'choice'")
+        if choice and (mixture or self.action_size > 1):
+            raise ValueError("output = 'choice': needs networks = 1 and action_size = 1")
+        size = self.observation_size, self.action_size
         for m, member in enumerate(self.among):
-            if self.choices is None or member.among:
+            if not choice or member.among or (member.observation_size, member.action_size) != size:
                 raise ValueError(
-                    "among: needs output = 'choice', and a policy in this list must not have a key among of its own"
-                )
-            if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
-                raise ValueError(
-                    f"among[{m}]: observation_size and action_size are {member.observation_size} and"
-                    f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as for the network"
-                    " that chooses among these policies"
+                    f"among[{m}]: needs output = 'choice', no key among of its own, and the same observation_size and"
+                    f" action_size, {size}"
                 )
         return self
 

@@ -85,7 +85,6 @@ def train(
     directory: str | Path,
     *,
     scheme: Scheme | None = None,
-    turns: int | None = None,
     seed: int | None = None,
     steps: int | None = None,
     force: bool = False,
@@ -104,7 +103,6 @@ def train(
         scenario: likewise. Its roles say which vehicles learn.
         directory: new folder of the run.
         scheme: how several learners train together; None: as the recipe says. Likewise:
-        turns: how often each independent learner has its turn to learn.
         seed: of worlds, networks and exploration.
         steps: decisions of all learners together. A training ends with a whole update, so there may be a few more.
         force: replace an earlier run in ``directory``.
@@ -118,7 +116,7 @@ def train(
     or another thread is training, ``TrainingDiverged`` if a weight is not finite.
 
     """
-    changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
+    changes = {"scheme": scheme, "seed": seed, "total_steps": steps}
     training = Training.of(recipe, scenario, **{key: value for key, value in changes.items() if value is not None})
     folder = RunFolder(directory)
     with _prepared(training, folder, measure, on_progress) as updates:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from ethbrake_marl.training.finite import TrainingDiverged
 from stable_baselines3 import A2C
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -29,7 +30,6 @@ from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import train as train_module
 from ethbrake_marl.training.algorithm import Algorithm, name_in_sb3
-from ethbrake_marl.training.finite import TrainingDiverged
 from ethbrake_marl.training.ppo import Ppo
 from ethbrake_marl.training.recipe import ALGORITHMS, PpoRecipe, TrainingRecipe, load_recipe, register_algorithm
 from ethbrake_marl.training.run import RunFolder

@@ -207,7 +207,7 @@ class Plan:
                     changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
                     name = algorithm
                     if learners == 1:  # schemes are for several learners
-                        changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
+                        changes["scheme"] = None
                         name = recipe.name
                     training = Training.of(recipe.replace(**changes), level.scenario)
                     yield (
