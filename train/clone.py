@@ -92,7 +92,6 @@ def as_policy(network: nn.Sequential, metadata: dict[str, Any], seed: int) -> Po
         algorithm="clone",
         network=NetworkSpec(
             observation_size=len(view.names),
-            action_size=1,
             policy_hidden=HIDDEN,
             value_hidden=(),
             activation="relu",

@@ -34,7 +34,7 @@ class NetworkSpec(FileModel):
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F
-    action_size: Annotated[int, Field(ge=1, le=64)]  # A
+    action_size: Literal[1] = 1
     policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]  # width of each hidden layer of an actor
     value_hidden: PerhapsHidden  # of the critic; empty: no critic, which no policy needs to act
     activation: Activation
@@ -59,14 +59,13 @@ class NetworkSpec(FileModel):
             )
         if (mixture or choice) and self.value_hidden:
             raise ValueError("value_hidden: must be empty if networks is above 1 or output is 'choice'")
-        if choice and (mixture or self.action_size > 1):
-            raise ValueError("output = 'choice': needs networks = 1 and action_size = 1")
-        size = self.observation_size, self.action_size
+        if choice and mixture:
+            raise ValueError("output = 'choice': needs networks = 1")
         for m, member in enumerate(self.among):
-            if not choice or member.among or (member.observation_size, member.action_size) != size:
+            if not choice or member.among or member.observation_size != self.observation_size:
                 raise ValueError(
-                    f"among[{m}]: needs output = 'choice', no key among of its own, and the same observation_size and"
-                    f" action_size, {size}"
+                    f"among[{m}]: needs output = 'choice', no key among of its own, and"
+                    f" observation_size = {self.observation_size}"
                 )
         return self
 
@@ -90,7 +89,7 @@ class NetworkSpec(FileModel):
     @property
     def tensors(self) -> Shapes:
         """Name -> shape of every float32 tensor; weights are [outputs, inputs], as in ``y = W x + b``."""
-        outputs = self.action_size if self.choices is None else len(self.among) + self.choices
+        outputs = 1 if self.choices is None else len(self.among) + self.choices
         shapes: Shapes = {}
         for name in self.actors:
             shapes |= self._network(name, self.policy_hidden, outputs)
@@ -100,9 +99,9 @@ class NetworkSpec(FileModel):
             for m, member in enumerate(self.among, 1):
                 shapes |= {f"among_{m}.{name}": shape for name, shape in member.tensors.items()}
         elif self.output == "clip":
-            shapes["policy.log_std"] = (self.action_size,)
+            shapes["policy.log_std"] = (1,)
         else:
-            shapes |= _layer("policy.log_std", self.policy_hidden[-1], self.action_size)
+            shapes |= _layer("policy.log_std", self.policy_hidden[-1], 1)
         if self.value_hidden:
             shapes |= self._network("value", self.value_hidden, 1)
         return shapes

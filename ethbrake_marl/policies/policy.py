@@ -64,7 +64,7 @@ class Policy:
         return View(self.manifest.observation.features)
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Return the actions [n, A] in [-1, 1] for observations [n, F] float32, each by itself."""
+        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32, each by itself."""
         return self.actor(observations)
 
     @classmethod

@@ -79,7 +79,6 @@ def network_of(name: str, actor: Any) -> NetworkSpec:
         raise InvalidInput(f"save_team: the actor of {name}, a {type(actor).__name__}, {CONTRACT}")
     return NetworkSpec(
         observation_size=linear[0].in_features,
-        action_size=1,
         policy_hidden=tuple(layer.out_features for layer in linear[:-1]),
         value_hidden=(),
         activation=activation,

@@ -159,7 +159,6 @@ class TrainingRecipe(FileModel):
         shape = vars(self)["network"]
         return NetworkSpec(
             observation_size=observation_size,
-            action_size=1,
             policy_hidden=shape.policy,
             value_hidden=getattr(shape, "value", ()),
             activation=shape.activation,

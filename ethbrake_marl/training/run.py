@@ -22,8 +22,6 @@ from ethbrake_marl.worlds.scenario import Scenario
 Status = Literal["running", "finished", "interrupted", "failed"]
 
 FORMAT = "ethbrake-run"
-OF_STATUS = ("format", "format_version", "status", "started_utc", "ended_utc")  # keys that every ``run.json`` has
-WRITTEN = "written"  # key of run.json: names of the files that ``ethbrake run`` has written after the training
 
 
 class RunFolder:
@@ -62,13 +60,11 @@ class RunFolder:
         return hold_lock(self.path / "run.lock", "another process is training in this folder")
 
     def write_status(self, status: Status, **more: Any) -> None:
-        """Write ``run.json``: the status, times, and ``more``."""
+        """Change keys of ``run.json``: the status, times, and ``more``."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        before = read_object(self.status) if self.status.exists() else {}
-        times = {"started_utc": before.get("started_utc") or now}
-        if status != "running":
-            times["ended_utc"] = now
-        write_json(self.status, {"format": FORMAT, "format_version": 1, "status": status, **times, **more})
+        before = read_object(self.status) if self.status.exists() else {"format": FORMAT, "format_version": 1}
+        times = {"started_utc": before.get("started_utc", now), "ended_utc": None if status == "running" else now}
+        write_json(self.status, {**before, "status": status, **times, **more})
 
     @contextmanager
     def stage(self, name: str, status: Status) -> Iterator[None]:
@@ -76,9 +72,8 @@ class RunFolder:
 
         ``status``: of the training, if nothing goes wrong.
         """
-        kept = {key: value for key, value in read_object(self.status).items() if key not in OF_STATUS}
         with self.held():
-            self.write_status("running", **kept, stage=name)
+            self.write_status("running", stage=name)
             before = set(os.listdir(self.path))
             ended: Status = status
             reason: str | None = None
@@ -90,7 +85,7 @@ class RunFolder:
                 raise
             finally:
                 written = sorted(set(os.listdir(self.path)) - before)
-                self.write_status(ended, **{**kept, "stage": name, "reason": reason, WRITTEN: written})
+                self.write_status(ended, reason=reason, written=written)
 
     def training(self) -> Training:
         """Return the training that a run records.
@@ -120,7 +115,7 @@ class RunFolder:
         """Delete what killed processes have left half-written, and the results of the training so far."""
         for folder in (self.path, self.checkpoints):
             remove_unfinished(folder)
-        written = read_object(self.status).get(WRITTEN, ())
+        written = read_object(self.status).get("written", ())
         for path in [*self.path.iterdir()]:
             if path.name in written and not path.is_dir():
                 path.unlink()

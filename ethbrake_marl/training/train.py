@@ -216,7 +216,7 @@ def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainRes
     model, training, folder = updates.model, updates.training, updates.folder
     if saved is not None:
         updates.restore(saved)
-    folder.write_status("running")
+    folder.write_status("running", reason=None, stage=None, written=[])
     progress, steps = ("", None) if saved is None else (saved["course"]["progress"], saved["steps"])
     model.logger.output_formats = folder.open_logs(progress, steps)
     status: Literal["finished", "interrupted"] = "finished"

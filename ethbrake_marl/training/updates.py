@@ -153,8 +153,6 @@ class BetweenUpdates(BaseCallback):
             return
         recipe = self.training.recipe
         metrics = dict(self.evaluations[-1]) if self.evaluations else {}
-        if "total_harm" in metrics and recipe.reward.harm_count == "total":  # what is counted comes first
-            metrics = {"total_harm": metrics["total_harm"], **metrics}
         rollout = self.model.n_envs * recipe.rounds
         planned = -(-recipe.total_steps // rollout) * rollout
         note, self.note = self.note, ""

@@ -41,7 +41,6 @@ TRAININGS: dict[str, tuple[TrainingRecipe, str]] = {
     "sac": (TINY_SAC, "paper-random"),
     "shared": (TINY.replace(scheme="shared", total_steps=6 * 2 * UPDATE), PAIR),
     "independent": (TINY.replace(scheme="independent", total_steps=6 * 2 * UPDATE), PAIR),
-    "turns": (TINY.replace(scheme="independent", turns=2, total_steps=8 * 2 * UPDATE), PAIR),
     "centralised": (TINY.replace(scheme="centralised", total_steps=6 * 2 * UPDATE), PAIR),
 }
 FORK = multiprocessing.get_context("fork")
