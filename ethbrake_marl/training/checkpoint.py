@@ -47,7 +47,7 @@ def capture(model: BaseAlgorithm) -> dict[str, Any]:
         "torch": torch.get_rng_state(),
         "actions": model.action_space.np_random.bit_generator.state,
         "log": {
-            name: (float(value), log.name_to_count[name], log.name_to_excluded[name])
+            name: (np.asarray(value), log.name_to_count[name], log.name_to_excluded[name])
             for name, value in log.name_to_value.items()
         },
         "replay": None if memory is None else (memory.pos, memory.full),
@@ -75,8 +75,9 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
     model.ep_info_buffer = deque(episodes, model._stats_window_size)
     model.ep_success_buffer = deque(maxlen=model._stats_window_size)
     log = model.logger
-    for name, entry in saved["log"].items():
-        log.name_to_value[name], log.name_to_count[name], log.name_to_excluded[name] = entry
+    for name, (value, count, excluded) in saved["log"].items():
+        log.name_to_value[name] = value.numpy()[()]  # a single precision number is written with fewer digits
+        log.name_to_count[name], log.name_to_excluded[name] = count, excluded
     memory: Any = getattr(model, "replay_buffer", None)
     if memory is not None:
         memory.pos, memory.full = saved["replay"]

@@ -113,7 +113,7 @@ def train(
         on_progress: is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
 
     Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe and scenario do not fit each other
-    or another thread is training, ``TrainingDiverged`` if a weight is not finite.
+    or another thread is training, ``TrainingDiverged`` if a loss or a weight is not finite.
 
     """
     changes = {"scheme": scheme, "seed": seed, "total_steps": steps}

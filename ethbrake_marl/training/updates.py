@@ -33,7 +33,7 @@ class Stopped(Exception):
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
-    """A weight or the noise of exploration is not finite. The last policy that was finite is saved."""
+    """A loss, a weight or the noise of exploration is not finite. The last policy that was finite is saved."""
 
 
 class BetweenUpdates(BaseCallback):
@@ -112,7 +112,7 @@ class BetweenUpdates(BaseCallback):
             self.report()
 
     def take_policies(self) -> None:
-        """Keep a copy of the current policies. Raises ``TrainingDiverged`` if a weight is not finite."""
+        """Keep a copy of the current policies. Raises ``TrainingDiverged``."""
         check_finite(self.model)
         actors, networks = self.algorithm.actors(self.model), self.training.networks
         tensors = [self.algorithm.tensors(*pair) for pair in zip(actors, networks, strict=True)]
@@ -164,7 +164,7 @@ class BetweenUpdates(BaseCallback):
         )  # fmt: skip
 
     def write_checkpoint(self) -> None:
-        """Write a checkpoint. Raises ``TrainingDiverged`` if a weight is not finite."""
+        """Write a checkpoint. Raises ``TrainingDiverged``."""
         check_finite(self.model)
         best = [self.best[learners[0]] for learners in self.training.groups] if self.best else []
         course = {
@@ -226,12 +226,13 @@ class BetweenUpdates(BaseCallback):
 
 
 def check_finite(model: BaseAlgorithm) -> None:
-    """Raise ``TrainingDiverged`` unless all weights are finite, and the noise of exploration finite and above 0."""
+    """Raise ``TrainingDiverged`` unless losses and weights are finite, and the noise of exploration too and above 0."""
+    losses = torch.tensor([value for name, value in model.logger.name_to_value.items() if name.endswith("loss")])
     noise = getattr(model.policy, "log_std", torch.zeros(1)).detach().exp()
-    if not all(bool(torch.isfinite(each).all()) for each in (*model.policy.parameters(), noise, 1.0 / noise)):
+    if not all(bool(torch.isfinite(each).all()) for each in (losses, *model.policy.parameters(), noise, 1.0 / noise)):
         raise TrainingDiverged(
-            f"training: a weight or the noise of exploration is not finite at step {model.num_timesteps}; try a smaller"
-            " learning_rate or max_grad_norm, or smaller weights of the reward"
+            f"training: a loss, a weight or the noise of exploration is not finite at step {model.num_timesteps}; try a"
+            " smaller learning_rate or max_grad_norm, or smaller weights of the reward"
         )
 
 
