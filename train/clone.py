@@ -91,11 +91,7 @@ def as_policy(network: nn.Sequential, metadata: dict[str, Any], seed: int) -> Po
         tensors,
         algorithm="clone",
         network=NetworkSpec(
-            observation_size=len(view.names),
-            policy_hidden=HIDDEN,
-            value_hidden=(),
-            activation="relu",
-            output="clip",
+            observation_size=len(view.names), policy_hidden=HIDDEN, value_hidden=(), activation="relu", output="clip"
         ),
         observation=view,
         learners=(learner,),

@@ -26,8 +26,8 @@ def onnx_model(manifest: Manifest, observation: View, tensors: Mapping[str, Floa
     missing = [name for name in CAPACITIES if name not in columns]
     if missing:
         raise InvalidInput(
-            f"to_onnx: the policy lacks {' and '.join(missing)}; must observe {' and '.join(CAPACITIES)}, from which the"
-            " acceleration follows"
+            f"to_onnx: the policy lacks {' and '.join(missing)}; must observe {' and '.join(CAPACITIES)}, which give"
+            " the acceleration"
         )
     with naming_extras():
         import onnx  # an optional extra, imported only here

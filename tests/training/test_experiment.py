@@ -37,11 +37,7 @@ def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: 
     names = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
     assert [*found.compared.teams] == names and found.learned == "trained policy"
     assert found.compared.harm_count == count
-    specs = {
-        "e_v2x_bm": "e_v2x_bm",
-        "trained policy": f"policy@{run}",
-        "hybrid": f"policy@{run}+episode",
-    }
+    specs = {"e_v2x_bm": "e_v2x_bm", "trained policy": f"policy@{run}", "hybrid": f"policy@{run}+episode"}
     again = eb.evaluate("paper-random", [*specs.values()], episodes=EPISODES, harm_count=count)
     for name, spec in specs.items():
         assert found.compared.result[name]["total_harm"].tolist() == again[spec]["total_harm"].tolist()

@@ -121,26 +121,6 @@ def test_resume__after_a_kill_while_a_checkpoint_is_written(
     assert not list(run.glob("**/.ethbrake-*"))
 
 
-def test_resume__after_the_disk_was_full(whole: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run, written = tmp_path / "run", Path.write_bytes
-
-    def full(path: Path, data: bytes) -> int:
-        if path.parent.name == "checkpoints" and list(path.parent.glob("step_*")):
-            written(path, data[:1000])
-            raise OSError(28, "No space left on device")
-        return written(path, data)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", full)
-        with pytest.raises(OSError, match="No space left"):
-            begin("ppo", run)
-    status = json.loads((run / "run.json").read_text())
-    assert (status["status"], status["reason"]) == ("failed", "OSError: [Errno 28] No space left on device")
-    assert status["checkpoints"] == ["step_000000000256.pt"]
-    go_on(run)
-    assert kept(run) == whole("ppo")
-
-
 @pytest.mark.parametrize("nth", [1, 2, 4])
 def test_resume__after_an_error_and_a_kill_while_policies_are_replaced(
     nth: int, whole: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
