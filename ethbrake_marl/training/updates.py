@@ -126,7 +126,7 @@ class BetweenUpdates(BaseCallback):
         metrics = {name: float(value) for name, value in self.evaluate(self.policies).items()}
         spent = {"cpu_s": begun - self.cpu_start}
         self.cpu_start += time.process_time() - begun
-        self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **self.returns(), **spent})
+        self.evaluations.append({"steps": self.steps, "updates": self.updates, **metrics, **spent})
         value = deciding(metrics, self.training.recipe.reward.harm_count)
         if value < self.best_value:
             self.best, self.best_value = self.policies, value
@@ -142,11 +142,6 @@ class BetweenUpdates(BaseCallback):
         elif self.count or self.evaluations:
             self.logger.dump(step=model.num_timesteps)
 
-    def returns(self) -> dict[str, float]:
-        """Return the mean return of the latest training episodes as ``episode_return``, if there are any."""
-        returns = [float(episode["r"]) for episode in self.model.ep_info_buffer or ()]
-        return {"episode_return": sum(returns) / len(returns)} if returns else {}
-
     def report(self) -> None:
         """Report progress."""
         if self.tell is None:
@@ -154,11 +149,11 @@ class BetweenUpdates(BaseCallback):
         recipe = self.training.recipe
         metrics = dict(self.evaluations[-1]) if self.evaluations else {}
         rollout = self.model.n_envs * recipe.rounds
-        planned = -(-recipe.total_steps // rollout) * rollout
+        planned = -(-recipe.total_steps // rollout) * rollout  # whole updates
         note, self.note = self.note, ""
         self.tell(
             Progress(
-                "training", self.steps, planned, {**metrics, **self.returns()}, note, self.updates, self.wall_s,
+                "training", self.steps, planned, metrics, note, self.updates, self.wall_s,
                 "objective",
             )
         )  # fmt: skip
@@ -207,8 +202,6 @@ class BetweenUpdates(BaseCallback):
         for policies, place in ((self.chosen, self.folder.policy), (self.policies, self.folder.last_policy)):
             if policies:
                 save_drivers(policies, place, replace=True)
-        left = () if status == "finished" else checkpoint.files_in(self.folder.checkpoints)
-        chosen = next((policy.manifest.steps for policy in self.chosen.values()), None)
         finite = [{name: value for name, value in each.items() if math.isfinite(value)} for each in self.evaluations]
         self.folder.write_status(
             status,
@@ -217,9 +210,6 @@ class BetweenUpdates(BaseCallback):
             evaluations=finite,
             steps=self.steps,
             updates=self.updates,
-            policy_steps=chosen,
-            policy=None if chosen is None else self.folder.policy.name,
-            checkpoints=[path.name for path in left],
         )
         if status == "finished" and self.folder.checkpoints.is_dir():
             remove_folder(self.folder.checkpoints)
