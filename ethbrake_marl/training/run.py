@@ -123,7 +123,7 @@ class RunFolder:
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
         """Return the writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
 
-        ``steps``: those of the first row to come, of a training that goes on; None: the events begin anew.
+        ``steps``: those before the first row to come, of a training that goes on; None: the events begin anew.
         """
         self.progress.unlink(missing_ok=True)  # it may be a link, whose target must not be overwritten
         if steps is None:
@@ -135,7 +135,7 @@ class RunFolder:
         table.keys = [name for name in progress.partition("\n")[0].split(",") if name]
         events: Any = TensorBoardOutputFormat(str(self.tensorboard))  # torch declares its attribute ``writer`` as None
         if steps is not None:
-            restart = Event(step=steps, session_log=SessionLog(status=SessionLog.START))
+            restart = Event(step=steps + 1, session_log=SessionLog(status=SessionLog.START))
             events.writer.file_writer.add_event(restart)  # TensorBoard then drops all events from this step on
         return [table, events]
 

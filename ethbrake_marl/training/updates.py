@@ -1,4 +1,4 @@
-"""What happens between two updates of a training: write checkpoints, measure, log, report, keep the best policies."""
+"""What happens between two updates of a training: measure, log, report, keep the best policies, write checkpoints."""
 
 from __future__ import annotations
 
@@ -37,10 +37,7 @@ class TrainingDiverged(EthBrakeError, ArithmeticError):
 
 
 class BetweenUpdates(BaseCallback):
-    """What happens before the first update, between updates and at the end.
-
-    A checkpoint holds the state before this work, so a resumed training begins with it.
-    """
+    """What happens before the first update, between updates and at the end."""
 
     model: BaseAlgorithm
 
@@ -70,6 +67,7 @@ class BetweenUpdates(BaseCallback):
         self.best_value = math.inf
         self.evaluations: list[dict[str, float]] = []
         self.note = ""
+        self.restored = False  # the work after this update was done before the checkpoint
         self.wall_start, self.cpu_start = time.monotonic(), time.process_time()
 
     @property
@@ -86,10 +84,14 @@ class BetweenUpdates(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
+        due = bool(self.count) and self.count % self.training.recipe.checkpoint_every_updates == 0
+        if self.restored:
+            self.restored = due = False
+        else:
+            self.work()
         stopping = self.stop()
-        if stopping or (self.count and self.count % self.training.recipe.checkpoint_every_updates == 0):
+        if due or stopping:
             self.write_checkpoint()
-        self.work()
         if stopping:
             self.take_policies()
             raise Stopped
@@ -152,11 +154,8 @@ class BetweenUpdates(BaseCallback):
         planned = -(-recipe.total_steps // rollout) * rollout  # whole updates
         note, self.note = self.note, ""
         self.tell(
-            Progress(
-                "training", self.steps, planned, metrics, note, self.updates, self.wall_s,
-                "objective",
-            )
-        )  # fmt: skip
+            Progress("training", self.steps, planned, metrics, note, self.updates, self.wall_s, objective="objective")
+        )
 
     def write_checkpoint(self) -> None:
         """Write a checkpoint. Raises ``TrainingDiverged``."""
@@ -191,6 +190,7 @@ class BetweenUpdates(BaseCallback):
             if course["best"]:
                 tensors = [{name: each.numpy() for name, each in policy.items()} for policy in course["best"]]
                 self.best = policies_of(self.training, course["best_steps"], tensors)
+            self.restored = True
         except Exception as error:  # of whatever kind: Python's, NumPy's or torch's
             raise CorruptBundle(
                 f"{self.folder.checkpoints}: the checkpoint of step {saved['steps']} does not fit this training:"

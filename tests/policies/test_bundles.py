@@ -297,12 +297,12 @@ def test_damaged_bundle__is_refused_and_runs_and_opens_nothing_else(name: str, p
 
 
 FOLDERS: dict[str, Callable[[], Any]] = {
-    "'/dev/zero': is not a folder; give the folder of a policy bundle": lambda: load_policy("/dev/zero"),
-    "'nowhere': is not a folder": lambda: load_drivers(Path("nowhere")),
-    "'empty': contains no policy; give the folder": lambda: load_policy("empty"),
+    "/dev/zero: is not a folder; give the folder of a policy bundle": lambda: load_policy("/dev/zero"),
+    "nowhere: is not a folder": lambda: load_drivers(Path("nowhere")),
+    "empty: contains no policy; give the folder": lambda: load_policy("empty"),
     "policy = None: must be the path of a training run or of a policy bundle": lambda: load_policy(None),  # type: ignore[arg-type]
     "policy = 3: must be the path": lambda: load_policy(3),  # type: ignore[arg-type]
-    "'a\\x00b': is not a folder": lambda: load_policy("a\0b"),
+    "a\\x00b: is not a folder": lambda: load_policy("a\0b"),
     "aaa: is not a folder": lambda: load_policy("a" * 5000),
     "unknown shipped policy 'universel'; did you mean 'universal'?": lambda: load_shipped("universel"),
 }

@@ -379,12 +379,3 @@ def test_resume__a_hostile_folder_is_refused(message: str, begun: Path) -> None:
     HOSTILE[message](begun)
     with refused(message):
         go_on(begun)
-
-
-def test_resume__deletes_the_results_of_the_training_so_far_and_nothing_else(begun: Path) -> None:
-    for name in ("results.json", "mine.txt", "../precious.txt"):
-        (begun / name).write_text("x")
-    changed(begun, "run.json", written=["results.json", "../precious.txt", "tensorboard", 3])
-    go_on(begun)
-    assert not (begun / "results.json").exists()
-    assert all((begun / name).exists() for name in ("mine.txt", "config.json", "tensorboard", "../precious.txt"))
