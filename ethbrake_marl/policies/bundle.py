@@ -73,7 +73,7 @@ def _bundle_in(path: Path) -> Path:
         raise InvalidInput(f"{path}: has one policy for each learner; give the path of one, for instance {member}")
     reason = "contains no policy" if folders else "is not a folder"
     raise InvalidInput(
-        f"{str(path):.200}: {reason}; give the folder of a policy bundle ({MANIFEST}, {WEIGHTS}) or of a finished run"
+        f"{path!s:.200}: {reason}; give the folder of a policy bundle ({MANIFEST}, {WEIGHTS}) or of a finished run"
     )
 
 
