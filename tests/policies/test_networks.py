@@ -150,6 +150,13 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score() -> None:
     assert np.array_equal(Actor(spec, tensors)(seen), np.choose(best[:, np.newaxis], every))
 
 
+def test_policy__says_which_format_its_network_needs() -> None:
+    versions = {"clip": 2, "tanh": 2, "experts": 3, "choice": 4, "among": 5}
+    for kind, version in versions.items():
+        policy = Policy.make(tensors_for(SPECS[kind]), network=SPECS[kind], observation=View(), **FIELDS)
+        assert policy.manifest.format_version == version
+
+
 @pytest.mark.parametrize("kind", [kind for kind in SPECS if kind != "wide"])
 def test_onnx__asks_for_the_same_acceleration(kind: str) -> None:
     spec = SPECS[kind]

@@ -65,9 +65,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 15: network.policy = []: must not be empty": lambda: with_line("policy: [8]", "policy: []"),
     "mine.yaml, line 15: network.values: unknown key; did you mean value?": lambda: with_line("value:", "values:"),
     "mine.yaml, line 16: reward.harms: unknown key; did you mean harm?": lambda: with_line("harm: 1", "harms: 1"),
-    "mine.yaml, line 16: reward = {harm: 0}: all weights of the reward except shaping are 0": lambda: with_line(
-        "m: 1", "m: 0"
-    ),
+    "all weights of the reward except shaping are 0": lambda: with_line("m: 1", "m: 0, shaping: 0.1"),
     "mine.yaml: must be a mapping of keys to values": lambda: with_line(GOOD, "- ppo\n"),
     "mine.yaml: gamma: missing; this key is required; the shipped recipe ppo has all": lambda: with_line(
         "gamma: 0.99\n", ""

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.files import store
@@ -65,8 +66,13 @@ def test_resume__after_a_kill_everything_is_the_same(run: Path, whole: Made) -> 
         "step_000000000512.pt",
         "step_000000000256.pt",
     ]
-    assert go_on(run).status == "finished"
+    spent = checkpoint.read(newest(run))["course"]["wall_s"]
+    result = go_on(run)
+    assert result.status == "finished" and result.wall_s > spent > 0.0
     assert kept(run) == whole("ppo")
+    events = EventAccumulator(str(run / "tensorboard"))
+    events.Reload()
+    assert [event.step for event in events.Scalars("train/loss")] == [128 * k for k in range(1, 7)]
     with refused("this training has finished and cannot be resumed"):
         go_on(run)
 

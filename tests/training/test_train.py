@@ -112,9 +112,14 @@ def test_train__keeps_the_best_by_the_count_of_the_reward(count: str, best: int,
 
 def test_train__objectives_decide_where_they_are_not_the_harm_of_the_line(tmp_path: Path) -> None:
     recipe = TINY.replace(reward={"harm": 0.05, "objective": "own"}, total_steps=UPDATE)
-    for each in train(recipe, PAIR, tmp_path / "run", on_progress=None).evaluations:
-        own = [each["objective_vehicle_2"], each["objective_vehicle_3"]]
-        assert each["objective"] == pytest.approx(sum(own) / 2) and 0.0 < sum(own) < each["first_impact_harm"]
+    result = train(recipe, PAIR, tmp_path / "run", on_progress=None)
+    scenario, game = game_of(PAIR)
+    last = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))
+    assert result.metrics is not None
+    own = [result.metrics[f"objective_{name}"] for name in result.policies]
+    assert own == pytest.approx(last.borne_harm("first")[:, 1:].mean(axis=0))
+    assert result.metrics["objective"] == pytest.approx(sum(own) / 2)
+    assert result.metrics["objective"] == min(each["objective"] for each in result.evaluations)
 
 
 def closed() -> Any:
@@ -306,6 +311,42 @@ def test_policy__acts_as_the_model_does_without_exploration(name: str) -> None:
         own = np.ascontiguousarray(seen[rows, : len(training.row.names)])
         np.testing.assert_allclose(policies[learner](own), expected[rows], atol=1e-5)
         assert policies[learner].manifest.steps == 5
+
+
+SETTINGS: dict[str, tuple[TrainingRecipe, set[str]]] = {  # recipe -> keys that Stable-Baselines3 calls the same
+    "ppo": (
+        TINY.replace(
+            gamma=0.97, gae_lambda=0.9, clip_range=0.15, ent_coef=0.01, vf_coef=0.6, max_grad_norm=0.4, target_kl=0.2
+        ),
+        {"n_steps", "batch_size", "n_epochs", "gae_lambda", "ent_coef", "vf_coef", "max_grad_norm", "target_kl"},
+    ),
+    "sac": (
+        TINY_SAC.replace(gamma=0.97, tau=0.03, gradient_steps=3, target_update_interval=2, ent_coef=0.2),
+        {"batch_size", "buffer_size", "learning_starts", "tau", "gradient_steps", "ent_coef", "target_update_interval"},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_model__has_the_settings_of_the_recipe(name: str) -> None:
+    recipe, keys = SETTINGS[name]
+    recipe = recipe.replace(seed=5, horizon_is_end=False)
+    training = Training.of(recipe, "paper-random")
+    environment: Any = make_environment(training)
+    model = algorithm_of(recipe).build(training, environment)
+    for key in (*keys, "gamma", "seed", "n_envs"):
+        assert getattr(model, key) == getattr(recipe, key), key
+    assert model.lr_schedule(0.3) == recipe.learning_rate.at(0.3)
+    assert name == "sac" or model.clip_range(1.0) == 0.15
+    assert not environment.horizon_is_end and environment.game.rewarding.params == recipe.reward
+
+
+def test_training__has_an_identity_of_all_but_words() -> None:
+    identity = Training.of(TINY, "paper-random").identity
+    words = {"name": "other", "title": "Other", "description": "Other", "source": "Other"}
+    assert Training.of(TINY.replace(**words), "paper-random").identity == identity
+    others = [Training.of(TINY, "paper-random", seed=1), Training.of(TINY, "paper-random-obstacle")]
+    assert identity not in [each.identity for each in others]
 
 
 REFUSED: dict[str, Any] = {
