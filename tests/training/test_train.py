@@ -343,7 +343,7 @@ def test_model__has_the_settings_of_the_recipe(name: str) -> None:
 
 def test_training__has_an_identity_of_all_but_words() -> None:
     identity = Training.of(TINY, "paper-random").identity
-    words = {"name": "other", "title": "Other", "description": "Other", "source": "Other"}
+    words = {"title": "Other", "description": "Other", "source": "Other"}
     assert Training.of(TINY.replace(**words), "paper-random").identity == identity
     others = [Training.of(TINY, "paper-random", seed=1), Training.of(TINY, "paper-random-obstacle")]
     assert identity not in [each.identity for each in others]
