@@ -278,3 +278,9 @@ def test_resume__follows_no_link_out_of_the_run(name: str, run: Path) -> None:
         go_on(run)
     assert [file.name for file in outside.iterdir()] == ["precious.txt"]
     assert (outside / "precious.txt").read_text() == "precious"
+
+
+def test_write__keeps_the_newest_two_checkpoints(tmp_path: Path) -> None:
+    for steps in (1, 2, 10):
+        checkpoint.write(tmp_path, {"steps": steps})
+    assert [path.name for path in checkpoint.files_in(tmp_path)] == ["step_000000000010.pt", "step_000000000002.pt"]
