@@ -92,7 +92,6 @@ def policy_of(experiment: Any, training: Training) -> Policy:
     (actor,) = (m for m in experiment.group_policies["learners"].modules() if isinstance(m, MultiAgentMLP))
     network = NetworkSpec(
         observation_size=len(training.row.names),
-        action_size=1,
         policy_hidden=recipe.network.policy,
         value_hidden=(),
         activation=recipe.network.activation,

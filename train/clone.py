@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 import ethbrake_marl as eb
@@ -27,6 +26,7 @@ from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.policy import Policy
+from ethbrake_marl.training.algorithm import tensors_of
 
 HIDDEN = (128, 128)
 EPOCHS, BATCH, LEARNING_RATE = 20, 512, 1e-3
@@ -81,22 +81,11 @@ def as_policy(network: nn.Sequential, metadata: dict[str, Any], seed: int) -> Po
     """Return the network as a policy, with the scenario and the seeds of its dataset."""
     (learner,) = metadata["learners"]
     scenario, view = eb.Scenario(**metadata["scenario"]), eb.View(metadata["observation"][learner])
-    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
-    names = [*(f"policy.{k}" for k in range(len(HIDDEN))), "policy.output"]
-    tensors: dict[str, NDArray[np.float32]] = {"policy.log_std": np.zeros(1, np.float32)}
-    for name, layer in zip(names, linear, strict=True):
-        tensors[f"{name}.weight"] = layer.weight.detach().numpy()
-        tensors[f"{name}.bias"] = layer.bias.detach().numpy()
     return Policy.make(
-        tensors,
+        tensors_of("policy", network) | {"policy.log_std": np.zeros(1, np.float32)},
         algorithm="clone",
         network=NetworkSpec(
-            observation_size=len(view.names),
-            action_size=1,
-            policy_hidden=HIDDEN,
-            value_hidden=(),
-            activation="relu",
-            output="clip",
+            observation_size=len(view.names), policy_hidden=HIDDEN, value_hidden=(), activation="relu", output="clip"
         ),
         observation=view,
         learners=(learner,),

@@ -158,7 +158,6 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
     view = game.views[scenario.learners[0]]
     network = NetworkSpec(
         observation_size=len(view.names),
-        action_size=1,
         policy_hidden=tuple(HIDDEN),
         value_hidden=tuple(HIDDEN),
         activation="relu",

@@ -48,9 +48,8 @@ def job_of(test: str, count: str, name: str, seconds: int, folder: Path) -> Job:
 
 def curve_of(run: RunFolder, count: str) -> Curve:
     """Return harm against the processor time of the training, without evaluations (s)."""
-    spent = read_object(run.status)["cpu_s"]
-    rows = [row for row in run.rows() if row.get("eval/total_harm")]
-    return {spent[str(int(row["steps"]))]: Estimate(float(row[f"eval/{HARM[count]}"]), None) for row in rows}
+    evaluations = read_object(run.status)["evaluations"]
+    return {each["cpu_s"]: Estimate(float(each[HARM[count]]), None) for each in evaluations}
 
 
 if __name__ == "__main__":

@@ -55,7 +55,7 @@ class LearnedAgent:
 
     def __post_init__(self) -> None:
         """Raise ``InvalidInput`` for something else than a policy of one action."""
-        if not isinstance(self.policy, Policy) or self.policy.manifest.network.action_size > 1:
+        if not isinstance(self.policy, Policy):
             raise InvalidInput(
                 f"agent {self.name!r}: policy = {self.policy!r:.80}: must be a policy with one action, such as that of"
                 " load_policy(PATH); for a function or a model of another library use policy_agent"

@@ -27,23 +27,23 @@ class Actor:
         self.members = [type(self)(member, tensors, f"among_{m}.") for m, member in enumerate(spec.among, 1)]
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Return the actions [n, A] in [-1, 1] for observations [n, F] float32. Raises ``InvalidInput``."""
+        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32. Raises ``InvalidInput``."""
         check_observations(observations, self.spec.observation_size)
-        actions = np.empty((len(observations), self.spec.action_size), np.float32)
+        actions = np.empty((len(observations), 1), np.float32)
         for start in range(0, len(observations), BLOCK_ROWS):
             rows = slice(start, start + BLOCK_ROWS)
             actions[rows] = self.columns(np.ascontiguousarray(observations[rows].T)).T
         return actions
 
     def columns(self, x: Float32s) -> Float32s:
-        """Return the actions [A, rows] for observations that stand in columns, [F, rows]."""
+        """Return the actions [1, rows] for observations that stand in columns, [F, rows]."""
         if not self.gate:
             y = self.forward(self.networks[0], x)
             if self.spec.output == "choice":
                 return self.chosen(y.argmax(axis=0), x)
         else:
             expert = self.expert(x)
-            y = np.empty((self.spec.action_size, x.shape[1]), np.float32)
+            y = np.empty((1, x.shape[1]), np.float32)
             for m, layers in enumerate(self.networks):
                 rows = np.flatnonzero(expert == m)
                 y[:, rows] = self.forward(layers, np.ascontiguousarray(x[:, rows]))

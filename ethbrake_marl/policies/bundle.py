@@ -7,14 +7,14 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from ethbrake_marl.errors import RENAMED, CorruptBundle, InvalidInput, refuse_shipped_path, unknown_name
+from ethbrake_marl.errors import CorruptBundle, InvalidInput, unknown_name
 from ethbrake_marl.files.model import read_json_model
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.policies.manifest import Manifest, content_sha256
 from ethbrake_marl.policies.policy import MANIFEST, WEIGHTS, Policy, checked_tensors
 
-LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}
+LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}  # of the files of a bundle
 SHIPPED = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a bundle, NAME/card.md describes it
 
 
@@ -26,10 +26,10 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     if not isinstance(path, str | os.PathLike):
         raise InvalidInput(f"policy = {path!r:.60}: must be the path of a training run or of a policy bundle")
     folder = _bundle_in(Path(path).expanduser())
-    for name in sorted({MANIFEST, WEIGHTS} ^ _names_in(folder)):
+    for name in sorted(LIMITS_BYTES.keys() ^ set(os.listdir(folder))):
+        missing = "is missing from the policy bundle"
         wrong = f"does not belong in a bundle, which has only the files {MANIFEST} and {WEIGHTS}"
-        missing = name in (MANIFEST, WEIGHTS)
-        raise CorruptBundle(f"{folder / name}: {'is missing from the policy bundle' if missing else wrong}")
+        raise CorruptBundle(f"{folder / name}: {missing if name in LIMITS_BYTES else wrong}")
     manifest = _read_manifest(folder / MANIFEST)
     file = folder / WEIGHTS
     data = _read(file)
@@ -45,11 +45,10 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
 
 
 def _read_manifest(file: Path) -> Manifest:
-    data = _read(file)
     try:
-        content, manifest = read_json_model(data, Manifest)
+        content, manifest = read_json_model(_read(file), Manifest)
     except ValueError as error:
-        raise CorruptBundle(f"{file}: {error}") from None
+        raise CorruptBundle(str(error) if isinstance(error, CorruptBundle) else f"{file}: {error}") from None
     own = content_sha256(content)
     if own != manifest.manifest_sha256:
         raise CorruptBundle(
@@ -57,7 +56,7 @@ def _read_manifest(file: Path) -> Manifest:
             " changed after it was saved"
         )
     manifest.observation.check(file, manifest.versions.get("ethbrake-marl", "not recorded"))
-    return manifest.model_copy(update={"algorithm": RENAMED.get(manifest.algorithm, manifest.algorithm)})
+    return manifest
 
 
 def _read(file: Path) -> bytes:
@@ -66,33 +65,16 @@ def _read(file: Path) -> bytes:
 
 def _bundle_in(path: Path) -> Path:
     """Return the folder of the bundle: ``path``, or its folder ``policy``."""
-    members: list[Path] = []
-    for folder in (path, path / "policy"):
-        names = _names_in(folder)
-        if names & {MANIFEST, WEIGHTS}:
-            if folder.is_symlink():
-                raise CorruptBundle(f"{folder}: is a symbolic link; give the folder to which the link points")
+    folders = [folder for folder in (path, path / "policy") if os.path.isdir(folder)]  # no errors
+    for folder in folders:
+        if LIMITS_BYTES.keys() & set(os.listdir(folder)):
             return folder
-        members += [folder / name for name in sorted(names) if name.startswith("vehicle_")]
-    if members:
-        raise InvalidInput(
-            f"{path}: has one policy for each learner; give the path of one of them, for instance {members[0]}"
-        )
-    reason = "contains no policy" if path.is_dir() else "is not a folder"
+    for member in (member for folder in folders for member in sorted(folder.glob("vehicle_*"))):
+        raise InvalidInput(f"{path}: has one policy for each learner; give the path of one, for instance {member}")
+    reason = "contains no policy" if folders else "is not a folder"
     raise InvalidInput(
-        f"{path}: {reason}; give the folder of a policy bundle ({MANIFEST}, {WEIGHTS}) or of a finished run"
+        f"{path!s:.200}: {reason}; give the folder of a policy bundle ({MANIFEST}, {WEIGHTS}) or of a finished run"
     )
-
-
-def _names_in(folder: Path) -> set[str]:
-    """Return the names in a folder; none if there is no such folder."""
-    try:
-        return set(os.listdir(folder))
-    except (FileNotFoundError, NotADirectoryError):
-        return set()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InvalidInput(f"{str(folder)!r:.120}: cannot be read ({reason})") from None
 
 
 def shipped_policies() -> dict[str, Path]:
@@ -110,8 +92,7 @@ def load_shipped(name: str) -> Policy:
 
 def load_named_policy(name: str) -> Policy:
     """Return a shipped policy by its name, or any other by the path of its run or bundle (``./ppo`` for a folder)."""
-    refuse_shipped_path(name)
-    return load_shipped(name) if name in shipped_policies() else load_policy(name)
+    return load_policy(shipped_policies().get(name, name))
 
 
 def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], *, replace: bool = False) -> None:
@@ -129,12 +110,10 @@ def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], 
 
 
 def load_drivers(folder: str | os.PathLike[str]) -> dict[str, Policy]:
-    """Return what ``save_drivers`` wrote, vehicle -> policy, front to rear. Raises ``CorruptBundle``."""
+    """Return what ``save_drivers`` wrote, vehicle -> policy, front to rear. Raises the errors of ``load_policy``."""
     path = Path(folder)
-    if (path / MANIFEST).exists():
-        policy = load_policy(path)
-        return dict.fromkeys(policy.manifest.learners, policy)
     names = sorted((each.name for each in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
-    if not names:
-        raise CorruptBundle(f"{path}: must contain a policy bundle, or one folder vehicle_... per learner")
-    return {name: load_policy(path / name) for name in names}
+    if names:
+        return {name: load_policy(path / name) for name in names}
+    policy = load_policy(path)
+    return dict.fromkeys(policy.manifest.learners, policy)

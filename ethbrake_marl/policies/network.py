@@ -34,7 +34,7 @@ class NetworkSpec(FileModel):
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F
-    action_size: Annotated[int, Field(ge=1, le=64)]  # A
+    action_size: Literal[1] = 1
     policy_hidden: Annotated[PerhapsHidden, Field(min_length=1)]  # width of each hidden layer of an actor
     value_hidden: PerhapsHidden  # of the critic; empty: no critic, which no policy needs to act
     activation: Activation
@@ -46,30 +46,26 @@ class NetworkSpec(FileModel):
 
     @model_validator(mode="after")
     def _settings_fit(self) -> NetworkSpec:
-        if (self.networks > 1) != bool(self.gate_hidden):
+        mixture, choice = self.networks > 1, self.output == "choice"
+        if mixture != bool(self.gate_hidden):
             raise ValueError(
                 f"gate_hidden = {list(self.gate_hidden)}: must have a layer if networks is above 1, and must be left"
                 f" out if networks is 1; networks is {self.networks}"
             )
-        if self.networks > 1 and self.value_hidden:
-            raise ValueError(f"value_hidden = {list(self.value_hidden)}: must be empty if networks is above 1")
-        if (self.output == "choice") != (self.choices is not None):
+        if choice != (self.choices is not None):
             raise ValueError(
                 f"choices = {self.choices}: must be a number if output is 'choice', and must be left out otherwise;"
                 f" output is {self.output!r}"
             )
-        if self.choices is not None and (self.value_hidden or self.networks > 1 or self.action_size > 1):
-            raise ValueError("output = 'choice': needs networks = 1, action_size = 1 and an empty value_hidden")
+        if (mixture or choice) and self.value_hidden:
+            raise ValueError("value_hidden: must be empty if networks is above 1 or output is 'choice'")
+        if choice and mixture:
+            raise ValueError("output = 'choice': needs networks = 1")
         for m, member in enumerate(self.among):
-            if self.choices is None or member.among:
+            if not choice or member.among or member.observation_size != self.observation_size:
                 raise ValueError(
-                    "among: needs output = 'choice', and a policy in this list must not have a key among of its own"
-                )
-            if (member.observation_size, member.action_size) != (self.observation_size, self.action_size):
-                raise ValueError(
-                    f"among[{m}]: observation_size and action_size are {member.observation_size} and"
-                    f" {member.action_size}; must be {self.observation_size} and {self.action_size}, as for the network"
-                    " that chooses among these policies"
+                    f"among[{m}]: needs output = 'choice', no key among of its own, and"
+                    f" observation_size = {self.observation_size}"
                 )
         return self
 
@@ -93,7 +89,7 @@ class NetworkSpec(FileModel):
     @property
     def tensors(self) -> Shapes:
         """Name -> shape of every float32 tensor; weights are [outputs, inputs], as in ``y = W x + b``."""
-        outputs = self.action_size if self.choices is None else len(self.among) + self.choices
+        outputs = 1 if self.choices is None else len(self.among) + self.choices
         shapes: Shapes = {}
         for name in self.actors:
             shapes |= self._network(name, self.policy_hidden, outputs)
@@ -103,9 +99,9 @@ class NetworkSpec(FileModel):
             for m, member in enumerate(self.among, 1):
                 shapes |= {f"among_{m}.{name}": shape for name, shape in member.tensors.items()}
         elif self.output == "clip":
-            shapes["policy.log_std"] = (self.action_size,)
+            shapes["policy.log_std"] = (1,)
         else:
-            shapes |= _layer("policy.log_std", self.policy_hidden[-1], self.action_size)
+            shapes |= _layer("policy.log_std", self.policy_hidden[-1], 1)
         if self.value_hidden:
             shapes |= self._network("value", self.value_hidden, 1)
         return shapes

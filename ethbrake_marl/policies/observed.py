@@ -114,8 +114,7 @@ class ObservationSchema(Finite):
             today = ObservationSchema.of(View(self.features))
         except InvalidInput as error:
             raise CorruptBundle(f"{where}: observation: {error}") from None
-        names = [[each.name for each in schema.registered] for schema in (self, today)]
-        if names[0] != names[1] or self.model_copy(update={"registered": today.registered}) != today:
+        if self.model_copy(update={"registered": today.registered}) != today:
             raise CorruptBundle(
                 f"{where}: observation: this version of the package computes or scales features differently than the"
                 f" version in which the policy was trained ({version}); use that version, or train again"

@@ -24,10 +24,10 @@ def onnx_model(manifest: Manifest, observation: View, tensors: Mapping[str, Floa
     """
     spec, columns = manifest.network, {f.name: (c, f.scale) for c, f in enumerate(observation.features)}
     missing = [name for name in CAPACITIES if name not in columns]
-    if missing or spec.action_size > 1:
+    if missing:
         raise InvalidInput(
-            f"to_onnx: the policy has action_size = {spec.action_size} and lacks the features"
-            f" {', '.join(missing) or 'none'}; must have one action, and observe {' and '.join(CAPACITIES)}"
+            f"to_onnx: the policy lacks {' and '.join(missing)}; must observe {' and '.join(CAPACITIES)}, which give"
+            " the acceleration"
         )
     with naming_extras():
         import onnx  # an optional extra, imported only here

@@ -64,7 +64,7 @@ class Policy:
         return View(self.manifest.observation.features)
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Return the actions [n, A] in [-1, 1] for observations [n, F] float32, each by itself."""
+        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32, each by itself."""
         return self.actor(observations)
 
     @classmethod
@@ -81,10 +81,9 @@ class Policy:
                 weights_sha256=hashlib.sha256(data).hexdigest(), manifest_sha256="0" * 64,
             )  # fmt: skip
             return cls(draft.model_copy(update={"manifest_sha256": _own_sha256(draft)}), checked_tensors(data, network))
-        except ValidationError as error:
-            raise InvalidInput(f"policy: {first_mistake(error)}") from None
         except ValueError as error:
-            raise InvalidInput(f"policy: {error}") from None
+            reason = first_mistake(error) if isinstance(error, ValidationError) else error
+            raise InvalidInput(f"policy: {reason}") from None
 
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write the bundle as a new folder, completely or not at all. Raises ``AlreadyExists``.

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.policies import BasePolicy
-from torch import nn
+from torch import Tensor, nn
 
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.policies.layers import Float32s
@@ -31,31 +32,39 @@ class Algorithm(ABC):
         ``environment`` has one row for each learner in each world.
         """
 
-    def actors(self, model: BaseAlgorithm) -> list[BasePolicy]:
+    def actors(self, model: BaseAlgorithm) -> list[Any]:
         """Return the policies inside the model that choose actions, one for each of ``training.groups``."""
         return [model.policy]
 
-    def tensors(self, actor: BasePolicy, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of an actor's weights: name in a policy file -> tensor."""
-        state = actor.state_dict()
-        names = {name: name_in_sb3(name, network) for name in network.tensors}
-        return {ours: state[theirs].detach().numpy().astype(np.float32) for ours, theirs in names.items()}
+    def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
+        """Return a copy of an actor's weights: name in a policy file -> tensor.
+
+        The networks are PPO's if the action is clipped, else SAC's.
+        """
+        if network.output != "clip":
+            inner = actor.actor
+            return tensors_of("policy", [*inner.latent_pi, inner.mu]) | _of_layer("policy.log_std", inner.log_std)
+        hidden = actor.mlp_extractor
+        tensors = tensors_of("policy", [*hidden.policy_net, actor.action_net])
+        tensors["policy.log_std"] = array_of(actor.log_std)
+        if network.value_hidden:
+            tensors |= tensors_of("value", [*hidden.value_net, actor.value_net])
+        return tensors
 
 
-def name_in_sb3(name: str, network: NetworkSpec) -> str:
-    """Return the name in Stable-Baselines3 of a tensor of a policy file: ``policy.0.weight``, ``value.output.bias``.
+def tensors_of(name: str, layers: Iterable[nn.Module]) -> dict[str, Float32s]:
+    """Return the weights of a perceptron's linear layers: ``name.0.weight``, ... ``name.output.bias``."""
+    *hidden, output = (layer for layer in layers if isinstance(layer, nn.Linear))
+    tensors: dict[str, Float32s] = {}
+    for k, layer in enumerate(hidden):
+        tensors |= _of_layer(f"{name}.{k}", layer)
+    return tensors | _of_layer(f"{name}.output", output)
 
-    The network is PPO's if its action is clipped, else SAC's. Stable-Baselines3 numbers activations too.
-    """
-    if network.output == "clip":
-        places = {
-            "policy": ("mlp_extractor.policy_net", "action_net"),
-            "value": ("mlp_extractor.value_net", "value_net"),
-        }
-        noise = "log_std"
-    else:
-        places, noise = {"policy": ("actor.latent_pi", "actor.mu")}, "actor.log_std"
-    part, layer, *kind = name.split(".")
-    hidden, output = places[part]
-    place = {"log_std": noise, "output": output}.get(layer) or f"{hidden}.{2 * int(layer)}"
-    return ".".join([place, *kind])
+
+def _of_layer(name: str, layer: nn.Linear) -> dict[str, Float32s]:
+    return {f"{name}.{kind}": array_of(getattr(layer, kind)) for kind in ("weight", "bias")}
+
+
+def array_of(tensor: Tensor) -> Float32s:
+    """Return a copy of a tensor as an array."""
+    return tensor.detach().cpu().numpy().astype(np.float32)

@@ -11,19 +11,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from ethbrake_marl.agents.drive import Agent, Team
-from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.door import EPISODES, SEED, evaluate
 from ethbrake_marl.evaluation.named_measures import MEASURES
 from ethbrake_marl.evaluation.results import RESULTS, write_results
-from ethbrake_marl.names import make_teams
+from ethbrake_marl.names import teams_of
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.shields.algorithm_1 import EpisodeShield
-from ethbrake_marl.shields.step import StepShield
-from ethbrake_marl.training.fixed_list import Policies
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import TrainResult, train
@@ -53,7 +49,7 @@ class Experiment(NamedTuple):
     ) -> Compared:
         """Let what was learned, its shield and baselines drive the same list of another scenario."""
         count = self.compared.harm_count
-        teams = compared_teams(self.trained.policies, scenario, count, baselines)
+        teams = compared_teams(self.trained, scenario, count, baselines)
         seed = self.compared.result.about["seed"]
         return Compared.of(scenario, teams, episodes=episodes, seed=seed, harm_count=count, measures=measures)
 
@@ -102,10 +98,10 @@ def run_experiment(
     """
     started, tell = time.monotonic(), on_progress or (lambda progress: None)
     shown: Report = report or Tables()
-    count, several = recipe.reward.harm_count, len(scenario.learners) > 1
+    count = recipe.reward.harm_count
     first = partial(evaluate, scenario, episodes=1, seed=list_seed, harm_count=count)
     whole = partial(evaluate, scenario, FULL_BRAKE.name, episodes=episodes, seed=list_seed)
-    baselines = usable("baselines", TEAM_BASELINES if several else BASELINES, first, tell)
+    baselines = usable("baselines", TEAM_BASELINES if len(scenario.learners) > 1 else BASELINES, first, tell)
     installed = [name for name in shown.measures if name in MEASURES]
     measures = tuple(usable("measures", installed, lambda name: whole(measures=name), tell))
     trained = train(
@@ -120,7 +116,7 @@ def run_experiment(
             )
         tell(Progress("evaluation", 0, episodes, note=note))
         compared = Compared.of(
-            scenario, compared_teams(trained.policies, scenario, count, baselines), episodes=episodes, seed=list_seed,
+            scenario, compared_teams(trained, scenario, count, baselines), episodes=episodes, seed=list_seed,
             harm_count=count, measures=measures, on_done=lambda done: tell(Progress("evaluation", done, episodes)),
         )  # fmt: skip
         write_results(trained.directory, compared.table, compared.result, "csv", force=True)
@@ -144,24 +140,21 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 
 
 def compared_teams(
-    policies: Policies, scenario: Scenario, harm_count: str, baselines: Sequence[str]
+    trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
     """Return the teams to compare, by name: baselines, then what was learned, without and with a shield.
 
     With several learners there is also the team ``all but vehicle_i`` for each learner, which then brakes fully.
     """
-    drivers: dict[int, Agent] = {
-        1 + scenario.vehicle_names.index(name): LearnedAgent(policy) for name, policy in policies.items()
-    }
-    teams = make_teams(baselines, scenario, harm_count=harm_count)
-    if len(drivers) == 1:
-        shield: Any = EpisodeShield(drivers, harm_count=harm_count)
-        return {**teams, POLICY: Team(POLICY, drivers), HYBRID: Team(HYBRID, drivers, shield)}
-    teams[TEAM] = Team(TEAM, drivers)
-    for body in drivers:
-        name = without(scenario.vehicle_names[body - 1])
-        teams[name] = Team(name, {**drivers, body: FULL_BRAKE})
-    return {**teams, SHIELDED: Team(SHIELDED, drivers, StepShield(drivers, harm_count=harm_count))}
+    agents: dict[str, Any] = {name: name for name in baselines}
+    if len(trained.policies) == 1:
+        agents |= {POLICY: trained.agent, HYBRID: f"{trained.agent}+episode"}
+    else:
+        own = {vehicle: f"policy@{trained.directory / place}" for vehicle, place in trained.training.drivers.items()}
+        agents[TEAM] = own
+        agents |= {without(vehicle): {**own, vehicle: FULL_BRAKE.name} for vehicle in own}
+        agents[SHIELDED] = f"{trained.agent}+step"
+    return teams_of(agents, scenario, harm_count=harm_count)
 
 
 def without(vehicle: str) -> str:

@@ -46,13 +46,11 @@ def measure_on_list(training: Training) -> Evaluate:
 
 def metrics_of(training: Training, last: State) -> dict[str, float]:
     """Return the metrics of episodes whose last state is ``last``."""
-    metrics = {
-        "first_impact_harm": mean(last.harm("first")),
-        "total_harm": mean(last.harm("total")),
-        "collision_rate": float(last.collided.mean()),
-        "horizon_rate": float((~last.at_rest).mean()),
-    }
     reward, scenario = training.recipe.reward, training.scenario
+    counts = sorted(HARM, key=lambda count: count != reward.harm_count)  # what is counted comes first
+    metrics = {HARM[count]: mean(last.harm(count)) for count in counts}
+    metrics["collision_rate"] = float(last.collided.mean())
+    metrics["horizon_rate"] = float((~last.at_rest).mean())
     objectives = objectives_of(reward.objective or scenario.objective, scenario.vehicles)
     if reward.harm > 0.0 and any(each.kind is not OBJECTIVES["total"] for each in objectives):
         harm = amounts(objectives, None, last, reward.harm_count)

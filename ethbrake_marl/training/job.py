@@ -11,7 +11,7 @@ from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.store import check_folder, hold_lock, remove_unfinished
 from ethbrake_marl.progress import OnProgress
-from ethbrake_marl.training.fixed_list import OBJECTIVE, deciding
+from ethbrake_marl.training.fixed_list import deciding
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import resume, train
 from ethbrake_marl.training.training import Training
@@ -39,38 +39,28 @@ class Job(NamedTuple):
     folder: Path  # of its run, which need not exist
     settings: tuple[str, ...] = ()  # ``KEY=VALUE``, by which it differs from files, for ``config.json``
 
-    def is_finished(self) -> bool:
-        """Return whether the training has finished.
+    def finish(self, on_progress: OnProgress | None = None) -> bool:
+        """Do what is left of the training; return False if Ctrl-C stopped it. Raises the errors of ``train``.
 
         Raises ``InvalidInput`` if the folder has another training, or something else.
         """
-        run = RunFolder(self.folder)
+        recipe, scenario = self.training.recipe, self.training.scenario
         if not self.folder.exists():
-            return False
+            self.folder.parent.mkdir(parents=True, exist_ok=True)
+            ended = train(recipe, scenario, self.folder, settings=self.settings, on_progress=on_progress)
+            return ended.status == "finished"
+        run = RunFolder(self.folder)
         if run.training().identity != self.training.identity:
             raise InvalidInput(f"{self.folder}: has a training with other settings; delete it, or use another folder")
-        return bool(read_object(run.status)["status"] == "finished")
-
-    def finish(self, on_progress: OnProgress | None = None) -> bool:
-        """Do what is left of the training; return False if Ctrl-C stopped it. Raises the errors of ``train``."""
-        if self.is_finished():
+        if read_object(run.status)["status"] == "finished":
             return True
-        if self.folder.exists():
-            return resume(self.folder, on_progress=on_progress).status == "finished"
-        self.folder.parent.mkdir(parents=True, exist_ok=True)
-        recipe, scenario = self.training.recipe, self.training.scenario
-        ended = train(recipe, scenario, self.folder, settings=self.settings, on_progress=on_progress)
-        return ended.status == "finished"
+        return resume(self.folder, on_progress=on_progress).status == "finished"
 
     def attempt(self) -> str:
-        """Do what is left of the training; return why it failed, or nothing.
-
-        A finished one whose results are damaged fails too. Raises ``KeyboardInterrupt`` if Ctrl-C stopped it.
-        """
+        """Do what is left of the training; return why it failed, or nothing. Raises ``KeyboardInterrupt``."""
         try:
             if not self.finish():
                 raise KeyboardInterrupt
-            self.result()
         except EthBrakeError as error:
             return str(error)
         return ""
@@ -78,19 +68,9 @@ class Job(NamedTuple):
     def result(self) -> dict[str, float]:
         """Return the measurement of the saved policy: ``steps``, ``harm`` (which decides which one is best), and more.
 
-        Raises ``InvalidInput`` if ``progress.csv`` is damaged.
+        The training must have finished.
         """
-        run, count = RunFolder(self.folder), self.training.recipe.reward.harm_count
-        try:
-            measured = [row for row in run.rows() if row.get("eval/total_harm")]
-            every = [
-                {name: float(row[f"eval/{name}"]) for name in (*MEASURED, OBJECTIVE) if row.get(f"eval/{name}")}
-                | {"steps": int(row["steps"])}
-                for row in measured
-            ]
-            best = min(every, key=lambda row: deciding(row, count))
-            return {"steps": best["steps"], "harm": deciding(best, count), **{name: best[name] for name in MEASURED}}
-        except (OSError, ValueError, KeyError) as error:
-            raise InvalidInput(
-                f"{run.progress}: is damaged ({' '.join(str(error).split())}); delete the run's folder to train again"
-            ) from None
+        count = self.training.recipe.reward.harm_count
+        evaluations = read_object(RunFolder(self.folder).status)["evaluations"]
+        best = min(evaluations, key=lambda each: deciding(each, count))
+        return {"steps": best["steps"], "harm": deciding(best, count), **{name: best[name] for name in MEASURED}}

@@ -7,16 +7,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch import Tensor, nn
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.policies.bundle import save_drivers
-from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.training.algorithm import ACTIVATIONS
+from ethbrake_marl.training.algorithm import ACTIVATIONS, array_of, tensors_of
 
 CONTRACT = (
     "must have the attributes mean, an nn.Sequential of linear layers with ReLU (or with Tanh) between them, from the"
@@ -52,11 +50,11 @@ def save_team(
         )
     policies: dict[str, Policy] = {}
     for name in views:
-        network = network_of(name, actors[name])
-        sharing = tuple(other for other in views if actors[other] is actors[name])
+        actor = actors[name]
+        sharing = tuple(other for other in views if actors[other] is actor)
         policies[name] = policies.get(sharing[0]) or Policy.make(
-            tensors_of(actors[name]),
-            network=network,
+            network=network_of(name, actor),
+            tensors=tensors_of("policy", actor.mean) | {"policy.log_std": array_of(actor.log_std)},
             observation=views[name],
             algorithm="ppo",
             learners=sharing,
@@ -73,27 +71,16 @@ def network_of(name: str, actor: Any) -> NetworkSpec:
     mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
     layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
     linear, between = layers[::2], layers[1::2]
-    kinds = {next((key for key, kind in ACTIVATIONS.items() if isinstance(layer, kind)), None) for layer in between}
-    activation = kinds.pop() if len(kinds) == 1 else None
+    used = (key for key, kind in ACTIVATIONS.items() if between and all(isinstance(each, kind) for each in between))
+    activation = next(used, None)
     fits = len(linear) == len(between) + 1 and all(isinstance(layer, nn.Linear) for layer in linear)
     one = fits and linear[-1].out_features == 1 and isinstance(log_std, Tensor) and log_std.shape == (1,)
     if activation is None or not one:
         raise InvalidInput(f"save_team: the actor of {name}, a {type(actor).__name__}, {CONTRACT}")
     return NetworkSpec(
         observation_size=linear[0].in_features,
-        action_size=1,
         policy_hidden=tuple(layer.out_features for layer in linear[:-1]),
         value_hidden=(),
         activation=activation,
         output="clip",
     )
-
-
-def tensors_of(actor: Any) -> dict[str, Float32s]:
-    """Return the weights of an actor, by their names in a policy file."""
-    linear = [layer for layer in actor.mean if isinstance(layer, nn.Linear)]
-    places = [*range(len(linear) - 1), "output"]
-    named = {f"policy.{place}": layer for place, layer in zip(places, linear, strict=True)}
-    tensors = {f"{place}.{kind}": getattr(layer, kind) for place, layer in named.items() for kind in ("weight", "bias")}
-    tensors["policy.log_std"] = actor.log_std
-    return {place: tensor.detach().cpu().numpy().astype(np.float32) for place, tensor in tensors.items()}

@@ -45,7 +45,7 @@ class Ppo(Algorithm):
             "device": "cpu",
         }
         if training.scheme == "independent":
-            return IndependentPPO(environment, training, recipe.turns, policy_kwargs=network, **settings)
+            return IndependentPPO(environment, training, policy_kwargs=network, **settings)
         if training.scheme == "centralised":
             network["own"] = len(training.row.names)
             return PPO(CentralCriticPolicy, environment, policy_kwargs=network, **settings)

@@ -159,7 +159,6 @@ class TrainingRecipe(FileModel):
         shape = vars(self)["network"]
         return NetworkSpec(
             observation_size=observation_size,
-            action_size=1,
             policy_hidden=shape.policy,
             value_hidden=getattr(shape, "value", ()),
             activation=shape.activation,
@@ -195,15 +194,10 @@ class PpoRecipe(TrainingRecipe):
     vf_coef: NonNegative = Field(description="weight of the critic's loss")
     max_grad_norm: Positive = Field(description="largest norm of the gradient; longer gradients are scaled down to it")
     target_kl: Positive | None = Field(None, description="KL divergence beyond which an update stops early")
-    turns: Annotated[int, Field(ge=1, le=1000)] | None = Field(  # None: all learners learn in every update
-        None, description="number of turns of each learner, if independent learners learn one after the other"
-    )
     network: NoisyShape = Field(description=NETWORK)
 
     @model_validator(mode="after")
     def _keys_fit(self) -> Self:
-        if self.turns is not None and self.scheme != "independent":
-            refuse(("turns",), self.turns, "is allowed with scheme: independent only; remove the key turns")
         rollout = self.n_envs * self.n_steps
         if not rollout <= MOST_DECISIONS:
             right = f"n_envs x n_steps = {rollout} decisions per update are too many (at most {MOST_DECISIONS})"
@@ -211,16 +205,6 @@ class PpoRecipe(TrainingRecipe):
         if rollout % self.batch_size:
             refuse(("batch_size",), self.batch_size, f"must divide n_envs x n_steps = {rollout}")
         return self
-
-    def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the training has fewer updates than turns (the turns of all learners added up)."""
-        updates = -(-self.total_steps // (self.n_envs * learners * self.n_steps))
-        if self.turns is not None and self.turns * learners > updates:
-            raise InvalidInput(
-                f"recipe {self.name!r}: turns = {self.turns} for each of {learners} learners needs at least"
-                f" {self.turns * learners} updates, but total_steps = {self.total_steps} gives only {updates}; raise"
-                " total_steps, or lower turns"
-            )
 
 
 class SacRecipe(TrainingRecipe):

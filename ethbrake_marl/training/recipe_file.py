@@ -1,47 +1,14 @@
-"""Files of recipes that users write: a commented copy to begin with, and the JSON Schema for their editor."""
+"""The JSON Schema of recipe files, for editors."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from pydantic.json_schema import models_json_schema
 
 from ethbrake_marl.episode.reward import own_terms
-from ethbrake_marl.files.json_schema import FileSchema, schema_lines
-from ethbrake_marl.files.yaml import flow_text
+from ethbrake_marl.files.json_schema import FileSchema
 from ethbrake_marl.training.recipe import ALGORITHMS, TrainingRecipe
-from ethbrake_marl.worlds.explain import check_file_name
-
-
-def new_recipe_text(name: str, like: TrainingRecipe) -> str:
-    """Return the text of a commented file ``<name>.yaml`` with the values of another recipe.
-
-    Keys without a value are commented out. Raises ``InvalidInput`` for a bad name.
-    """
-    check_file_name("recipe", name)
-    recipe = like.replace(
-        name=name,
-        title="Title in one line",
-        description="What this recipe is for.",
-        source=f"Values of {like.name}, to be changed.",
-    )
-    lines = [
-        f"# Recipe {name}, a copy of {like.name}. Train with it: ethbrake train --recipe {name}.yaml\n",
-        schema_lines("recipe", "train --schema"),
-    ]
-    values, meanings = recipe.model_dump(mode="json"), key_meanings(type(recipe))
-    for key in type(recipe).model_fields:
-        value = values.get(key)
-        lines.append(f"\n# {meanings[key]}\n" if key in meanings else "\n")
-        if value is None:
-            lines.append(f"# {key}:\n")
-        elif isinstance(value, Mapping):
-            inside = (f"  {name}: {flow_text(entry)}\n" for name, entry in value.items() if entry is not None)
-            lines += [f"{key}:\n", *inside]
-        else:
-            lines.append(f"{key}: {flow_text(value)}\n")
-    return "".join(lines)
 
 
 def recipe_schema() -> dict[str, Any]:

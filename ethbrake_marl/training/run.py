@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -23,8 +22,6 @@ from ethbrake_marl.worlds.scenario import Scenario
 Status = Literal["running", "finished", "interrupted", "failed"]
 
 FORMAT = "ethbrake-run"
-OF_STATUS = ("format", "format_version", "status", "started_utc", "ended_utc")  # keys that every ``run.json`` has
-WRITTEN = "written"  # key of run.json: names of the files that ``ethbrake run`` has written after the training
 
 
 class RunFolder:
@@ -33,52 +30,41 @@ class RunFolder:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path).expanduser()
         self.config = self.path / "config.json"  # recipe and scenario in full, seeds, versions
-        self.status = self.path / "run.json"  # steps, status and reason
-        self.team = self.path / "team.json"  # which policy drives which vehicle
+        self.status = self.path / "run.json"  # steps, status and reason, evaluations
         self.policy = self.path / "policy"  # the best policies, or the last ones if nothing was measured
         self.last_policy = self.path / "policy-last"
         self.progress = self.path / "progress.csv"  # a row per update
         self.tensorboard = self.path / "tensorboard"  # the numbers of progress.csv
         self.checkpoints = self.path / "checkpoints"  # until the training has finished
-        self.lock = self.path / "run.lock"
 
-    def create(self, training: Training, config: Mapping[str, Any], *, force: bool = False) -> None:
-        """Create the folder, so that the run can be resumed. With ``force`` another run, or an empty folder, goes.
+    def create(self, config: Mapping[str, Any], *, force: bool = False) -> None:
+        """Create the folder, so that the run can be resumed. With ``force`` another run in its place goes.
 
         Raises ``AlreadyExists`` for any other path that exists, ``InvalidInput`` if a process trains in that run.
         """
-        path, is_run = self.path, self.status.is_file()
-        replace = force and path.is_dir() and not path.is_symlink() and (is_run or not any(path.iterdir()))
-        if not replace and os.path.lexists(path):
-            if not is_run:
-                raise AlreadyExists(f"{path}: already exists and is not the folder of a run; choose another name")
+        exists = os.path.lexists(self.path)
+        if exists and (self.path.is_symlink() or not self.status.is_file()):
+            raise AlreadyExists(f"{self.path}: already exists and is not the folder of a run; choose another name")
+        if exists and not force:
             raise AlreadyExists(
-                f"{path}: this run already exists; choose another folder (--output), resume the run (ethbrake train"
-                " --resume), or replace it (--force; make run ARGS=--force)"
+                f"{self.path}: this run already exists; choose another folder (--output), resume the run (ethbrake"
+                " train --resume), or replace it (--force; make run ARGS=--force)"
             )
-        with self.held() if replace and is_run else nullcontext(), new_folder(path, replace=replace) as partial:
+        with self.held() if exists else nullcontext(), new_folder(self.path, replace=exists) as partial:
             new = RunFolder(partial)
             write_json(new.config, config)
-            new.write_team(training.scheme, training.scenario.vehicles, training.drivers)
             new.write_status("running")
 
-    def held(self) -> Any:
+    def held(self) -> AbstractContextManager[None]:
         """Return the context in which no other process can train here. It raises ``InvalidInput`` if one does."""
-        return hold_lock(self.lock, "another process is training in this folder")
-
-    def write_team(self, scheme: str, vehicles: int, drivers: Mapping[str, str]) -> None:
-        """Write ``team.json``; ``drivers`` has the folder of each learner's policy."""
-        team = {"scheme": scheme, "vehicles": vehicles, "drivers": drivers}
-        write_json(self.team, {"format": "ethbrake-team", "format_version": 1, **team})
+        return hold_lock(self.path / "run.lock", "another process is training in this folder")
 
     def write_status(self, status: Status, **more: Any) -> None:
-        """Write ``run.json``: the status, times, and ``more``."""
+        """Change keys of ``run.json``: the status, times, and ``more``."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        before = read_object(self.status) if self.status.exists() else {}
-        times = {"started_utc": before.get("started_utc") or now}
-        if status != "running":
-            times["ended_utc"] = now
-        write_json(self.status, {"format": FORMAT, "format_version": 1, "status": status, **times, **more})
+        before = read_object(self.status) if self.status.exists() else {"format": FORMAT, "format_version": 1}
+        times = {"started_utc": before.get("started_utc", now), "ended_utc": None if status == "running" else now}
+        write_json(self.status, {**before, "status": status, **times, **more})
 
     @contextmanager
     def stage(self, name: str, status: Status) -> Iterator[None]:
@@ -86,10 +72,9 @@ class RunFolder:
 
         ``status``: of the training, if nothing goes wrong.
         """
-        kept = {key: value for key, value in read_object(self.status).items() if key not in OF_STATUS}
         with self.held():
-            self.write_status("running", **kept, stage=name)
-            before = {path.name for path in self.path.iterdir()}
+            self.write_status("running", stage=name)
+            before = set(os.listdir(self.path))
             ended: Status = status
             reason: str | None = None
             try:
@@ -99,8 +84,8 @@ class RunFolder:
                 reason = repr(error)
                 raise
             finally:
-                written = sorted({path.name for path in self.path.iterdir()} - before)
-                self.write_status(ended, **{**kept, "stage": name, "reason": reason, WRITTEN: written})
+                written = sorted(set(os.listdir(self.path)) - before)
+                self.write_status(ended, reason=reason, written=written)
 
     def training(self) -> Training:
         """Return the training that a run records.
@@ -116,32 +101,24 @@ class RunFolder:
                 raise InvalidInput(
                     f"{folder}: must be a plain folder, not a link or a file, because the training replaces its content"
                 )
-        status, config = read_object(self.status), read_object(self.config)
-        for key, right in (("format", (FORMAT,)), ("status", get_args(Status))):
-            if status.get(key) not in right:
-                raise InvalidInput(f"{self.status}: {key} = {status.get(key)!r:.60}: must be {' or '.join(right)}")
-        for key in ("recipe", "scenario"):
-            if not isinstance(config.get(key), dict):
-                raise InvalidInput(f"{self.config}: does not describe a training, because the key {key} is missing")
+        status, config = read_object(self.status).get("status"), read_object(self.config)
+        if status not in get_args(Status):
+            raise InvalidInput(f"{self.status}: status = {status!r:.60}: must be {' or '.join(get_args(Status))}")
         try:
             return Training.of(config["recipe"], Scenario(**config["scenario"]))
+        except (KeyError, TypeError) as error:
+            raise InvalidInput(f"{self.config}: does not describe a training ({error})") from None
         except InvalidInput as error:
             raise InvalidInput(f"{self.config}: {error}") from None
 
     def clear(self) -> None:
         """Delete what killed processes have left half-written, and the results of the training so far."""
         for folder in (self.path, self.checkpoints):
-            if folder.is_dir():
-                remove_unfinished(folder)
-        own, written = {path.name for path in vars(self).values()}, read_object(self.status).get(WRITTEN)
+            remove_unfinished(folder)
+        written = read_object(self.status).get("written", ())
         for path in [*self.path.iterdir()]:
-            is_result = isinstance(written, list) and path.name in written and path.name not in own
-            if is_result and (path.is_symlink() or path.is_file()):
+            if path.name in written and not path.is_dir():
                 path.unlink()
-
-    def rows(self) -> list[dict[str, str]]:
-        """Return the rows of ``progress.csv``: column -> text."""
-        return list(csv.DictReader(self.progress.read_text("utf-8").splitlines()))
 
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
         """Return the writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.

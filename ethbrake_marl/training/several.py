@@ -74,7 +74,6 @@ class SeparatePolicies(BasePolicy):
         self.members = nn.ModuleList(
             ActorCriticPolicy(space, action_space, lr_schedule, use_sde=use_sde, **network) for space in own
         )
-        self.resting: frozenset[int] = frozenset()  # numbers of the learners that do not explore
 
     @property
     def log_std(self) -> Tensor:
@@ -91,8 +90,8 @@ class SeparatePolicies(BasePolicy):
         count = len(observation)
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
         for number, policy, rows in self._by_learner(observation):
-            still = deterministic or number in self.resting
-            actions[rows], values[rows], likelihood[rows] = policy(observation[rows][:, self.columns[number]], still)
+            own = observation[rows][:, self.columns[number]]
+            actions[rows], values[rows], likelihood[rows] = policy(own, deterministic)
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
@@ -114,55 +113,30 @@ class SeparatePolicies(BasePolicy):
 
 
 class IndependentPPO(PPO):
-    """PPO with a separate policy for each learner. The columns of its log are ``vehicle_2/loss`` and so on.
-
-    ``turns``: None, or how often each learner has its turn to learn; all turns have about the same number of updates,
-    and learners that wait take the means of their policies.
-    """
+    """PPO with a separate policy for each learner. The columns of its log are ``vehicle_2/loss`` and so on."""
 
     policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
 
     def __init__(
-        self,
-        environment: EthBrakeVecEnv,
-        training: Training,
-        turns: int | None,
-        policy_kwargs: dict[str, Any],
-        **settings: Any,
+        self, environment: EthBrakeVecEnv, training: Training, policy_kwargs: dict[str, Any], **settings: Any
     ) -> None:
-        self.names, self.turns = training.learners, turns
+        self.names = training.learners
         network = {**policy_kwargs, "columns": training.columns}
         super().__init__(SeparatePolicies, environment, policy_kwargs=network, **settings)  # type: ignore[arg-type]
-        self._learning: tuple[int, ...] = ()
-
-    def collect_rollouts(self, *arguments: Any, **settings: Any) -> bool:
-        """Collect decisions as PPO does; learners that do not learn in the next update do not explore."""
-        everyone = range(len(self.names))
-        self._learning = tuple(everyone) if self.turns is None else (self._whose_turn(self.turns),)
-        self.policy.resting = frozenset(everyone) - frozenset(self._learning)
-        return super().collect_rollouts(*arguments, **settings)
 
     def train(self) -> None:
-        """Let each learner whose turn it is learn from its own rows."""
+        """Let each learner learn from its own rows."""
         joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
-        parts = {number: self._part(buffer, number) for number in self._learning}
+        parts = [self._part(buffer, number) for number in range(len(self.names))]
         try:
-            for number, part in parts.items():
-                self.policy, self.rollout_buffer = joint.policies[number], part  # type: ignore[assignment]
+            for name, policy, part in zip(self.names, joint.policies, parts, strict=True):
+                self.policy, self.rollout_buffer = policy, part  # type: ignore[assignment]
                 self._logger, self._n_updates = Logger(None, []), updates
                 super().train()
-                for name, value in self._logger.name_to_value.items():
-                    excluded = self._logger.name_to_excluded[name]
-                    log.record(name.replace("train", self.names[number], 1), value, excluded)
+                for key, value in self._logger.name_to_value.items():
+                    log.record(key.replace("train", name, 1), value, self._logger.name_to_excluded[key])
         finally:
             self.policy, self.rollout_buffer, self._logger = joint, buffer, log
-
-    def _whose_turn(self, turns: int) -> int:
-        """Return the number of the learner that learns in the next update. It follows from the decisions so far."""
-        rollout = self.n_envs * self.n_steps
-        planned = -(-self._total_timesteps // rollout)
-        stretch = self.num_timesteps // rollout * turns * len(self.names) // planned
-        return stretch % len(self.names)
 
     def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
         """Return the rows of a learner."""

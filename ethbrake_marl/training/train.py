@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
@@ -24,12 +23,11 @@ from ethbrake_marl.progress import Progress, Told
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.stopping import stop_on_signal
 from ethbrake_marl.training import checkpoint
-from ethbrake_marl.training.finite import FiniteNumbers, TrainingDiverged, check_weights
 from ethbrake_marl.training.fixed_list import Measure, Policies, measure_on_list
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.training import Training
-from ethbrake_marl.training.updates import BetweenUpdates, Stopped
+from ethbrake_marl.training.updates import BetweenUpdates, Stopped, check_finite
 from ethbrake_marl.worlds.game import AnyScenario
 
 APPENDED: dict[Scheme, Any] = {"independent": "number", "centralised": "state"}
@@ -87,7 +85,6 @@ def train(
     directory: str | Path,
     *,
     scheme: Scheme | None = None,
-    turns: int | None = None,
     seed: int | None = None,
     steps: int | None = None,
     force: bool = False,
@@ -106,7 +103,6 @@ def train(
         scenario: likewise. Its roles say which vehicles learn.
         directory: new folder of the run.
         scheme: how several learners train together; None: as the recipe says. Likewise:
-        turns: how often each independent learner has its turn to learn.
         seed: of worlds, networks and exploration.
         steps: decisions of all learners together. A training ends with a whole update, so there may be a few more.
         force: replace an earlier run in ``directory``.
@@ -117,14 +113,14 @@ def train(
         on_progress: is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
 
     Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe and scenario do not fit each other
-    or another thread is training, ``TrainingDiverged`` if a number is not finite.
+    or another thread is training, ``TrainingDiverged`` if a loss or a weight is not finite.
 
     """
-    changes = {"scheme": scheme, "turns": turns, "seed": seed, "total_steps": steps}
+    changes = {"scheme": scheme, "seed": seed, "total_steps": steps}
     training = Training.of(recipe, scenario, **{key: value for key, value in changes.items() if value is not None})
     folder = RunFolder(directory)
     with _prepared(training, folder, measure, on_progress) as updates:
-        folder.create(training, training.config(settings), force=force)
+        folder.create(training.config(settings), force=force)
         with folder.held():
             return _learn(updates, None)
 
@@ -159,8 +155,7 @@ def resume(
         if saved is not None:
             _check_same(folder, training, saved, other_versions)
         folder.clear()
-        folder.write_team(training.scheme, training.scenario.vehicles, training.drivers)  # it may be damaged
-        updates.notes += [f"deleted a damaged checkpoint: {reason}" for reason in damaged]
+        updates.note = "; ".join(f"deleted a damaged checkpoint: {reason}" for reason in damaged)
         return _learn(updates, saved)
 
 
@@ -221,43 +216,33 @@ def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainRes
     model, training, folder = updates.model, updates.training, updates.folder
     if saved is not None:
         updates.restore(saved)
-    folder.write_status("running")
-    steps = None if saved is None else updates.steps
-    model.logger.output_formats = folder.open_logs("" if saved is None else saved["course"]["progress"], steps)
+    folder.write_status("running", reason=None, stage=None, written=[])
+    progress, steps = ("", None) if saved is None else (saved["course"]["progress"], saved["steps"])
+    model.logger.output_formats = folder.open_logs(progress, steps)
     status: Literal["finished", "interrupted"] = "finished"
     try:
-        model.learn(
-            training.recipe.total_steps - model.num_timesteps,
-            callback=[FiniteNumbers(), updates],
-            log_interval=None,  # type: ignore[arg-type]  # rows are written between updates
-            reset_num_timesteps=saved is None,
-        )
+        try:
+            model.learn(
+                training.recipe.total_steps - model.num_timesteps,
+                callback=updates,
+                log_interval=None,  # type: ignore[arg-type]  # rows are written between updates
+                reset_num_timesteps=saved is None,
+            )
+        except ValueError:  # torch's, of weights that are not finite, says nothing to a user
+            check_finite(model)
+            raise
     except Stopped:
         status = "interrupted"
     except BaseException as error:
-        cause = _cause(model, error)
-        updates.save("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", cause)
-        if cause is error:
-            raise
-        raise cause from error
+        updates.save("interrupted" if isinstance(error, KeyboardInterrupt) else "failed", error)
+        raise
     finally:
         model.logger.close()
     updates.save(status)
-    assert updates.policies is not None and updates.chosen is not None  # since before the first rollout
     return TrainResult(
         folder.path, training, updates.chosen, updates.policies, status, updates.steps, updates.updates,
         updates.wall_s, tuple(updates.evaluations),
     )  # fmt: skip
-
-
-def _cause(model: BaseAlgorithm, error: BaseException) -> BaseException:
-    """Return ``TrainingDiverged`` for a ValueError of torch about weights that are not finite; else the error."""
-    if isinstance(error, ValueError):
-        try:
-            check_weights(model)
-        except TrainingDiverged as diverged:
-            return diverged
-    return error
 
 
 def _check_unfinished(folder: RunFolder, training: Training) -> None:

@@ -11,6 +11,7 @@ from ethbrake_marl.episode.objectives import OBJECTIVES, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.manifest import installed_versions
+from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario, views_of
@@ -58,6 +59,15 @@ class Training(NamedTuple):
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """The learners that share a policy, one group for each policy, front to rear."""
         return tuple((name,) for name in self.learners) if self.scheme == "independent" else (self.learners,)
+
+    @property
+    def networks(self) -> list[NetworkSpec]:
+        """The networks of the policies, one for each of ``groups``."""
+        firsts = [self.learners.index(group[0]) for group in self.groups]
+        networks = [self.recipe.network_spec(len(self.views[first].names)) for first in firsts]
+        if self.scheme == "centralised":  # a vehicle cannot use the critic
+            return [network.model_copy(update={"value_hidden": ()}) for network in networks]
+        return networks
 
     @property
     def row(self) -> View:

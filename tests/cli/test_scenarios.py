@@ -8,9 +8,6 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation import trial
-from ethbrake_marl.training.recipe import load_recipe, shipped_recipes
-from ethbrake_marl.training.recipe_file import new_recipe_text
-from ethbrake_marl.worlds.catalogue import shipped_folder
 from tests.fixtures.commands import Answer, Command, check_refused, told_json
 
 SCRIPTS = """
@@ -73,22 +70,6 @@ def test_sample__draws_the_worlds_that_evaluate_draws(ethbrake: Command, tmp_pat
     paper = eb.load_scenario("paper-random")
     (other,) = eb.summarise(eb.evaluate(eb.read_worlds(paper, table), "full_brake", scenario=paper)).to_json()
     assert all(one[name] == other[name] for name in ("first_impact_harm", "total_harm", "scenario_sha256"))
-
-
-@pytest.mark.parametrize(
-    "name", [name for name, file in shipped_recipes().items() if file.parent == shipped_folder("train")]
-)
-def test_new_recipe__has_every_key_with_a_comment_and_the_same_values(name: str, tmp_path: Path) -> None:
-    base, file = load_recipe(name), tmp_path / "mine.yaml"
-    text = new_recipe_text("mine", base)
-    file.write_text(text)
-    made = load_recipe(file)
-    words = {"name", "title", "description", "source"}
-    assert made.model_dump(exclude=words) == base.model_dump(exclude=words)
-    lines = text.splitlines()
-    for key in type(base).model_fields:
-        (number,) = (k for k, line in enumerate(lines) if line.removeprefix("# ").startswith(f"{key}:"))
-        assert lines[number - 1].startswith("# "), key
 
 
 def test_set__is_noted_in_a_training(ethbrake: Command, tiny_recipe: Path, tmp_path: Path) -> None:

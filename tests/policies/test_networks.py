@@ -150,6 +150,13 @@ def test_among__acts_as_the_policy_or_the_action_of_the_highest_score() -> None:
     assert np.array_equal(Actor(spec, tensors)(seen), np.choose(best[:, np.newaxis], every))
 
 
+def test_policy__says_which_format_its_network_needs() -> None:
+    versions = {"clip": 2, "tanh": 2, "experts": 3, "choice": 4, "among": 5}
+    for kind, version in versions.items():
+        policy = Policy.make(tensors_for(SPECS[kind]), network=SPECS[kind], observation=View(), **FIELDS)
+        assert policy.manifest.format_version == version
+
+
 @pytest.mark.parametrize("kind", [kind for kind in SPECS if kind != "wide"])
 def test_onnx__asks_for_the_same_acceleration(kind: str) -> None:
     spec = SPECS[kind]
@@ -173,22 +180,24 @@ def test_onnx__needs_the_capacities() -> None:
     view = View(["own.speed", "own.driving_capacity"])
     spec = network("clip", observation_size=2)
     policy = Policy.make(tensors_for(spec), network=spec, observation=view, **FIELDS)
-    with refused("to_onnx: the policy has action_size = 1 and lacks the features own.braking_capacity; must have one"):
+    with refused("to_onnx: the policy lacks own.braking_capacity; must observe"):
         policy.to_onnx()
 
 
 WRONG: dict[str, dict[str, Any]] = {
     "gate_hidden = []: must have a layer if networks is above 1": {"networks": 2},
     "gate_hidden = [4]: must have a layer if": {"gate_hidden": (4,)},
-    "value_hidden = [5]: must be empty if networks is above 1": {
+    "value_hidden: must be empty if networks is above 1": {
         "networks": 2, "gate_hidden": (4,), "value_hidden": (5,),
     },
     "choices = None: must be a number if output is 'choice'": {"output": "choice"},
     "choices = 3: must be a number if": {"choices": 3},
-    "output = 'choice': needs networks = 1, action_size = 1": {"output": "choice", "choices": 3, "action_size": 2},
-    "among: needs output = 'choice', and a policy in this list": {"among": (network("clip"),)},
-    "must not have a key among of its own": {"output": "choice", "choices": 3, "among": (among(),)},
-    "among[0]: observation_size and action_size are 26": {
+    "output = 'choice': needs networks = 1": {"output": "choice", "choices": 3, "networks": 2, "gate_hidden": (4,)},
+    "among[0]: needs output = 'choice', no key": {"among": (network("clip"),)},
+    "among[0]: needs output = 'choice', no key among of its own": {
+        "output": "choice", "choices": 3, "among": (among(),),
+    },
+    "no key among of its own, and observation_size = 27": {
         "output": "choice", "choices": 3, "among": (network("clip", observation_size=26),),
     },
     "less than or equal to 4096": {"policy_hidden": (10**9,)},

@@ -32,7 +32,7 @@ from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.policies.bundle import shipped_policies
-from ethbrake_marl.training.recipe_file import new_recipe_text
+from ethbrake_marl.training.recipe import shipped_recipes
 from tests.programmes import Cases, Given, Told
 
 CPU_LIMIT_S, WALL_LIMIT_S = 10, 90.0
@@ -48,7 +48,6 @@ LINKS = {
     "run.lock": (PRECIOUS, True),
     "progress.csv": (PRECIOUS, False),
     "config.json": (PRECIOUS, True),
-    "team.json": (PRECIOUS, False),
     "policy": ("", False),
     "tensorboard/events.out.tfevents.1.x": (PRECIOUS, False),
 }
@@ -88,7 +87,7 @@ roles:
   vehicle_2: learner
   vehicle_3: full_brake
 """
-RECIPE = new_recipe_text("mine", eb.load_recipe("ppo"))
+RECIPE = shipped_recipes()["ppo"].read_text("utf-8").replace("name: ppo", "name: mine")
 STATES = "gap_1_m,gap_2_m,speed_1_mps,speed_2_mps,speed_3_mps\n" + 3 * "7,7,20,18,20\n"
 PYTHON = "from pathlib import Path\nPath('pwned').touch()\ndef make(**given): pass\n"
 TITLE = "title: A line of three"

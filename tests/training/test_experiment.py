@@ -12,12 +12,13 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.progress import Progress
-from ethbrake_marl.training.experiment import Experiment, compared_teams, run_experiment
+from ethbrake_marl.training.experiment import Experiment, run_experiment
 from ethbrake_marl.training.run import RunFolder
-from tests.training.tiny import PAIR, TINY
+from tests.refused import refused
+from tests.training.tiny import PAIR, TINY, UPDATE
 
-SHORT = TINY.replace(total_steps=256, evaluation={"every_updates": 1, "worlds": 10, "seed": 7})
-EPISODES = 40
+SHORT = TINY.replace(total_steps=UPDATE)
+EPISODES = 20
 
 
 def quick(run: Path, scenario: str = "paper-random", recipe: Any = SHORT, **settings: Any) -> Experiment:
@@ -29,48 +30,38 @@ def status(run: Path) -> dict[str, Any]:
     return content
 
 
-def test_one_learner__is_compared_alone_and_in_the_hybrid(tmp_path: Path) -> None:
+@pytest.mark.parametrize("count", ["first", "total"])
+def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    found = quick(run, force=False)
+    found = quick(run, recipe=SHORT.replace(reward={"harm": 1.0, "harm_count": count}))
     names = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybrid"]
     assert [*found.compared.teams] == names and found.learned == "trained policy"
-    again = eb.evaluate("paper-random", f"policy@{run},policy@{run}+episode", episodes=EPISODES)
-    for name, spec in (("trained policy", f"policy@{run}"), ("hybrid", f"policy@{run}+episode")):
+    assert found.compared.harm_count == count
+    specs = {"e_v2x_bm": "e_v2x_bm", "trained policy": f"policy@{run}", "hybrid": f"policy@{run}+episode"}
+    again = eb.evaluate("paper-random", [*specs.values()], episodes=EPISODES, harm_count=count)
+    for name, spec in specs.items():
         assert found.compared.result[name]["total_harm"].tolist() == again[spec]["total_harm"].tolist()
-    worst = np.maximum(*(found.compared.result[name]["first_impact_harm"] for name in ("trained policy", "e_v2x_bm")))
-    assert (found.compared.result["hybrid"]["first_impact_harm"] <= worst).all()
     saved = eb.read_result(run / "results.json")
     assert [*saved.agents] == names and saved.rows is not None and len(saved.rows["world"]) == len(names) * EPISODES
     assert {"sampled_harm", "vehicle_1_shoved_m"} <= saved.agents["hybrid"].keys()
     end = status(run)
-    assert (end["status"], end["stage"], end["steps"], end["reason"]) == ("finished", "evaluation", 256, None)
-    assert end["written"] == ["results.json", "worlds.csv"] and end["policy"] == "policy" and end["started_utc"]
+    assert (end["status"], end["stage"], end["steps"], end["reason"]) == ("finished", "evaluation", UPDATE, None)
+    assert end["written"] == ["results.json", "worlds.csv"] and end["started_utc"]
 
 
-def test_several_learners__are_compared_whole_without_each_and_shielded(tmp_path: Path) -> None:
-    found = quick(tmp_path / "run", PAIR, SHORT.replace(scheme="independent"))
+@pytest.mark.parametrize("scheme", ["independent", "shared"])
+def test_several_learners__are_compared_whole_without_each_and_shielded(scheme: str, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    found = quick(run, PAIR, SHORT.replace(scheme=scheme))
     names = ["full_brake", "e_v2x_bm", "trained team", "all but vehicle_2", "all but vehicle_3", "shielded team"]
     assert [*found.compared.teams] == names and found.learned == "trained team"
-    again = eb.evaluate(PAIR, f"team@{tmp_path / 'run'}", episodes=EPISODES)[f"team@{tmp_path / 'run'}"]
-    assert found.compared.result["trained team"]["total_harm"].tolist() == again["total_harm"].tolist()
-    teams = found.compared.teams
-    assert [teams["all but vehicle_2"].drivers[body].name for body in (2, 3)] == ["full_brake", "learned"]
-    assert [teams["all but vehicle_3"].drivers[body].name for body in (2, 3)] == ["learned", "full_brake"]
-
-
-def test_harm_count__of_the_reward_is_what_all_agents_minimise(tmp_path: Path) -> None:
-    total = quick(tmp_path / "run", recipe=SHORT.replace(reward={"harm": 1.0, "harm_count": "total"}))
-    assert total.compared.harm_count == "total" and total.compared.teams["hybrid"].shield.count == "total"
-    right = eb.evaluate("paper-random", "e_v2x_bm", episodes=EPISODES, harm_count="total")["e_v2x_bm"]["total_harm"]
-    assert total.compared.result["e_v2x_bm"]["total_harm"].tolist() == right.tolist()
-
-
-def test_baseline__that_cannot_drive_is_left_out_with_a_word(tmp_path: Path) -> None:
-    notes: list[str] = []
-    found = quick(tmp_path / "run", "paper-random-buildup", on_progress=lambda progress: notes.append(progress.note))
-    assert [*found.compared.teams] == ["full_brake", "e_v2x_bm", "trained policy", "hybrid"]
-    (said,) = filter(None, notes)
-    assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise: brakes build up gradually")
+    policies = found.trained.policies
+    rear = {"vehicle_2": "full_brake", "vehicle_3": eb.LearnedAgent(policies["vehicle_3"])}
+    front = {"vehicle_2": eb.LearnedAgent(policies["vehicle_2"]), "vehicle_3": "full_brake"}
+    specs = {"all but vehicle_2": rear, "all but vehicle_3": front, "trained team": f"team@{run}"}
+    again = eb.evaluate(PAIR, specs, episodes=EPISODES)
+    for name in specs:
+        assert np.array_equal(found.compared.result[name]["total_harm"], again[name]["total_harm"]), name
 
 
 def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_path: Path) -> None:
@@ -83,34 +74,36 @@ def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_pa
             assert [*other.teams] == ["coast", "trained policy", "hybrid"] and other.result.n == 10
             return ["table"], "there"
 
-    run = tmp_path / "run"
+    run, notes = tmp_path / "run", list[str]()
     found, tables, where = run_experiment(
-        SHORT, eb.load_scenario("paper-random"), run, episodes=20, list_seed=3, report=Mine()
-    )
+        SHORT, eb.load_scenario("paper-random-buildup"), run, episodes=10, list_seed=3, report=Mine(),
+        on_progress=lambda progress: notes.append(progress.note),
+    )  # fmt: skip
     assert (found.measures, tables, where) == (("injury_lr4s",), ["table"], "there")
     assert found.compared.result.about["seed"] == 3 and "mine.txt" in status(run)["written"]
+    (said,) = filter(None, notes)
+    assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise: brakes build up gradually")
 
 
-def stop_when(done: Callable[[Progress], bool]) -> Callable[[Progress], None]:
+def test_evaluation__that_is_interrupted_keeps_the_policy_and_says_so(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+
     def told(progress: Progress) -> None:
-        if done(progress):
+        if progress.name == "evaluation":
+            with refused("another process is training in this folder"), RunFolder(run).held():
+                pass
             raise KeyboardInterrupt
 
-    return told
-
-
-def test_interrupted_evaluation__keeps_the_policy_and_says_so(tmp_path: Path) -> None:
-    run = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
-        quick(run, on_progress=stop_when(lambda progress: progress.name == "evaluation"))
+        quick(run, on_progress=told)
     end = status(run)
     assert (end["status"], end["stage"], end["written"]) == ("interrupted", "evaluation", [])
     assert (run / "policy" / "weights.safetensors").is_file()
-    with pytest.raises(eb.EthBrakeError, match="has finished and cannot be resumed"):
+    with refused("has finished and cannot be resumed"):
         eb.resume(run, on_progress=None)
 
 
-def test_failed_report__says_so(tmp_path: Path) -> None:
+def test_report__that_fails_says_so(tmp_path: Path) -> None:
     class Broken:
         measures: tuple[str, ...] = ()
 
@@ -119,51 +112,16 @@ def test_failed_report__says_so(tmp_path: Path) -> None:
 
     run = tmp_path / "run"
     with pytest.raises(RuntimeError):
-        run_experiment(SHORT, eb.load_scenario("paper-random"), run, episodes=20, report=Broken())
+        quick(run, report=Broken())
     end = status(run)
     assert (end["status"], end["reason"]) == ("failed", "RuntimeError('no space left')")
-    assert end["written"] == ["results.json", "worlds.csv"] and end["steps"] == 256
-
-
-def test_evaluation__lets_nobody_train_in_the_folder(tmp_path: Path) -> None:
-    run = tmp_path / "run"
-
-    def told(progress: Progress) -> None:
-        if progress.name == "evaluation":
-            with pytest.raises(eb.EthBrakeError, match="another process is training in this folder"), folder.held():
-                pass
-            tried.append(progress)
-
-    folder, tried = RunFolder(run), list[Progress]()
-    quick(run, on_progress=told)
-    assert tried
+    assert end["written"] == ["results.json", "worlds.csv"] and end["steps"] == UPDATE
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
-    [
-        ({"scenario": "cooperation-0-sensors"}, "has no learner"),
-        ({"list_seed": -1}, "seed"),
-        ({"recipe": SHORT.replace(scheme="independent")}, "needs several learners"),
-    ],
+    ("settings", "said"), [({"scenario": "cooperation-0-sensors"}, "has no learner"), ({"list_seed": -1}, "seed")]
 )
 def test_refused__before_anything_is_written(settings: dict[str, Any], said: str, tmp_path: Path) -> None:
-    with pytest.raises(eb.EthBrakeError, match=said):
+    with refused(said):
         quick(tmp_path / "run", **settings)
     assert not (tmp_path / "run").exists()
-
-
-def test_folder__that_exists_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(eb.EthBrakeError, match="already exists and is not the folder of a run"):
-        quick(tmp_path, force=True)
-    assert (tmp_path / "mine.txt").read_text() == "mine"
-
-
-def test_compared_teams__may_be_others() -> None:
-    scenario, policy = eb.load_scenario("paper-random"), eb.load_shipped("ppo")
-    assert [*compared_teams({"vehicle_2": policy}, scenario, "first", ["coast"])] == [
-        "coast",
-        "trained policy",
-        "hybrid",
-    ]

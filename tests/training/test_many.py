@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training.job import Job
 from ethbrake_marl.training.training import Training
-from tests.training.tiny import TINY
+from tests.training.tiny import TINY, kept
 
 pytest.importorskip("optuna")
 Run = Callable[..., int]
@@ -30,7 +30,7 @@ TUNE += ("n_epochs=1..3", "network.policy=[8]/[16, 8]", "--recipe")
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> str:
     """The file of a recipe with a checkpoint after each update."""
-    often = {"total_steps": 1024, "evaluation": {"every_updates": 1, "worlds": 5, "seed": 7}}
+    often = {"total_steps": 512, "evaluation": {"every_updates": 1, "worlds": 5, "seed": 7}}
     file = tmp_path_factory.mktemp("recipe") / "tiny.yaml"
     tiny = TINY.replace(name="tiny", checkpoint_every_updates=1, **often)
     file.write_text(yaml.safe_dump(tiny.model_dump(mode="json")))
@@ -92,7 +92,7 @@ def test_sweep__on_ray_has_the_same_table(recipe: str, run: Run, tmp_path: Path)
 def test_run__that_fails_is_a_row_with_its_reason(recipe: str, run: Run, tmp_path: Path) -> None:
     (script, *options), diverging = SWEEP, "reward.harm=1.0e+300"
     assert run(script, *options, recipe, "--set", diverging, "--output", tmp_path / "sweep") == 1
-    assert (tmp_path / "sweep" / "results.csv").read_text().count(",training: ") == 2
+    assert (tmp_path / "sweep" / "results.csv").read_text().count("training: ") == 2
     assert run(TUNE[0], *TUNE[1:], recipe, "--trials", "1", "--set", diverging, "--output", tmp_path / "tune") == 0
     assert "\n0,,0.9" in (tmp_path / "tune" / "trials.csv").read_text()
 
@@ -138,17 +138,11 @@ def test_tune__a_log_of_other_settings_or_a_damaged_one_is_one_error(
 
 
 def test_job__skips_what_is_finished_and_reads_its_best_measurement(tmp_path: Path) -> None:
-    job = Job(Training.of(TINY, "paper-random"), tmp_path / "run")
-    assert not job.is_finished() and job.attempt() == "" and job.is_finished()
-    head, *rows = (tmp_path / "run" / "progress.csv").read_text().splitlines()
-    column = head.split(",").index("eval/first_impact_harm")
-    harm = [float(row.split(",")[column]) for row in rows if row.split(",")[column]]
-    assert len(harm) == 4 and job.result()["harm"] == min(harm)
-    other = Job(Training.of(TINY, "paper-random", seed=1), tmp_path / "run")
+    job = Job(Training.of(TINY, "paper-random"), tmp_path / "new" / "run")
+    assert job.attempt() == "" and job.attempt() == ""
+    harm = [float(row["eval/first_impact_harm"]) for row in kept(job.folder)["rows"][::3]]
+    assert len(harm) == 3 and job.result()["harm"] == job.result()["first_impact_harm"] == min(harm)
+    assert load_policy(job.folder).manifest.steps == job.result()["steps"]
+    other = Job(Training.of(TINY, "paper-random", seed=1), job.folder)
     assert "has a training with other settings" in other.attempt()
-    (tmp_path / "file").mkdir()
-    with pytest.raises(InvalidInput, match="is not the folder of a run"):
-        job._replace(folder=tmp_path / "file").is_finished()
-    for damaged in (b"\xff\xfe", (head + "\n" + rows[-1].replace(".", "x")).encode(), head.encode()):
-        (tmp_path / "run" / "progress.csv").write_bytes(damaged)
-        assert "is damaged (" in job.attempt()
+    assert "is not the folder of a run" in job._replace(folder=tmp_path).attempt()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import UserDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
+from ethbrake_marl.errors import AlreadyExists, UnknownName
 from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.training.ppo import Ppo
 from ethbrake_marl.training.recipe import (
@@ -24,7 +24,7 @@ from ethbrake_marl.training.recipe import (
     shipped_recipes,
     usable_recipes,
 )
-from ethbrake_marl.training.recipe_file import key_meanings, new_recipe_text, recipe_schema
+from ethbrake_marl.training.recipe_file import key_meanings, recipe_schema
 from tests.refused import refused
 
 PPO = load_recipe("ppo")
@@ -65,9 +65,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 15: network.policy = []: must not be empty": lambda: with_line("policy: [8]", "policy: []"),
     "mine.yaml, line 15: network.values: unknown key; did you mean value?": lambda: with_line("value:", "values:"),
     "mine.yaml, line 16: reward.harms: unknown key; did you mean harm?": lambda: with_line("harm: 1", "harms: 1"),
-    "mine.yaml, line 16: reward = {harm: 0}: all weights of the reward except shaping are 0": lambda: with_line(
-        "m: 1", "m: 0"
-    ),
+    "all weights of the reward except shaping are 0": lambda: with_line("m: 1", "m: 0, shaping: 0.1"),
     "mine.yaml: must be a mapping of keys to values": lambda: with_line(GOOD, "- ppo\n"),
     "mine.yaml: gamma: missing; this key is required; the shipped recipe ppo has all": lambda: with_line(
         "gamma: 0.99\n", ""
@@ -76,9 +74,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 9: gamma = .nan: must be a finite number": lambda: with_line("0.99", ".nan"),
     "mine.yaml, line 6: batch_size = 100: must divide n_envs x n_steps = 512": lambda: with_line("128", "100"),
     "mine.yaml, line 4: n_envs = 999999: n_envs x n_steps = 31999968 decisions": lambda: with_line("16", "999999"),
-    "mine.yaml, line 19: turns = 2: is allowed with scheme: independent only": lambda: with_line(
-        "updates: 3", "updates: 3\nturns: 2"
-    ),
     "mine.yaml, line 19: observation = [frnt_1]: unknown feature": lambda: with_line(
         "updates: 3", "updates: 3\nobservation: [frnt_1]"
     ),
@@ -112,13 +107,10 @@ def test_recipe__of_an_absent_extension_is_refused_by_name(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("name", usable_recipes())
-def test_recipe__that_ships_goes_round_and_passes_the_schema(name: str, empty_folder: Path) -> None:
+def test_recipe__that_ships_goes_round_and_passes_the_schema(name: str) -> None:
     recipe = load_recipe(name)
     assert recipe.name == name
     assert load_recipe(recipe.model_dump(mode="json")) == recipe == recipe.replace()
-    Path("copy.yaml").write_text(new_recipe_text("copy", recipe))
-    words = {"name": "copy", "title": "", "description": "", "source": ""}
-    assert load_recipe("copy.yaml").replace(**words) == recipe.replace(**words)
     schema = recipe_schema()
     Draft202012Validator.check_schema(schema)
     validator = Draft202012Validator(schema)
@@ -135,27 +127,11 @@ def test_recipe__every_key_has_a_meaning(algorithm: str) -> None:
 
 
 def test_replace__takes_any_mapping_and_sequence() -> None:
-    class Settings(Mapping[str, Any]):  # such as OmegaConf's
-        def __init__(self, **inside: Any) -> None:
-            self.inside = inside
-
-        def __getitem__(self, key: str) -> Any:
-            return self.inside[key]
-
-        def __iter__(self) -> Any:
-            return iter(self.inside)
-
-        def __len__(self) -> int:
-            return len(self.inside)
-
     expected = PPO.replace(reward={"harm": 2.0}, observation=["own", "front_1"], network={"policy": [4], "value": [8]})
-    for mapping in (UserDict, Settings):
-        network = mapping(policy=deque([4]), value=np.array([8]))
-        found = PPO.replace(
-            reward=mapping(harm=np.float64(2.0)), observation=deque(["own", "front_1"]), network=network
-        )
-        assert found == expected
-        assert load_recipe(mapping(**expected.model_dump(mode="json"))) == expected
+    network = UserDict(policy=deque([4]), value=np.array([8]))
+    reward = UserDict(harm=np.float64(2.0))
+    assert PPO.replace(reward=reward, observation=deque(["own", "front_1"]), network=network) == expected
+    assert load_recipe(UserDict(expected.model_dump(mode="json"))) == expected
     assert expected.replace(reward=expected.reward, learning_rate=PPO.learning_rate) == expected
 
 
@@ -192,4 +168,3 @@ def test_register_algorithm__is_refused(name: str, recipe: Any, algorithm: Any, 
 def test_register_algorithm__a_name_belongs_to_one() -> None:
     with refused("algorithm 'ppo' is registered already; give another name", AlreadyExists):
         register_algorithm("ppo", PpoRecipe, Ppo)
-    assert issubclass(UnknownName, InvalidInput)

@@ -83,7 +83,7 @@ class Ablation:
                     learners, name = len(level.scenario.learners), algorithm
                     changes: dict[str, Any] = {"seed": seed, "total_steps": self.steps_per_learner * learners}
                     if learners == 1:  # schemes are for several learners
-                        changes |= dict.fromkeys({"scheme", "turns"} & type(recipe).model_fields.keys())
+                        changes["scheme"] = None
                         name = recipe.name
                     training = Training.of(recipe.replace(**changes), level.scenario)
                     folder = self.folder / "trainings" / f"{level.name}-{name}-seed{seed}"
