@@ -71,8 +71,8 @@ def best_harm(
     header: dict[str, Any] = {"scenario": game.name, "vehicles": names, "budget": budget, "search_seed": seed}
     header |= {} if objective == "total" else {"objective": objective}
     best = {count: best_of([(values[count], profiles) for profiles, values in found]) for count in counts}
-    harms, profiles = ({count: each[part] for count, each in best.items()} for part in (0, 1))
-    return BestHarmTable(problem.identity, harms, profiles, header)
+    harms, kept = {count: harm for count, (harm, _) in best.items()}, {count: one for count, (_, one) in best.items()}
+    return BestHarmTable(problem.identity, harms, kept, header)
 
 
 def _searched(
@@ -81,7 +81,7 @@ def _searched(
     """Search with all that a search can start from: with several vehicles, the best profile of each of them alone."""
     starts, bodies = starting_profiles(problem, alert, given), problem.bodies.tolist()
     for c, body in enumerate(bodies if len(bodies) > 1 else ()):
-        own = problem_of(game, alert, [body], count=problem.count, objective=objective, deciders=bodies)
+        own = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)
         best, _ = _searched(game, alert, own, (), objective, effort)
         commands = np.repeat(problem.bounds[:, np.newaxis, :, 0], best.ends.shape[1], axis=1)
         commands[:, :, c] = best.commands_mps2[:, :, 0]
@@ -103,7 +103,7 @@ def starting_profiles(problem: Problem, alert: State, given: Sequence[Profiles] 
 def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
     """Return the constant deceleration of E-V2X-BM for one controlled vehicle, [n]."""
     choice = coupled(
-        alert._replace(wanted=problem.state.wanted), int(problem.bodies[0]), problem.count, problem.horizon_s
+        alert._replace(wanted=problem.state.wanted), int(problem.bodies[0]), problem.harm_count, problem.horizon_s
     )
     return problem.constant(-choice.deceleration_mps2[:, np.newaxis, np.newaxis])
 

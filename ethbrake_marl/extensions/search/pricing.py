@@ -139,7 +139,7 @@ class Problem(NamedTuple):
         return self.state.n
 
     @property
-    def count(self) -> str:
+    def harm_count(self) -> str:
         """Count of harm that is minimised: ``first`` or ``total``."""
         return "total" if self.total else "first"
 

@@ -136,8 +136,8 @@ def divide(field: Field, attention: int) -> None:
 def select(world: World, room: Room, given: Profiles, field: Field) -> None:
     """Simulate step by step from now on; the best one of the field's first and of the given profiles becomes first."""
     world.numbers[STEPWISE] = 1.0
-    best = field_for(1, *field.commands.shape[1:])
-    gather(world, room, *(array[:SMALLEST_FIELD] for array in field[:3]), 0, PROFILES, 0.0, best)
+    best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
+    gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
     gather(world, room, *given, np.full(len(given.ends), given.ends.shape[1]), 0, PROFILES, 0.0, best)
     for array, one in zip(field, best, strict=True):
         array[0] = one[0]
