@@ -123,8 +123,7 @@ def test_who_reacts_later_than_it_says__is_believed_to_react_from_then_on() -> N
 
 def test_in_order__who_is_not_known_stays_between_those_who_are() -> None:
     place, known = np.array([[0.0, 9.0, 4.0, 3.0, 7.0]]), np.array([[True, False, True, False, False]])
-    in_order(place, known)
-    assert place.tolist() == [[0.0, 4.0, 4.0, 4.0, 7.0]]
+    assert in_order(place, known).tolist() == [[0.0, 4.0, 4.0, 4.0, 7.0]]
 
 
 # ------------------------------------------------------------------------------------------------ the claim
@@ -308,7 +307,7 @@ def test_latencies_that_are_over__are_not_waited_for_again() -> None:
 
 REFUSED: dict[str, Callable[[], object]] = {
     "needs a scenario": lambda: eb.make_agent("e_v2x_bm:estimated"),
-    "this is a mixture; give one of": lambda: eb.make_agent("e_v2x_bm:estimated", scenario="mixture-delays"),
+    "this is a mixture; give one of": lambda: eb.evaluate("mixture-delays", "e_v2x_bm:estimated", episodes=2),
     "but vehicle_3 is driven by 'idm'": lambda: eb.make_agent(
         "coast+step:estimated", scenario=BASE.replace(roles={"vehicle_2": "learner", "vehicle_3": "idm"})
     ),

@@ -5,7 +5,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.explain import scenario_json_schema, sentences
 from ethbrake_marl.worlds.given import worlds_from_state
@@ -74,12 +73,6 @@ REFUSED = {
 def test_what_cannot_be__is_refused(message: str) -> None:
     with refused(message):
         REFUSED[message]()
-
-
-def test_error__names_the_line_of_the_file() -> None:
-    content = {**PAPER.declared(), "v2x": {"tells": ["mas"]}}
-    with refused("mine.yaml, line 9: v2x.tells[0] = mas: did you mean mass?"):
-        Scenario.from_document(Document("mine.yaml", content, {("v2x", "tells"): 9}))
 
 
 def test_scenario__says_what_is_declared_and_can_be_made_of_it() -> None:
