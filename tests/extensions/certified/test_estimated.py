@@ -46,9 +46,8 @@ def test_the_line_is_the_true_one__where_everything_is_known() -> None:
         assert known.sum() > 10
         np.testing.assert_allclose(median.line[known][:, [SPEED, GAP], :-1], state.line[known][:, [SPEED, GAP], :-1])
         np.testing.assert_array_equal(median.car[known][:, [MASS, BRAKING]], state.car[known][:, [MASS, BRAKING]])
-    np.testing.assert_array_equal(
-        lines_at(BASE, steps=9, action=-0.5)[2].line, lines_at(BASE, steps=9, action=-0.5)[1].line
-    )
+    _, state, median = lines_at(BASE, steps=9, action=-0.5)
+    np.testing.assert_array_equal(median.line, state.line)
 
 
 def test_who_is_not_known_is_in_the_middle_of_the_ranges_and_follows_its_script() -> None:
@@ -174,11 +173,6 @@ def test_between_the_corners__some_worlds_are_above_their_bound() -> None:
     assert 0 < (found.harm > found.first).sum() < 12 and not found.trusted.all()
 
 
-def test_in_the_middle__nothing_is_promised_of_the_corners() -> None:
-    found = estimated("never heard", "first", "coast", 30, 7, corners=False)
-    assert (found.harm > found.first + 1.0).any()
-
-
 @pytest.mark.parametrize("corners", [False, True])
 def test_where_everything_is_known__the_bound_is_that_of_step_mode(corners: bool) -> None:
     loaded, game = eb.open_game(BASE)
@@ -200,9 +194,6 @@ CHANNELS = {
 }
 
 
-SPECS = ["e_v2x_bm:estimated", "coast+step:estimated", "ppo+episode:estimated", "coast+robust:estimated"]
-
-
 def decided(spec: str, scenario: eb.Scenario, alert: State) -> tuple[Any, Any]:
     """Commands of Vehicle 2 at its first four decisions, and whether it has heard or felt anything of Vehicle 3."""
     _, game = eb.open_game(scenario)
@@ -215,8 +206,14 @@ def decided(spec: str, scenario: eb.Scenario, alert: State) -> tuple[Any, Any]:
             return np.array(commands[1:]), np.array(aware[:-1])
 
 
-@pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("spec", SPECS)
+@pytest.mark.parametrize(
+    ("spec", "channel"),
+    [
+        ("e_v2x_bm:estimated", "periodic"), ("e_v2x_bm:estimated", "no capacity"), ("coast+step:estimated", "blocked"),
+        ("coast+step:estimated", "periodic"), ("ppo+episode:estimated", "front alone"),
+        ("coast+robust:estimated", "no capacity"), ("coast+robust:estimated", "blocked"),
+    ],
+)  # fmt: skip
 def test_what_was_not_received__changes_no_command(spec: str, channel: str) -> None:
     scenario = BASE.replace(v2x=CHANNELS[channel])
     alert, rng = scenario.sample(60, 7), np.random.default_rng(0)
@@ -234,23 +231,13 @@ def test_what_was_not_received__changes_no_command(spec: str, channel: str) -> N
     assert unaware.sum() > 10 and (one[0] == two[0])[unaware].all()
 
 
-def test_a_leak_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    received = Lines.received
-    monkeypatch.setattr(
-        Lines, "received", lambda self, state: (np.ones_like(received(self, state)[0]), received(self, state)[1])
-    )
-    with pytest.raises(AssertionError):
-        test_what_was_not_received__changes_no_command("coast+step:estimated", "blocked")
-
-
 # ------------------------------------------------------------------------------------------------ doors
 
 
 @pytest.mark.parametrize(
     "spec",
-    ["coast+step:estimated", "ppo+episode:estimated", "ppo+episode:pairwise:estimated", "e_v2x_bm:estimated",
-     "e_v2x_bm:pairwise:estimated"],
-)  # fmt: skip
+    ["coast+step:estimated", "ppo+episode:pairwise:estimated", "e_v2x_bm:estimated", "e_v2x_bm:pairwise:estimated"],
+)
 @pytest.mark.parametrize(
     "scenario",
     [PERIODIC, eb.load_scenario("cooperation-2-five").replace(v2x="blocked", roles={"vehicle_2": "learner"})],
@@ -265,13 +252,9 @@ def test_no_world_depends_on_the_batch(spec: str, scenario: eb.Scenario) -> None
 
 
 def test_knowledge_and_names() -> None:
-    for spec, knows in (
-        ("e_v2x_bm:estimated", "estimated model"),
-        ("coast+step:estimated", "own sensors + estimated model"),
-        ("ppo+robust:estimated", "messages + estimated model"),
-        ("ppo+episode:pairwise:estimated", "messages + estimated model"),
-    ):
-        assert eb.evaluate(DEAF, spec, episodes=1).knows[spec] == knows
+    specs = "e_v2x_bm:estimated,coast+step:estimated,ppo+episode:pairwise:estimated"
+    knows = ["estimated model", "own sensors + estimated model", "messages + estimated model"]
+    assert [*eb.evaluate(DEAF, specs, episodes=1).knows.values()] == knows
 
 
 def test_a_role_is_the_same_agent_as_a_driver() -> None:

@@ -48,8 +48,7 @@ def test_pair__by_hand_less_what_rounding_can_do_which_is_next_to_nothing(name):
     assert bound.impact_proven[0] == (harm > 0)
 
 
-@pytest.mark.parametrize("body", [1, 2])
-@pytest.mark.parametrize("step", [0.1, 0.02])
+@pytest.mark.parametrize(("body", "step"), [(1, 0.1), (2, 0.02)])
 def test_bound__is_never_above_what_its_own_optimum_reaches_in_steps(body, step):
     # Full braking behind a leader, or full drive ahead of a follower, attains the bound; rounding alone decides.
     rng, n = np.random.default_rng(61), 4000
@@ -132,11 +131,11 @@ def test_decisions__leave_less_room_and_no_plan_is_below():
     assert np.all(any_time <= decided) and decided.mean() > 1.02 * any_time.mean()
     assert often.mean() < 1.01 * any_time.mean()
     begun, least = game.begin(state), np.full(100, np.inf)
-    for early, late, switch in product((-1, -0.5, 0, 0.5, 1), (-1, -0.5, 0, 1), range(0, 40, 2)):
+    for early, late, switch in product((-1, -0.5, 0, 0.5, 1), (-1, -0.5, 0, 1), range(0, 40, 4)):
         plan = np.where(np.arange(75) < switch, float(early), float(late))
         least = np.minimum(least, eb.price(game, begun, np.tile(plan[:, np.newaxis], (100, 1, 1)), "first"))
     near = (decided > 0) & (least < 1.02 * decided + 1e-6)
-    assert np.all(decided <= least) and near.sum() > 15
+    assert np.all(decided <= least) and near.sum() > 10
 
 
 # What a first contact leaves, and what the command in force costs.
@@ -170,7 +169,7 @@ def follows(kind, values, time, closing):
 
 def test_gentlest_contact__is_reached_and_falls_with_the_time():
     met = 0
-    for values in random_rows(200, seed=43):
+    for values in random_rows(60, seed=43):
         for kind, meet in ((FRONT_FIRST, meet_front), (REAR_FIRST, meet_rear)):
             coming = meet(values, np.inf if kind == FRONT_FIRST else 99.0)
             times = np.array([meet(values, parameter) for parameter in np.linspace(0, 3, 13)])
@@ -181,12 +180,12 @@ def test_gentlest_contact__is_reached_and_falls_with_the_time():
             for time, (_, parameter) in zip(times, softest, strict=True):
                 if np.isfinite(parameter):
                     assert meet(values, parameter) == pytest.approx(time, abs=1e-5)
-    assert met > 130
+    assert met > 40
 
 
 def test_what_follows__falls_with_the_closing_speed_and_rises_with_the_time():
     some = 0
-    for values in random_rows(300, seed=44):
+    for values in random_rows(80, seed=44):
         apart, stand = values[row.GAP_L] + values[row.GAP_R], values[row.V_L] / values[row.A_L]
         for kind in (FRONT_FIRST, REAR_FIRST):
             times = [t for t in (0.1, 0.4, 0.8, 1.6) if row.leader(values, t)[1] - row.follower(values, t)[1] > -apart]
@@ -197,7 +196,7 @@ def test_what_follows__falls_with_the_closing_speed_and_rises_with_the_time():
             some += np.any(harm > 0)
             assert np.all(np.diff(harm, axis=1) < 1e-7)
             assert kind == REAR_FIRST or np.all(np.diff(harm, axis=0) > -1e-7)
-    assert some > 100
+    assert some > 25
 
 
 # kind, gaps, speeds, rear vehicle's latency, command, first-impact harm of both pairs
@@ -339,9 +338,7 @@ def test_horizon__what_comes_later_does_not_count():
 
 
 @pytest.mark.parametrize("time_step_s", [None, 0.1])
-@pytest.mark.parametrize(
-    ("mass", "bounce", "drive"), [(1.0, 0.0, 3.0), ([4.5, 5.5, 5.9], 1.0, 0.0), ([50, 1, 1], 0.1, 1e-9)]
-)
+@pytest.mark.parametrize(("mass", "bounce", "drive"), [(1.0, 0.0, 3.0), ([4.5, 5.5, 5.9], 1.0, 0.0)])
 def test_who_stands_at_the_leader__is_struck_together_with_it(time_step_s, mass, bounce, drive):
     """One impact of all three: the front pair closes at 0 in it, and no second one follows."""
     state = worlds([0, 20], [0, 0, 20], 6.0, drive=drive, mass=mass, restitution=bounce)
