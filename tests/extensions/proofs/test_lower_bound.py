@@ -376,6 +376,9 @@ def test_measures__are_asked_for_by_name():
     assert result["coast"]["avoidable_reason"].tolist() == ["front", "front", "", "", "", "rear"]
     assert result["full_brake"]["proven_harm"] == pytest.approx(RECORDED["paper-random"][2], rel=1e-12)
     assert (result["full_brake"]["proven_harm"] <= result["full_brake"]["first_impact_harm"]).all()
+    soon = eb.load_scenario("paper-random").replace(horizon_s=1.5)
+    near = eb.evaluate(soon, "full_brake", episodes=6, measures="proven_harm")["full_brake"]["proven_harm"]
+    assert near.sum() < 0.8 * sum(RECORDED["paper-random"][2])
     with refused("avoidable, proven_harm: a vehicle that does not learn does not brake fully"):
         coasts = eb.load_scenario("paper-random").replace(roles={"vehicle_2": "learner", "vehicle_3": "coast"})
         eb.evaluate(coasts, "full_brake", episodes=2, measures="avoidable")
