@@ -211,28 +211,12 @@ def rear_first(at, floor, best, enough, cells):
     best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, cells)
     if not avoids or end < last:
         return best
-    late = max(last_soft(at, high), last) + _GRAZE_S
+    # no first contact is possible after both have come to rest, or after the rear vehicle would reach the front one
+    late = max(min(max(high, at[V_L] / at[A_L]), outer_contact(at)[0]), last) + _GRAZE_S
     part = (late - last) / _PARTS
     for k in range(_PARTS):
         best = soft_harm(REAR_FIRST, at, last + k * part, last + (k + 1) * part, floor, best)
     return best
-
-
-@large
-def last_soft(at, rest):
-    """Return a time (s) after which no first contact with the rear vehicle is possible.
-
-    Until its first contact, the rear vehicle passes neither vehicle. If it brakes harder than the controlled vehicle,
-    by b (m/s2), and already braked t seconds before the contact, it was then faster by at least ``b t`` (m/s). ``rest``
-    is the time (s) at which controlled and rear vehicle have both come to rest under full braking.
-    """
-    last = min(max(rest, at[V_L] / at[A_L]), outer_contact(at)[0])
-    if at[A_F] >= at[A_R]:
-        return last
-    harder, onset, closing = at[A_R] - at[A_F], at[ONSET_R], at[V_R] - at[V_F]
-    gap = max(at[GAP_R] + (0.5 * at[U_F] * onset - closing) * onset, 0.0)
-    ahead = max(closing + at[A_F] * onset, 0.0)
-    return min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder)))
 
 
 @kernel

@@ -14,7 +14,7 @@ from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS
 from ethbrake_marl.extensions.proofs.flights import lead, widest_flight
 from ethbrake_marl.extensions.proofs.followers import after, after_rear, held_by_leader
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, REAR_FIRST
-from ethbrake_marl.extensions.proofs.lower_bound import front_first, last_soft, lower_bound, rear_first, rounding
+from ethbrake_marl.extensions.proofs.lower_bound import front_first, lower_bound, rear_first, rounding
 from ethbrake_marl.extensions.proofs.meetings import gentlest, gentlest_front, meet_front, meet_rear
 from ethbrake_marl.motion.layout import SPEED
 from tests.extensions.proofs.worlds import opening, play, searched_harm, wide_worlds, worlds
@@ -223,7 +223,6 @@ def test_after__is_nearly_attained_by_bouncing_off(name):
 
 CELL_MEMORY = np.empty((CELLS, CELL_COLUMNS))
 HELD = dict(V_L=10, A_L=8, V_F=20, A_F=4, U_F=2, LIMIT_F=40, V_R=30, A_R=4, FRONT_SHARE=0.9, GAP_R=100 - 121 / 14)
-SOFT = dict(V_L=30, A_L=1, V_F=18, A_F=5, U_F=4, V_R=21, A_R=7, GAP_L=50, GAP_R=1)
 CONTACTS = {  # function, row, further arguments -> value
     # Both at 19 after 20 against 18 m/s; the rear one, braking harder, is no help: 19^2 - 2 * 4 * 7.
     "after rear, of one that brakes less": (
@@ -234,11 +233,6 @@ CONTACTS = {  # function, row, further arguments -> value
     # rest after 11^2 / 14 m. The rear one, at 30 m/s with 4, comes there after 100 m in all: 900 - 800.
     "held by the leader": (held_by_leader, HELD, (0.0, 0.0, 10.0), 10.0),
     "not held by one that brakes harder": (held_by_leader, {**HELD, "A_F": 9}, (0.0, 0.0, 10.0), 0),
-    # It was faster by 2 t a time t before, over 1 m: t is at most 1 s, and 1.5 s for 3 m/s.
-    "last soft contact": (last_soft, SOFT, (9.0,), 1.0),
-    "last soft contact, from far": (last_soft, {**SOFT, "GAP_R": 90}, (9.0,), 1.5),
-    # Till its onset it can be left behind by up to 4, or be come towards by up to 5.
-    "last soft contact, late": (last_soft, {**SOFT, "GAP_R": 90, "ONSET_R": 0.2}, (9.0,), 0.2 + 4 / 2),
 }  # fmt: skip
 
 
