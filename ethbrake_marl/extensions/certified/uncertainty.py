@@ -89,7 +89,9 @@ class Uncertainty(NamedTuple):
             key, rule, bodies = interval.quantity, RULES[interval.quantity], alert.vehicles
             last = rule.count(bodies)
             if interval.number is not None and interval.number > last:
-                raise InvalidInput(f"uncertainty: {interval.text}: there is no such {rule.per}, because the line has {last}")
+                raise InvalidInput(
+                    f"uncertainty: {interval.text}: there is no such {rule.per}, because the line has {last}"
+                )
             for body in range(1, last + 1) if interval.number is None else (interval.number,):
                 values, of = values_of(alert, key)[:, body], f" of {rule.owner(body - 1)}"
                 half = interval.half_width * (values if interval.relative else 1.0)
@@ -101,8 +103,8 @@ class Uncertainty(NamedTuple):
                     k = int(np.argmin(good))
                     right = rule.interval if np.isfinite(values[k]) else f"finite: declare {key} in the scenario"
                     raise InvalidInput(
-                        f"uncertainty: {interval.text}: the value {values[k]:g}{of} in world {k} may be from {low[k]:g} to"
-                        f" {high[k]:g}; must be {right}"
+                        f"uncertainty: {interval.text}: the value {values[k]:g}{of} in world {k} may be from"
+                        f" {low[k]:g} to {high[k]:g}; must be {right}"
                     )
                 if interval.half_width > 0.0:
                     sides.append(Side(key, body, low if rule.positive else np.maximum(low, 0.0), high))
@@ -164,6 +166,7 @@ def parse_uncertainty(text: str) -> Uncertainty:
         new = Interval(entry, name, width / 100.0 if share else width, share, number)
         for other in intervals:
             if other.quantity == name and (None in (number, other.number) or number == other.number):
-                raise InvalidInput(f"uncertainty: {other.text} and {new.text} are intervals of the same quantity; give only one")
+                both = f"{other.text} and {entry}"
+                raise InvalidInput(f"uncertainty: {both} are intervals of the same quantity; give only one")
         intervals.append(new)
     return Uncertainty(tuple(intervals))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.explain import scenario_json_schema, sentences
+from ethbrake_marl.worlds.explain import sentences
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.extensions.messages.line import LINE
@@ -84,21 +84,6 @@ def test_scenario__says_what_is_declared_and_can_be_made_of_it() -> None:
     words = "persistence: periodic, tells: {vehicle_2: [place, mass]}"
     assert any(words in sentence for sentence in sentences(scenario))
     assert scenario.v2x.drawn and PAPER.v2x.extensions == ()
-
-
-def test_schema__has_the_keys_and_no_others() -> None:
-    schema = scenario_json_schema()
-    mapping = schema["$defs"]["V2X"]["anyOf"][1]
-    assert mapping["additionalProperties"] is False
-    assert mapping["properties"]["persistence"]["enum"] == ["first", "periodic"]
-    assert "tells" in mapping["properties"]
-
-
-def test_given_worlds__have_messages_if_no_message_can_be_lost() -> None:
-    sure = LINE.replace(v2x={"link_latency_s": 0.2, "senses": "none", "persistence": "periodic"})
-    given_memory, drawn = (w.memories["messages"] for w in (worlds_from_state(sure, {}), sure.sample(1, 7)))
-    for one, other, name in zip(given_memory, drawn, drawn._fields, strict=True):
-        assert name == "channel" or one.tobytes() == other.tobytes()
 
 
 def test_mixture__has_the_contents_of_each_member() -> None:

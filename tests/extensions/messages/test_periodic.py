@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.extensions.messages.belief import ages_s, believed, known_pieces
+from ethbrake_marl.extensions.messages.belief import ages_s, believed
 from ethbrake_marl.extensions.messages.links import NAME, chance, moved_on
 from ethbrake_marl.motion.layout import GAP, HIT, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -37,12 +37,6 @@ def test_sample_of_the_alert__has_the_force_that_acts_at_once() -> None:
     seen = seen_by(game, state, 2)  # of Vehicle 1 at the alert: 20 m/s, -6 m/s2; Vehicle 3 coasts until 1 s
     names = ("front_1.age", "front_1.acceleration", "front_1.gap", "rear_1.acceleration")
     assert [seen[name] for name in names] == pytest.approx([0.5, -0.6, (8 + 9.25 - 9) / 10, 0.0], abs=1e-6)
-
-
-def test_alert__nothing_has_been_received() -> None:
-    alert = LINE.replace(v2x={"link_latency_s": 0.0, "senses": "none", **PERIODIC}, latency_s=0.0).sample(1, 7)
-    assert (alert.know[0, 1:, 1:] == 0.0).all()
-    assert known_pieces(alert, 2)[0, 1:].any(axis=1).tolist() == [False, True, False]
 
 
 def test_episode_that_has_ended__hears_no_more() -> None:
