@@ -102,8 +102,8 @@ def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, unt
     """
     out = np.empty((2, *tried.shape[:2]))
     hold_worlds(
-        state.line, state.car, wanted, np.asarray(bodies, np.int64), tried, np.ascontiguousarray(state.time_s), until_s,
-        count == "total", working_memory(wanted.shape[1]), out,
+        state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(tried),
+        np.ascontiguousarray(state.time_s), until_s, count == "total", working_memory(wanted.shape[1]), out,
     )  # fmt: skip
     return out
 

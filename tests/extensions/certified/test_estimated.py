@@ -120,6 +120,13 @@ def test_who_reacts_later_than_it_says__is_believed_to_react_from_then_on() -> N
     assert (median.car[late, LATENCY, 3] >= state.time_s[late]).all()
 
 
+def test_a_line_without_the_vehicles_own_impact__is_not_possible() -> None:
+    lines, state, median = lines_at(DEAF, 5, steps=2)
+    struck = state.line.copy()
+    struck[:, HIT, 2] = 1.0
+    assert lines.agrees(state, median).all() and not lines.agrees(state._replace(line=struck), median).any()
+
+
 def test_in_order__who_is_not_known_stays_between_those_who_are() -> None:
     place, known = np.array([[0.0, 9.0, 4.0, 3.0, 7.0]]), np.array([[True, False, True, False, False]])
     assert in_order(place, known).tolist() == [[0.0, 4.0, 4.0, 4.0, 7.0]]
