@@ -162,16 +162,28 @@ def test_news_remove_corners__and_the_bound_falls() -> None:
 
 
 def test_news__never_make_the_shield_drop_a_better_plan() -> None:
-    """The policy's own play is its plan; best constant actions cost more in the lines that are left."""
+    """Every new plan here is full driving, which costs more than the plan that is held."""
     loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
-    drivers = {2: eb.make_agent("ppo")}
-    game = game._replace(shield=EstimatedShield(drivers, scenario=loaded, corners=True))
-    state = game.begin(loaded.sample(20, 7))
-    bound = state.memories["shield"].price
-    for _ in range(20):
-        state, _ = game.step(state, None)
+    shield = EstimatedShield(scenario=loaded, corners=True)
+    game = game._replace(shield=shield)
+    state = game.begin(loaded.sample(6, 7))
+    bound, plan = state.memories["shield"].price, state.memories["shield"].plan
+    shield.plans = lambda game, median, *states: [np.ones((median.n, *plan.shape[1:]))]  # type: ignore[method-assign]
+    for _ in range(8):
+        state, _ = game.step(state, np.full((6, 1), np.nan))
         assert (state.memories["shield"].price <= bound).all()
         bound = state.memories["shield"].price
+    assert (state.know[:, 2, 3] <= state.time_s).any()
+
+
+def test_e_v2x_bm__chooses_again_when_it_hears_something_new() -> None:
+    loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
+    team, again = eb.Team("one", {2: EstimatedEV2XBM(loaded)}), 0
+    states = [state for _, state in eb.play(game, loaded.sample(40, 7), team)]
+    for before, now, after in zip(states, states[1:], states[2:], strict=False):
+        heard = (now.know[:, 2, 3] <= now.time_s) & (now.know[:, 2, 3] > before.time_s)
+        again += int((heard & (after.wanted[:, 2] != now.wanted[:, 2])).sum())
+    assert again > 3
 
 
 def test_between_the_corners__some_worlds_are_above_their_bound() -> None:
