@@ -1,4 +1,4 @@
-"""Search the least harm of every world of a list, let agents improve on it, and save a table; or print shipped tables.
+"""Search the least harm of every world of a list and save a table, or print the shipped tables.
 
 ``python docs/studies/best_harm.py --scenario paper-random --episodes 1000 --output paper-random.npz`` searches a list.
 With ``--output``, finished chunks are saved beside the file, and the same command continues after an interruption.
@@ -22,7 +22,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
-from ethbrake_marl.extensions.search.best_harm import lowered, search_list
+from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.pricing import COUNTS, problem_of
 from ethbrake_marl.extensions.search.tables import BestHarmTable, shipped_tables
 from ethbrake_marl.files.sheet import Column, Sheet
@@ -48,7 +48,7 @@ def main(words: list[str]) -> None:
     add("--search-seed", type=int, default=0)
     add("--threads", type=int, help="worlds searched at the same time; changes no result")
     add("--start", type=Path, metavar="FILE.npz", help="a table to start from; no world gets more harm")
-    add("--agents", default="", metavar="A,B,...", help="agents to try after the search; less harm counts")
+    add("--agents", default="", metavar="A,B,...", help="agents that the search also starts from")
     add("--output", type=Path, metavar="FILE.npz", help="the table to write")
     given = parser.parse_args(words)
     if given.shipped:
@@ -79,15 +79,15 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
         raise InvalidInput(f"scenario {scenario.name!r} has no learner; give vehicles to control: --vehicles vehicle_2")
     alert = scenario.sample(given.episodes, seed=given.seed)
     counts = COUNTS if given.harm_count is None else (given.harm_count,)
-    teams = {count: make_teams(given.agents, scenario, harm_count=count) if given.agents else {} for count in counts}
+    known = None if given.start is None else BestHarmTable.load(given.start)
+    teams = [make_teams(given.agents, scenario, harm_count=count) if given.agents else {} for count in counts]
     table = search_list(
         game, alert, chunks=None if given.output is None else parts_beside(given.output), counts=counts,
-        budget=given.budget, seed=given.search_seed, threads=given.threads,
-        known=None if given.start is None else BestHarmTable.load(given.start),
+        budget=given.budget, seed=given.search_seed, threads=given.threads, known=known,
+        teams=[team for each in teams for team in each.values()],
     )  # fmt: skip
-    for name in teams[counts[0]]:
-        table = lowered(table, game, alert, {count: teams[count][name] for count in counts}, name)
     header = {**table.header, "episodes": given.episodes, "list_seed": given.seed, "command": command}
+    header |= {} if known is None else {"after": known.header}
     return BestHarmTable(table.identity, table.harm, table.profiles, header)
 
 

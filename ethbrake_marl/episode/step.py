@@ -196,20 +196,26 @@ def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: I
     return State(line, car, clock, know, wanted, {})
 
 
+def advanced(state: State, until_s: Floats) -> State:
+    """Return the state at ``until_s`` [n] if all hold ``state.wanted``."""
+    line, clock = state.line.copy(), state.clock.copy()
+    failed = advance_worlds(line, state.car, state.time_s, until_s, state.wanted, scratch_for(line.shape[2]))
+    if failed >= 0:
+        raise failure(state, failed, state.time_s[failed], until_s[failed])
+    clock[:, TIME] = until_s
+    return state._replace(line=line, clock=clock)
+
+
 def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
     """Return episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
 
     Until then ``alert.wanted`` is commanded.
     """
-    line, clock = alert.line.copy(), alert.clock.copy()
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
-    wanted = alert.wanted.copy()
-    failed = advance_worlds(line, alert.car, alert.time_s, first, wanted, scratch_for(wanted.shape[1]))
-    if failed >= 0:
-        raise failure(alert, failed, 0.0, first[failed])
-    clock[:, TIME] = clock[:, FIRST_DECISION] = first
-    clock[:, LAST] = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
-    return State(line, alert.car, clock, alert.know, wanted, alert.memories)
+    state = advanced(alert, first)
+    state.clock[:, FIRST_DECISION] = first
+    state.clock[:, LAST] = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
+    return state._replace(wanted=alert.wanted.copy())
 
 
 def step(

@@ -295,7 +295,7 @@ def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: 
 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
     """Fallback: the shield's own agents drive on, from the nominal state."""
-    nominal = after if after.n == len(plans) else after.take(slice(None, None, after.n // len(plans)))
+    nominal = after if after.n == len(plans) else after.take(np.arange(0, after.n, after.n // len(plans)))
     return rollout(game, shield.drivers, nominal, plans, shield.count, most), np.zeros(len(plans))
 
 

@@ -16,8 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import TIME, State
-from ethbrake_marl.episode.step import advance_worlds, failure
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS
 from ethbrake_marl.extensions.messages.belief import known_pieces
@@ -60,7 +59,6 @@ from ethbrake_marl.motion.layout import (
     TOTAL,
     Bools,
     Floats,
-    scratch_for,
 )
 from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.roles import HELD, LEARNER, first_command
@@ -233,8 +231,8 @@ class Lines(NamedTuple):
         place[:, 2:] = -np.cumsum(line[:, GAP, 1:-1], axis=1)
         place = np.where(known, news[:, PLACE] + way - news[:, PLACE, [body]], place - place[:, [body]])
         ahead = np.where(pieces[:, 0, P_PLACE], news[:, PLACE, 0] - news[:, PLACE, body], line[:, GAP, 0] + place[:, 1])
-        in_order(place[:, body:0:-1], known[:, body:0:-1])
-        in_order(-place[:, body:], known[:, body:], out=place[:, body:])
+        place[:, body:0:-1] = in_order(place[:, body:0:-1], known[:, body:0:-1])
+        place[:, body:] = -in_order(-place[:, body:], known[:, body:])
         fresh = known & (at >= time)
         exact = fresh[:, 1:-1] & fresh[:, 2:]
         line[:, GAP, 1:-1] = np.where(exact, state.gaps_m, np.maximum(place[:, 1:-1] - place[:, 2:], 0.0))
@@ -248,28 +246,14 @@ class Lines(NamedTuple):
         return lines._replace(line=line, car=car, wanted=wanted)
 
 
-def in_order(place: Floats, known: Bools, out: Floats | None = None) -> None:
-    """Correct places (m), from a vehicle outwards, so that nobody is nearer than who is before; in place.
+def in_order(place: Floats, known: Bools) -> Floats:
+    """Return places (m), from a vehicle outwards, so that nobody is nearer than who is before.
 
     Who is not ``known`` is at most as far away as the next known one beyond.
     """
     limit = np.where(known, place, np.inf)[:, ::-1]
     within = np.minimum(place, np.minimum.accumulate(limit, axis=1)[:, ::-1])
-    ordered = np.maximum.accumulate(within, axis=1)
-    if out is None:
-        place[:] = ordered
-    else:
-        out[:] = -ordered
-
-
-def advanced(state: State, until_s: Floats) -> State:
-    """Return the line at ``until_s`` [n] if all hold their commands."""
-    line, clock = state.line.copy(), state.clock.copy()
-    failed = advance_worlds(line, state.car, state.time_s.copy(), until_s, state.wanted, scratch_for(line.shape[2]))
-    if failed >= 0:
-        raise failure(state, failed, state.time_s[failed], until_s[failed])
-    clock[:, TIME] = until_s
-    return state._replace(line=line, clock=clock)
+    return np.maximum.accumulate(within, axis=1)
 
 
 @large

@@ -15,6 +15,7 @@ info ``trusted`` is false once no line is possible.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,8 +25,9 @@ from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines, advanced
+from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines
 from ethbrake_marl.extensions.certified.robust import Members, MembersShield, apart, joined, opened
 from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
@@ -63,7 +65,7 @@ class EstimatedShield(MembersShield):
     def begin(self, game: Game, alert: State, state: State) -> Memory:
         """Return the memory at the first decision ``state``."""
         lines, possible, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
-        median = lines.take(slice(None, None, self.lines.alert.n))
+        median = lines.take(np.arange(0, lines.n, self.lines.alert.n))
         memory = self.start(game, median, median, lines, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(lines, state.n), possible))
 
@@ -76,12 +78,14 @@ class EstimatedShield(MembersShield):
         if len(rows):
             memory = self.planned_again(game, memory, lines, rows)
         memory = memory._replace(members=Members(apart(lines, state.n), trusted))
-        return super().decide(game, with_shield(state, memory), proposed, donate=donate)
+        state = state._replace(memories={**state.memories, "shield": memory})
+        return super().decide(game, state, proposed, donate=donate)
 
     def planned_again(self, game: Game, memory: Memory, lines: State, rows: Ints) -> Memory:
         """Return the memory in which the worlds ``rows`` hold the cheapest of their plan and new first plans."""
         here = part(lines, rows, self.lines.alert.n)
-        median, plan, price = here.take(slice(None, None, self.lines.alert.n)), memory.plan.copy(), memory.price.copy()
+        median = here.take(np.arange(0, here.n, self.lines.alert.n))
+        plan, price = memory.plan.copy(), memory.price.copy()
         plans = [plan[rows], *self.plans(game, median, median, here)]
         prices = np.stack([self.price(game, here, each) for each in plans])
         plan[rows], price[rows] = np.stack(plans)[prices.argmin(axis=0), np.arange(len(rows))], prices.min(axis=0)
@@ -141,8 +145,6 @@ class EstimatedEV2XBM:
         self.scenario, self.is_pairwise, self.count = scenario, is_pairwise, count
         self.name = f"e_v2x_bm{':pairwise' if is_pairwise else ''}:estimated"
         self.lines: dict[int, Lines] = {}  # body -> its median line
-        if scenario.members:
-            Lines.of(scenario, 1, corners=False)  # refuses
 
     def begin(self, alert: State, body: int) -> Estimate:
         """Return the median line, and no command."""
@@ -155,7 +157,7 @@ class EstimatedEV2XBM:
         """Return the commands of vehicle ``body``, [n] m/s2, and the new memory."""
         wanted = memory.median.wanted.copy()
         wanted[:, body] = state.wanted[:, body]
-        foretold = advanced(memory.median._replace(wanted=wanted), state.time_s.copy())
+        foretold = advanced(memory.median._replace(wanted=wanted), state.time_s)
         median, command = self.lines[body].overwritten(state, foretold), memory.command.copy()
         rows = (differ(foretold, median) | np.isnan(command)).nonzero()[0]
         if len(rows):
@@ -187,23 +189,8 @@ def lines_of_learner(scenario: Scenario, corners: bool) -> Lines:
     return Lines.of(scenario, scenario.learners[0], corners=corners)
 
 
-def with_shield(state: State, memory: Memory) -> State:
-    """Return the state with another memory of the shield."""
-    return state._replace(memories={**state.memories, "shield": memory})
-
-
-def make_step(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team ``TEAM+step:estimated``."""
-    return with_lines(team, argument, settings, corners=False)
-
-
-def make_robust(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team ``TEAM+robust:estimated``."""
-    return with_lines(team, argument, settings, corners=True)
-
-
 def with_lines(team: Team, argument: str | None, settings: Any, corners: bool) -> Team:
-    """Return a team with an estimated shield. Raises ``InvalidInput`` for an argument."""
+    """Return the team ``TEAM+step:estimated``, or ``TEAM+robust:estimated`` with corners."""
     if argument is not None:
         raise InvalidInput(f"agent {settings.spec!r}: nothing but estimated can follow the colon")
     scenario, count = settings.needed_scenario(), settings.harm_count
@@ -228,8 +215,12 @@ def _entry(make: Any, form: str, about: str) -> Part:
     return Part(make, form=form, about=about, knows=KNOWS)
 
 
-STEP = _entry(make_step, "step:estimated", "certified in the median line that its vehicle estimates")
-CORNERS = _entry(make_robust, "robust:estimated", "also in the corners of the ranges of what was not received")
+STEP = _entry(
+    partial(with_lines, corners=False), "step:estimated", "certified in the median line that its vehicle estimates"
+)
+CORNERS = _entry(
+    partial(with_lines, corners=True), "robust:estimated", "also in the corners of the ranges of what was not received"
+)
 EPISODE = _entry(
     make_episode, "episode[:pairwise]:estimated", "the paper's hybrid in the line that its vehicle estimates"
 )

@@ -34,16 +34,11 @@ NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 class Interval(NamedTuple):
     """Interval around one quantity, of one vehicle or pair, or of all."""
 
+    text: str  # as it was written, such as mass_t.vehicle_2=10%
     quantity: str
     half_width: float  # in the quantity's unit, or a share of its value below 1
     relative: bool = False  # the half-width is a share
     number: int | None = None  # of the vehicle or pair; None: all of them
-
-    def __str__(self) -> str:
-        kind = RULES[self.quantity].per
-        where = "" if self.number is None else f".{kind}_{self.number}"
-        width = f"{100.0 * self.half_width:g}%" if self.relative else f"{self.half_width:g}"
-        return f"{self.quantity}{where}={width}"
 
 
 class Side(NamedTuple):
@@ -61,7 +56,7 @@ class Uncertainty(NamedTuple):
     intervals: tuple[Interval, ...]
 
     def __str__(self) -> str:
-        return ",".join(str(interval) for interval in self.intervals)
+        return ",".join(interval.text for interval in self.intervals)
 
     def members(self, alert: State) -> State:
         """Return the members of worlds at the alert, M rows for each world: itself, then the corners of its box.
@@ -94,7 +89,9 @@ class Uncertainty(NamedTuple):
             key, rule, bodies = interval.quantity, RULES[interval.quantity], alert.vehicles
             last = rule.count(bodies)
             if interval.number is not None and interval.number > last:
-                raise InvalidInput(f"uncertainty: {interval}: there is no such {rule.per}, because the line has {last}")
+                raise InvalidInput(
+                    f"uncertainty: {interval.text}: there is no such {rule.per}, because the line has {last}"
+                )
             for body in range(1, last + 1) if interval.number is None else (interval.number,):
                 values, of = values_of(alert, key)[:, body], f" of {rule.owner(body - 1)}"
                 half = interval.half_width * (values if interval.relative else 1.0)
@@ -106,8 +103,8 @@ class Uncertainty(NamedTuple):
                     k = int(np.argmin(good))
                     right = rule.interval if np.isfinite(values[k]) else f"finite: declare {key} in the scenario"
                     raise InvalidInput(
-                        f"uncertainty: {interval}: the value {values[k]:g}{of} in world {k} may be from {low[k]:g} to"
-                        f" {high[k]:g}; must be {right}"
+                        f"uncertainty: {interval.text}: the value {values[k]:g}{of} in world {k} may be from"
+                        f" {low[k]:g} to {high[k]:g}; must be {right}"
                     )
                 if interval.half_width > 0.0:
                     sides.append(Side(key, body, low if rule.positive else np.maximum(low, 0.0), high))
@@ -166,9 +163,10 @@ def parse_uncertainty(text: str) -> Uncertainty:
         if not width < (100.0 if share else math.inf):
             raise InvalidInput(f"uncertainty: {entry!r}: must be a finite number, or a share below 100 %")
         number = None if match["number"] is None else int(match["number"])
-        new = Interval(name, width / 100.0 if share else width, share, number)
+        new = Interval(entry, name, width / 100.0 if share else width, share, number)
         for other in intervals:
             if other.quantity == name and (None in (number, other.number) or number == other.number):
-                raise InvalidInput(f"uncertainty: {other} and {new} are intervals of the same quantity; give only one")
+                both = f"{other.text} and {entry}"
+                raise InvalidInput(f"uncertainty: {both} are intervals of the same quantity; give only one")
         intervals.append(new)
     return Uncertainty(tuple(intervals))

@@ -8,7 +8,7 @@ objective while the others keep theirs. n worlds, N vehicles, L learners, T deci
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,9 @@ from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.statistics import decrease
 from ethbrake_marl.extensions.search.best_harm import BUDGET as JOINT_BUDGET, best_harm
-from ethbrake_marl.extensions.search.kernels import PLAN, Field, gather, improve
+from ethbrake_marl.extensions.search.kernels import PLAN, gather, improve
 from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, aimed, problem_of
-from ethbrake_marl.extensions.search.search import prepared, seeded, steps_of
+from ethbrake_marl.extensions.search.search import field_for, prepared, seeded
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.names import open_game
@@ -149,10 +149,11 @@ def respond(problem: Problem, plans: Floats, budget: int, seed: int) -> Floats:
         world = world._replace(
             bounds=np.ascontiguousarray(world.bounds[:1])
         )  # only the first vehicle's commands change
-        ends, tried = steps_of(T, problem.last_step[k]), other_plans(plan, world.bounds[0], budget // 3)
-        field: Any = Field(
-            np.zeros((FIELD, T), np.int64), np.zeros((FIELD, *shape)), np.zeros(FIELD, np.int64), np.full(FIELD, np.inf)
+        ends, tried = (
+            np.minimum(np.arange(1, T + 1), problem.last_step[k]),
+            other_plans(plan, world.bounds[0], budget // 3),
         )
+        field = field_for(FIELD, *shape)
         steps = np.repeat(ends[np.newaxis], len(tried), axis=0)
         gather(world, room, steps, tried, np.full(len(tried), T), 0, DRAWING, SAME, field)
         each = max((budget - len(tried)) // (2 * FIELD), 1)

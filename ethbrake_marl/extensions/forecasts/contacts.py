@@ -111,7 +111,7 @@ def known_line(line, car, know, time, i, known, parameters, commands):
 @large
 def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out):
     """Write ``contact`` and ``contact_far``, unscaled, to ``out`` [n, observers, F]; return a failed row or -1."""
-    scratch, here, known, parameters, commands, value = memory
+    scratch, here, known, parameters, commands = memory
     near, failed = 3 * PER_COMMAND, -1
     for k in range(len(out)):
         for o in range(len(observers)):
@@ -125,9 +125,8 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 met = drive(here, parameters, commands, scratch, 0.0, FORECAST_S)
                 if met == FAILED:
                     failed = k
+                value = out[k, o, c * PER_COMMAND : (c + 1) * PER_COMMAND]
                 write_features(scratch, met == MET, i, first, last, time_step_s, value)
-                for f in range(PER_COMMAND):
-                    out[k, o, c * PER_COMMAND + f] = value[f]
                 far = near + c * FAR_PER_COMMAND
                 out[k, o, far], out[k, o, far + 1] = value[0], value[4]
                 out[k, o, far + 2], out[k, o, far + 3] = math.sqrt(value[8]), math.sqrt(value[9])
@@ -164,7 +163,7 @@ def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))
     line, known, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))
-    memory = scratch_for(bodies), line, known, parameters, np.zeros(bodies), np.zeros(PER_COMMAND)
+    memory = scratch_for(bodies), line, known, parameters, np.zeros(bodies)
     failed = forecast_worlds(state.line, state.car, state.clock, state.know, observers, time_step_s, memory, out)
     if failed >= 0:
         raise PhysicsError({failed: f"a forecast of contacts failed before the end of its {FORECAST_S:g} s"})

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import TIME, State
-from ethbrake_marl.episode.step import advance_worlds, failure
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import solo
 from ethbrake_marl.motion.forces import ROUNDING_S
@@ -31,7 +31,6 @@ from ethbrake_marl.motion.layout import (
     SPEED,
     Bools,
     Floats,
-    scratch_for,
 )
 
 NAME = "messages"  # of the memory in `State.memories`
@@ -150,15 +149,10 @@ def _own(memory: Memory) -> Memory:
 
 def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
     """Return the state at ``until_s`` [n], and the way of Vehicle 1, [n] m: what the gap to a post ahead loses."""
-    line, clock = state.line.copy(), state.clock.copy()
+    line = state.line.copy()
     line[line[:, GAP, 0] >= FAR_M, GAP, 0] = POST_M
-    way = line[:, GAP, 0].copy()
-    failed = advance_worlds(line, state.car, state.time_s.copy(), until_s, state.wanted, scratch_for(line.shape[2]))
-    if failed >= 0:
-        raise failure(state, failed, state.time_s[failed], until_s[failed])
-    clock[:, TIME] = until_s
-    way -= line[:, GAP, 0]
-    return state._replace(line=line, clock=clock), way
+    after = advanced(state._replace(line=line), until_s)
+    return after, line[:, GAP, 0] - after.line[:, GAP, 0]
 
 
 def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:

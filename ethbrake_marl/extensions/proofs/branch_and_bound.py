@@ -87,11 +87,12 @@ def harm_of(kind, at, early, late, soft, hard, floor):
     return soft * soft + max(follows, floor)
 
 
-@kernel
-def put(cells, count, harm, early, late, soft, hard):
-    """Add a cell, and return the new number of cells."""
+@large
+def put(kind, at, floor, cells, count, least, early, late, soft, hard):
+    """Add a cell, whose bound is at least ``least`` (m2/s2), and return the new number of cells."""
     cell = cells[count]
-    cell[HARM], cell[EARLY], cell[LATE], cell[SOFT], cell[HARD] = harm, early, late, soft, hard
+    cell[HARM] = max(harm_of(kind, at, early, late, soft, hard, floor), least)
+    cell[EARLY], cell[LATE], cell[SOFT], cell[HARD] = early, late, soft, hard
     return count + 1
 
 
@@ -112,33 +113,25 @@ def divide(kind, at, floor, count, row, cells):
     Returns the new number of cells, and the bound (m2/s2) for one single first contact in the cell, which the smallest
     bound of all first contacts does not exceed.
     """
-    harm, early, late, soft, hard = (
-        cells[row, HARM],
-        cells[row, EARLY],
-        cells[row, LATE],
-        cells[row, SOFT],
-        cells[row, HARD],
-    )
+    cell = cells[row]
+    harm, early, late, soft, hard = cell[HARM], cell[EARLY], cell[LATE], cell[SOFT], cell[HARD]
     count -= 1
     for column in range(CELL_COLUMNS):
-        cells[row, column] = cells[count, column]
+        cell[column] = cells[count, column]
     middle = 0.5 * (early + late)
     if (late - early) * (at[U_F] + at[A_F] + at[A_L]) > hard - soft and early < middle < late:
         closing = max(soft, gentlest(kind, at, middle)[0])
         reached = harm_of(kind, at, middle, middle, closing, closing, floor)
         if soft < hard:
-            least = harm_of(kind, at, middle, late, soft, hard, floor)
-            count = put(cells, count, max(least, harm), middle, late, soft, hard)
+            count = put(kind, at, floor, cells, count, harm, middle, late, soft, hard)
         soft, late = max(soft, gentlest_between(kind, at, early, middle)), middle
     else:
         middle = 0.5 * (soft + hard)
         reached = harm_of(kind, at, late, late, middle, middle, floor)
-        least = harm_of(kind, at, early, late, middle, hard, floor)
-        count = put(cells, count, max(least, harm), early, late, middle, hard)
+        count = put(kind, at, floor, cells, count, harm, early, late, middle, hard)
         hard = middle
     if soft < hard:
-        least = harm_of(kind, at, early, late, soft, hard, floor)
-        count = put(cells, count, max(least, harm), early, late, soft, hard)
+        count = put(kind, at, floor, cells, count, harm, early, late, soft, hard)
     return count, reached
 
 
@@ -158,7 +151,7 @@ def least_harm(kind, at, first, last, floor, best, enough, cells):
         until = next_split(kind, at, begin, last) if count < _SPLITS else last
         soft = gentlest_between(kind, at, begin, until)
         if soft < hard:
-            count = put(cells, count, harm_of(kind, at, begin, until, soft, hard, floor), begin, until, soft, hard)
+            count = put(kind, at, floor, cells, count, 0.0, begin, until, soft, hard)
         begin = until
     row, least = lowest(cells, count)
     for _ in range(len(cells) - _SPLITS - 2):

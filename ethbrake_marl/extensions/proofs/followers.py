@@ -210,24 +210,6 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
 
 
 @large
-def slowed_by_rear(at, early, closing, gap):
-    """Return the smallest closing speed (m/s) of the front pair after the rear vehicle has hit the controlled vehicle.
-
-    From the fact that the controlled vehicle, which must brake at least as hard, stays ahead of the rear vehicle. The
-    result is 0 if the closing speed of the front pair may rise with time. ``gap``: gap to the front vehicle at
-    ``early`` (m).
-    """
-    share, v_l = at[REAR_SHARE], leader(at, early)[0]
-    pooled = (1.0 - share) * at[A_F] + share * at[A_R]
-    mean = 0.5 * (at[A_F] + pooled)
-    speed = follower(at, early)[0] - (1.0 - share) * closing
-    if not (mean >= at[A_L] and speed > 0.0):
-        return 0.0
-    until = walk(gap, v_l, braking(0.0, at[A_L]), speed, braking(0.0, pooled), speed / pooled)[1]
-    return max(speed - mean * until - max(v_l - at[A_L] * until, 0.0), 0.0) if until < math.inf else 0.0
-
-
-@large
 def after_rear(at, early, late, closing, end, lack):
     """Return the smallest squared closing speed (m2/s2) of the front pair after the rear vehicle's first contact."""
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
@@ -241,7 +223,7 @@ def after_rear(at, early, late, closing, end, lack):
     least = gap - max(follower(at, late)[1] - way_r - (leader(at, late)[1] - way_l), 0.0)
     squared = braking_after(gap, least, v_l, at[A_L], speed, at[A_F])
     if at[A_F] >= at[A_R]:
-        pushed = max(pushed_by_rear(at, early, late, closing, end, lack, gap), slowed_by_rear(at, early, closing, gap))
+        pushed = pushed_by_rear(at, early, late, closing, end, lack, gap)
         squared = max(squared, pushed * pushed)
     return squared
 

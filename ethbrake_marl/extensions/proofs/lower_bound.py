@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import TIME, State
-from ethbrake_marl.episode.step import advance_worlds, failure
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.proofs.avoidability import Avoidability, avoidability, largest_behind, spare_gap
+from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability, largest_behind, spare_gap
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, least_harm
 from ethbrake_marl.extensions.proofs.followers import after
 from ethbrake_marl.extensions.proofs.line import (
@@ -55,7 +55,7 @@ from ethbrake_marl.extensions.proofs.meetings import (
 from ethbrake_marl.extensions.proofs.plans import braking, walk
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import solo
-from ethbrake_marl.motion.layout import LIMIT, Bools, Floats, scratch_for
+from ethbrake_marl.motion.layout import LIMIT, Bools, Floats
 
 LEAST_TIME_STEP_S = 1e-3  # shorter steps between decisions would take too long
 
@@ -79,7 +79,6 @@ class LowerBound(NamedTuple):
     front_pair: Floats  # bound of the front pair alone, after the early harm
     rear_pair: Floats  # bound of the rear pair alone, after the early harm
     combined: Floats  # bound of both pairs together; 0 if nothing is proven
-    contact: Avoidability  # can contact be avoided? The combined bound uses it
 
     @property
     def impact_proven(self) -> Bools:
@@ -212,28 +211,12 @@ def rear_first(at, floor, best, enough, cells):
     best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, cells)
     if not avoids or end < last:
         return best
-    late = max(last_soft(at, high), last) + _GRAZE_S
+    # no first contact is possible after both have come to rest, or after the rear vehicle would reach the front one
+    late = max(min(max(high, at[V_L] / at[A_L]), outer_contact(at)[0]), last) + _GRAZE_S
     part = (late - last) / _PARTS
     for k in range(_PARTS):
         best = soft_harm(REAR_FIRST, at, last + k * part, last + (k + 1) * part, floor, best)
     return best
-
-
-@large
-def last_soft(at, rest):
-    """Return a time (s) after which no first contact with the rear vehicle is possible.
-
-    Until its first contact, the rear vehicle passes neither vehicle. If it brakes harder than the controlled vehicle,
-    by b (m/s2), and already braked t seconds before the contact, it was then faster by at least ``b t`` (m/s). ``rest``
-    is the time (s) at which controlled and rear vehicle have both come to rest under full braking.
-    """
-    last = min(max(rest, at[V_L] / at[A_L]), outer_contact(at)[0])
-    if at[A_F] >= at[A_R]:
-        return last
-    harder, onset, closing = at[A_R] - at[A_F], at[ONSET_R], at[V_R] - at[V_F]
-    gap = max(at[GAP_R] + (0.5 * at[U_F] * onset - closing) * onset, 0.0)
-    ahead = max(closing + at[A_F] * onset, 0.0)
-    return min(last, onset + min(ahead / harder, math.sqrt(2.0 * gap / harder)))
 
 
 @kernel
@@ -309,15 +292,16 @@ def lower_bound(
     ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.
 
     """
-    verdict = avoidability(state, body)
+    reason = avoidability(state, body).reason
     start = state.time_s + rows_of(state, body)[:, ONSET_F]
     _check_asked(state, start, count, horizon_s, time_step_s)
-    now = _at_start(state, start)
+    full = np.pad(-state.braking_capacity_mps2, ((0, 0), (1, 0)))
+    now = advanced(state._replace(wanted=full), start)  # until then all brake fully
     counts = (now.speeds_mps[:, 1:] >= 0.0) & (now.speeds_mps[:, :-1] >= 0.0) & ((count == "total") | ~now.pair_hit)
     none = np.zeros(state.n, np.bool_)
     has_front = counts[:, body - 2] if body > 1 else none
     has_rear = counts[:, body - 1] if body < state.vehicles else none
-    unavoidable = has_front & has_rear & (verdict.reason >= 2)
+    unavoidable = has_front & has_rear & (reason >= FRONT)
     rows, until, out = rows_of(now, body, time_step_s or 0.0), horizon_s - start, np.empty((state.n, BOUNDS))
 
     def bound(first: int) -> None:
@@ -329,7 +313,7 @@ def lower_bound(
         list(threads.map(bound, range(0, state.n, _AT_ONCE)))
     parts = (now.harm(count), out[:, FRONT_BOUND], out[:, REAR_BOUND], out[:, COMBINED_BOUND])
     early, front, rear, combined = (np.maximum(part - rounding(state, body), 0.0) for part in parts)
-    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined, verdict)
+    return LowerBound(early + np.maximum(front + rear, combined), early, front, rear, combined)
 
 
 def _check_asked(state: State, start: Floats, count: str, horizon_s: float, time_step_s: float | None) -> None:
@@ -351,17 +335,6 @@ def _check_asked(state: State, start: Floats, count: str, horizon_s: float, time
         raise InvalidInput(
             f"lower_bound: world {int(np.argmax(ahead))} has an obstacle ahead; the bound is proven without an obstacle"
         )
-
-
-def _at_start(state: State, start: Floats) -> State:
-    """Return the episodes at the start, when the controlled vehicle may act; until then all brake fully."""
-    line, clock, wanted = state.line.copy(), state.clock.copy(), np.zeros(state.wanted.shape)
-    wanted[:, 1:] = -state.braking_capacity_mps2
-    failed = advance_worlds(line, state.car, state.time_s.copy(), start, wanted, scratch_for(line.shape[2]))
-    if failed >= 0:
-        raise failure(state, failed, state.time_s[failed], start[failed])
-    clock[:, TIME] = start
-    return state._replace(line=line, clock=clock)
 
 
 def rounding(state: State, body: int) -> Floats:

@@ -9,14 +9,13 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import MODEL, Agent, Team
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.objectives import Declared
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.extensions.search.best_harm import alone, commands_of, e_v2x_bm_profiles
+from ethbrake_marl.extensions.search.best_harm import commands_of, e_v2x_bm_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of
 from ethbrake_marl.extensions.search.search import refine, search_profiles
 from ethbrake_marl.extensions.search.tables import best_known
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import BRAKING, Floats
 from ethbrake_marl.names import AgentSettings, make_agent
 from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.game import game_of
@@ -38,12 +37,6 @@ class Memory(NamedTuple):
     predicted_harm: Floats  # [n] m2/s2
 
 
-class Role(NamedTuple):
-    """A vehicle that an agent drives, whose commands nobody knows at the alert."""
-
-    name: str
-
-
 class Planner:
     """Drives commands that it chose at the alert; it assumes that other learners brake fully.
 
@@ -53,17 +46,12 @@ class Planner:
     knows = MODEL
 
     def __init__(self, name: str, scenario: Scenario, count: str) -> None:
-        roles = dict(enumerate(scenario.roles.values(), 1))
-        agents = {i: Role(role) for i, role in roles.items() if role.partition(":")[0] not in (LEARNER, *HELD)}
-        self.name, self.count = name, count
-        self.objective: Declared = scenario.objective
-        self.game: Game = game_of(scenario, scripts=agents)[1]  # type: ignore[arg-type]  # nobody asks them
+        self.name, self.scenario, self.count = name, scenario, count
 
     def begin(self, alert: State, body: int) -> Memory:
         """Choose. Raises ``InvalidInput`` where another vehicle's commands are not known at the alert."""
-        game = self.game._replace(scripts={i: role for i, role in self.game.scripts.items() if i != body})
-        game, alert = alone(game, alert, body)
-        problem = problem_of(game, alert, count=self.count, objective=self.objective)
+        game, alert = alone(self.scenario, alert, body)
+        problem = problem_of(game, alert, count=self.count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
         return Memory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
@@ -73,14 +61,9 @@ class Planner:
 
     def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
         """Return the command of the latest decision of the plan, [n] m/s2, and the memory as it was."""
-        step = np.floor((state.time_s - memory.start_s) / self.game.rules.time_step_s + ROUNDING).astype(np.int64)
+        step = np.floor((state.time_s - memory.start_s) / self.scenario.time_step_s + ROUNDING).astype(np.int64)
         at = np.clip(step, 0, memory.commands_mps2.shape[1] - 1)
         return memory.commands_mps2[np.arange(state.n), at], memory
-
-    @property
-    def decisions(self) -> int:
-        """Largest number of decisions of an episode."""
-        return int(np.ceil(self.game.rules.horizon_s / self.game.rules.time_step_s)) + 1
 
 
 class BestHarm(Planner):
@@ -92,32 +75,32 @@ class BestHarm(Planner):
 
     def __init__(self, scenario: Scenario, count: str = "first", budget: int = BUDGET, name: str = "best_harm") -> None:
         super().__init__(name, scenario, count)
-        self.scenario, self.budget = scenario, budget
+        self.budget = budget
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
         """Look the worlds up; search those that are in no table, or all for another objective than the line's harm."""
         known, profiles = best_known(problem, self.count)
-        missing = np.isnan(known) | (self.objective != "total")
-        commands = profiles.stepwise(self.decisions)[:, :, 0]
+        commands = profiles.stepwise(int(problem.last_step.max()))[:, :, 0]
         harm = problem.value(problem.follow(profiles))
-        if missing.any():
-            some = np.flatnonzero(missing)
-            commands[some], harm[some] = self.search(game, alert.take(some), problem.take(some), body)
+        some = (np.isinf(known) | (self.scenario.objective != "total")).nonzero()[0]
+        if len(some):
+            commands[some], harm[some] = self.search(
+                game, alert.take(some), problem.take(some), body, commands.shape[1]
+            )
         return commands, harm
 
-    def search(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
+    def search(self, game: Game, alert: State, problem: Problem, body: int, steps: int) -> tuple[Floats, Floats]:
         """Search these worlds."""
         profiles, values = search_profiles(problem, e_v2x_bm_profiles(problem, alert), budget=self.budget)
-        best = profiles.stepwise(self.decisions)[:, :, 0]
+        best = profiles.stepwise(steps)[:, :, 0]
         if self.scenario.learners != (body,):
             return best, values[self.count]
-        steps = int(problem.last_step.max())
         policy = make_agent(START, scenario=self.scenario)
         assert not isinstance(policy, Team)
-        theirs = planned(game, alert, policy, body, steps)
+        theirs = commands_of(problem, game, alert, Team(START, {body: policy}))[:, :, 0]
         better = refine(problem, theirs, budget=1)[1] < values[self.count]
-        start = np.where(better[:, np.newaxis], theirs, best[:, :steps])
-        best[:, :steps], harm = refine(problem, start, budget=self.budget)
+        start = np.where(better[:, np.newaxis], theirs, best[:, : theirs.shape[1]])
+        best[:, : theirs.shape[1]], harm = refine(problem, start, budget=self.budget)
         return best, harm
 
 
@@ -138,15 +121,24 @@ class Searched(Planner):
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
         """Let the inner agent drive, and search around its commands."""
-        start = planned(game, alert, self.inner, body, int(problem.last_step.max()))
-        commands, harm = refine(problem, start, budget=self.candidates)
-        return np.pad(commands, ((0, 0), (0, self.decisions - commands.shape[1])), mode="edge"), harm
+        start = commands_of(problem, game, alert, Team(self.inner.name, {body: self.inner}))[:, :, 0]
+        return refine(problem, start, budget=self.candidates)
 
 
-def planned(game: Game, alert: State, agent: Agent, body: int, steps: int) -> Floats:
-    """Return what an agent commands at each of the first decisions, [n, steps] m/s2."""
-    commands = commands_of(game, alert, Team(agent.name, {body: agent}))[:, :, 0]
-    return np.pad(commands, ((0, 0), (0, steps - commands.shape[1])), mode="edge")
+def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
+    """Return the game in which one vehicle learns and the other learners brake fully, and its worlds.
+
+    Raises ``InvalidInput`` where an agent drives another vehicle, so that its commands are not known at the alert.
+    """
+    for other, role in enumerate(scenario.roles.values(), 1):
+        if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
+            raise InvalidInput(
+                f"scenario {scenario.name!r}: vehicle_{other} is driven by {role!r}, whose commands are not known at"
+                " the alert; a search needs scripts that hold one command"
+            )
+    others, wanted = [each for each in scenario.learners if each != body], alert.wanted.copy()
+    wanted[:, others] = -alert.car[:, BRAKING][:, others]
+    return game_of(scenario, [scenario.vehicle_names[body - 1]])[1], alert._replace(wanted=wanted)
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent, Team, play
+from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import CorruptBundle, InvalidInput
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.search.extremes import extreme_profiles
-from ethbrake_marl.extensions.search.pricing import COUNTS, MOST_PHASES, Problem, Profiles, UInt64s, problem_of
-from ethbrake_marl.extensions.search.search import search_profiles
+from ethbrake_marl.extensions.search.pricing import COUNTS, MOST_PHASES, Problem, Profiles, best_of, problem_of
+from ethbrake_marl.extensions.search.search import compact, search_profiles
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.motion.layout import Floats
 
 BUDGET = 100_000  # profiles that are simulated in each world, in each count
 CHUNK = 200  # worlds that are searched together
 CONSTANTS = 29  # constant commands with which every search begins
-TOLERANCE = 1e-6  # a harm replaces one that is known if it is less by more than this (m2/s2)
 
 
 def best_harm(
@@ -36,12 +36,12 @@ def best_harm(
     budget: int = BUDGET,
     seed: int = 0,
     threads: int | None = None,
-    known: BestHarmTable | None = None,
+    given: Sequence[Profiles] = (),
     objective: Declared = "total",
 ) -> BestHarmTable:
     """Search worlds at the alert for the profile of least harm; return a table.
 
-    The harm is at most that of every profile in ``known``, and of one vehicle's best constant deceleration. With
+    The harm is at most that of every profile in ``given``, and of one vehicle's best constant deceleration. With
     several vehicles it is at most what the same search reaches with one of them, while the others brake fully. It
     depends on no other world.
 
@@ -53,7 +53,7 @@ def best_harm(
         budget: number of profiles that are simulated in each world, in each count.
         seed: of the random search.
         threads: None: one for each core.
-        known: a table of the same vehicles, whose profiles are tried first.
+        given: profiles that are tried first, [n] each.
         objective: what is minimised, as under a scenario's key ``objective``; the table then holds its values.
 
     Raises ``InvalidInput`` for other counts, and the errors of ``problem_of`` and ``search_profiles``.
@@ -63,25 +63,16 @@ def best_harm(
         raise InvalidInput(f"counts = {tuple(counts)}: must be 'first', 'total' or both, each once")
     effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
     problem = problem_of(game, alert, bodies, objective=objective)
-    found: list[tuple[Profiles, Mapping[str, Floats]]] = []
-    if known is not None:
-        stored = [known.stored(problem, count)[1] for count in counts]
-        found += [(profiles, problem.values(profiles)) for profiles in stored]
+    found = [(profiles, problem.values(profiles)) for profiles in given]
     for count in counts:
         starts = [profiles for profiles, _ in found]
         found.append(_searched(game, alert, problem.counting(count), starts, objective, effort))
     names = [f"vehicle_{body}" for body in problem.bodies]
     header: dict[str, Any] = {"scenario": game.name, "vehicles": names, "budget": budget, "search_seed": seed}
     header |= {} if objective == "total" else {"objective": objective}
-    header |= {} if known is None else {"after": dict(known.header)}
-    least, best = {}, {}
-    every, rows = Profiles.padded([profiles for profiles, _ in found]), np.arange(alert.n)
-    for count in counts:
-        harms = np.stack([values[count] for _, values in found])
-        pick = harms.argmin(axis=0)
-        least[count] = harms[pick, rows]
-        best[count] = Profiles(*(np.stack(arrays)[pick, rows] for arrays in zip(*every, strict=True)))
-    return BestHarmTable(problem.identity, least, best, header)
+    best = {count: best_of([(values[count], profiles) for profiles, values in found]) for count in counts}
+    harms, kept = {count: harm for count, (harm, _) in best.items()}, {count: one for count, (_, one) in best.items()}
+    return BestHarmTable(problem.identity, harms, kept, header)
 
 
 def _searched(
@@ -90,8 +81,7 @@ def _searched(
     """Search with all that a search can start from: with several vehicles, the best profile of each of them alone."""
     starts, bodies = starting_profiles(problem, alert, given), problem.bodies.tolist()
     for c, body in enumerate(bodies if len(bodies) > 1 else ()):
-        count = "total" if problem.total else "first"
-        own = problem_of(game, alert, [body], count=count, objective=objective, deciders=bodies)
+        own = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)
         best, _ = _searched(game, alert, own, (), objective, effort)
         commands = np.repeat(problem.bounds[:, np.newaxis, :, 0], best.ends.shape[1], axis=1)
         commands[:, :, c] = best.commands_mps2[:, :, 0]
@@ -112,18 +102,19 @@ def starting_profiles(problem: Problem, alert: State, given: Sequence[Profiles] 
 
 def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
     """Return the constant deceleration of E-V2X-BM for one controlled vehicle, [n]."""
-    (body,), count = problem.bodies.tolist(), "total" if problem.total else "first"
-    choice = coupled(alert._replace(wanted=problem.state.wanted), body, count, problem.horizon_s)
+    choice = coupled(
+        alert._replace(wanted=problem.state.wanted), int(problem.bodies[0]), problem.harm_count, problem.horizon_s
+    )
     return problem.constant(-choice.deceleration_mps2[:, np.newaxis, np.newaxis])
 
 
 def joined(parts: Sequence[Profiles], n: int) -> Profiles:
     """Join parts of some profiles for each of n worlds, [n * Q]: first all profiles of world 0, and so on."""
-    ends, commands = zip(*(part.shortened() for part in parts), strict=True)
-    B = commands[0].shape[2]
-    every = np.concatenate([each.reshape(n, -1, MOST_PHASES) for each in ends], axis=1)
-    what = np.concatenate([each.reshape(n, -1, MOST_PHASES, B) for each in commands], axis=1)
-    return Profiles(every.reshape(-1, MOST_PHASES), what.reshape(-1, MOST_PHASES, B))
+    short = [part.shortened() for part in parts]
+    ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in short], axis=1)
+    B = parts[0].commands_mps2.shape[2]
+    commands = np.concatenate([part.commands_mps2.reshape(n, -1, MOST_PHASES, B) for part in short], axis=1)
+    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, B))
 
 
 def search_list(
@@ -132,6 +123,10 @@ def search_list(
     *,
     chunks: Path | None = None,
     on_progress: Callable[[int, int], None] | None = None,
+    known: BestHarmTable | None = None,
+    teams: Iterable[Team] = (),
+    bodies: Sequence[int] | None = None,
+    threads: int | None = None,
     **options: Any,
 ) -> BestHarmTable:
     """Run ``best_harm`` on a long list of worlds, chunk by chunk; an interrupted run goes on where it stopped.
@@ -139,20 +134,31 @@ def search_list(
     Args:
         game: rules of the episodes.
         alert: worlds at the alert.
-        chunks: folder of the finished chunks; those of the same worlds and options are read. None: no files.
+        chunks: folder of the finished chunks; those of the same search are read. None: no files.
         on_progress: called with the number of finished worlds, and of all.
+        known: a table of the same vehicles, whose profiles are tried first.
+        teams: what they drive is tried first, too.
+        bodies: as for ``best_harm``.
+        threads: as for ``best_harm``.
         options: of ``best_harm``.
 
+    Raises ``InvalidInput`` if ``known`` holds none of the worlds, and the errors of ``best_harm``.
+
     """
-    parts, known = [], options.get("known")
+    parts = []
     if known is not None:
-        known.check_holds_any(problem_of(game, alert, options.get("bodies")).identity)
+        known.check_holds_any(problem_of(game, alert, bodies).identity)
     for first in range(0, alert.n, CHUNK):
         some = alert.take(slice(first, first + CHUNK))
-        file = None if chunks is None else chunks / f"{first:07d}.npz"
-        part = None if file is None else kept(file, game, some, options)
-        if part is None:
-            part = best_harm(game, some, **options)
+        problem = problem_of(game, some, bodies)
+        given = [] if known is None else [known.stored(problem, count)[1] for count in known.harm]
+        given += [driven_profiles(problem, game, some, team) for team in teams]
+        asked = [repr(options).encode(), problem.identity.tobytes(), *(a.tobytes() for each in given for a in each)]
+        file = None if chunks is None else chunks / f"{hashlib.sha256(b''.join(asked)).hexdigest()[:16]}.npz"
+        if file is not None and file.exists():
+            part = BestHarmTable.load(file)
+        else:
+            part = best_harm(game, some, bodies=bodies, threads=threads, given=given, **options)
             if file is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 part.save(file)
@@ -167,79 +173,15 @@ def search_list(
     )
 
 
-def kept(file: Path, game: Game, alert: State, options: Mapping[str, Any]) -> BestHarmTable | None:
-    """Return the table in ``file`` if it was made for these worlds with these options; None otherwise."""
-    try:
-        table = BestHarmTable.load(file)
-    except (InvalidInput, CorruptBundle):
-        return None
-    known = options.get("known")
-    asked = {
-        "budget": options.get("budget", BUDGET), "search_seed": options.get("seed", 0),
-        "objective": options.get("objective", "total"), "after": None if known is None else dict(known.header),
-    }  # fmt: skip
-    made = {"objective": "total", "after": None, **table.header}
-    same = all(made[key] == value for key, value in asked.items()) and [*table.harm] == [*options.get("counts", COUNTS)]
-    identity: UInt64s = problem_of(game, alert, options.get("bodies")).identity
-    return table if same and np.array_equal(table.identity, identity) else None
-
-
-def alone(game: Game, alert: State, body: int) -> tuple[Game, State]:
-    """Return the game in which one vehicle learns and the other learners brake fully, and its worlds."""
-    others = [each for each in game.rules.learners.tolist() if each != body]
-    wanted = alert.wanted.copy()
-    wanted[:, others] = -alert.car[:, BRAKING][:, others]
-    chosen = np.array([body], np.int64)
-    rules = game.rules._replace(learners=chosen)
-    return game._replace(rules=rules, deciders=chosen, shield=None), alert._replace(wanted=wanted)
-
-
-def commands_of(game: Game, alert: State, team: Team) -> Floats:
-    """Return the commands of a team at every decision, [n, T, B] m/s2; after the end of an episode its last ones."""
+def commands_of(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
+    """Return the commands of a team at every decision of a problem, [n, T, B] m/s2; after an episode its last ones."""
     bodies, states = sorted(team.drivers), play(game, alert, team)
     next(states)
-    return np.stack([state.wanted[:, bodies] for _, state in states], axis=1)
+    commands = np.stack([state.wanted[:, bodies] for _, state in states], axis=1)
+    return np.pad(commands, ((0, 0), (0, int(problem.last_step.max()) - commands.shape[1]), (0, 0)), mode="edge")
 
 
 def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
     """Return what a team drives, as profiles with one phase for each change of command."""
-    commands, last = commands_of(game, alert, team), problem.last_step
-    changes = (commands[:, 1:] != commands[:, :-1]).any(axis=2)
-    number = np.concatenate([np.zeros((problem.n, 1), np.int64), changes.cumsum(axis=1)], axis=1)
-    K = int(number.max()) + 1
-    ends = np.repeat(last[:, np.newaxis], K, axis=1)
-    world, step = np.nonzero(changes)
-    ends[world, number[world, step]] = np.minimum(step + 1, last[world])
-    first = (number[:, np.newaxis] < np.arange(K)[:, np.newaxis]).sum(axis=2).clip(max=commands.shape[1] - 1)
-    return Profiles(ends, np.take_along_axis(commands, first[:, :, np.newaxis], 1))
-
-
-def lowered(
-    table: BestHarmTable, game: Game, alert: State, agents: Mapping[str, Team | Agent], name: str
-) -> BestHarmTable:
-    """Let agents drive the worlds; return the table with what they drive where it does less harm.
-
-    ``agents``: count -> team or agent that minimises it. The header says in how many worlds they did, under ``name``.
-    Raises ``InvalidInput`` for a table of another objective than the harm of the line.
-    """
-    if "objective" in table.header:
-        raise InvalidInput(
-            f"the table holds values of the objective {table.header['objective']!r}; give a table of harm"
-        )
-    problem = problem_of(game, alert)
-    harm = {count: each.copy() for count, each in table.harm.items()}
-    profiles, rows = dict(table.profiles), table.rows(problem.identity)
-    counted = dict.fromkeys(harm, 0)
-    for driver in agents.values():
-        team = driver if isinstance(driver, Team) else Team(name, dict.fromkeys(game.rules.learners.tolist(), driver))
-        driven = driven_profiles(problem, game, alert, team)
-        for count, values in problem.values(driven).items():
-            if count in harm:
-                better = (rows >= 0) & (values < harm[count][rows] - TOLERANCE)
-                harm[count][rows[better]] = values[better]
-                old, new = Profiles.padded([profiles[count], driven])
-                for mine, its in zip(old, new, strict=True):
-                    mine[rows[better]] = its[better]
-                profiles[count], counted[count] = old, counted[count] + int(better.sum())
-    before = table.header.get("lowered_by", {})
-    return BestHarmTable(table.identity, harm, profiles, {**table.header, "lowered_by": {**before, name: counted}})
+    steps = Profiles.of_steps(commands_of(problem, game, alert, team), problem.last_step)
+    return Profiles.join([compact(*one) for one in zip(*steps, strict=True)])

@@ -14,7 +14,6 @@ from ethbrake_marl.extensions.proofs.meetings import meet_front, meet_rear
 from ethbrake_marl.extensions.search.kernels import RESOLUTION, try_all
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
 from ethbrake_marl.extensions.search.search import prepared, seeded
-from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import Floats
 
 KEPT = 12  # profiles of each world
@@ -39,11 +38,10 @@ def extreme_profiles(problem: Problem) -> Profiles:
         world, room = prepared(problem, int(k), random, MOST_PHASES, False)
         tried, values = [], []
         for kind in kinds:
-            low, high = 0.0, LATEST_S
+            meet, low, high = (meet_front, meet_rear)[kind], 0.0, LATEST_S
             for _ in range(ROUNDS):
                 changes = low + (high - low) * np.arange(TIMES) / (TIMES - 1)
-                meetings, value = np.empty(TIMES), np.empty(TIMES * len(WAYS))
-                meet_each(at[k], changes, kind, meetings)
+                meetings, value = np.array([meet(at[k], change) for change in changes]), np.empty(TIMES * len(WAYS))
                 tried.append(extremes(problem, int(k), kind, changes, meetings))
                 try_all(world, room, *tried[-1], value)
                 values.append(value)
@@ -69,20 +67,11 @@ def extremes(problem: Problem, k: int, kind: int, changes: Floats, meetings: Flo
     early, share = np.array(WAYS).T
     turn = np.repeat(np.minimum(changes / step, last).astype(np.int64), len(WAYS))
     within = np.repeat(changes / step, len(WAYS)) - turn
-    back = np.minimum(np.repeat(meetings / step, len(WAYS)), last).astype(np.int64) - np.tile(early, TIMES).astype(
-        np.int64
-    )
-    back = np.maximum(back, turn + 1)
+    back = np.minimum(np.repeat(meetings / step, len(WAYS)), last).astype(np.int64)
+    back = np.maximum(back - np.tile(early, TIMES).astype(np.int64), turn + 1)
     ends = np.minimum(np.stack([turn, turn + 1, back, back + 1, np.full(len(turn), last)], axis=1), last)
     commands = np.empty((len(turn), 5, 1))
     commands[:, [0, 4]], commands[:, 2] = first, second
     commands[:, 1, 0] = second + within * (first - second)
     commands[:, 3, 0] = second + np.tile(share, TIMES) * (first - second)
     return Profiles(ends, np.trunc(np.clip(commands, low, high) * RESOLUTION) / RESOLUTION)
-
-
-@large
-def meet_each(at, changes, kind, meetings):
-    """Write the time (s) at which the controlled vehicle meets its neighbour to ``meetings``, for each first change."""
-    for j in range(len(changes)):
-        meetings[j] = meet_rear(at, changes[j]) if kind == 1 else meet_front(at, changes[j])

@@ -14,11 +14,11 @@ import numpy as np
 
 from ethbrake_marl.episode.state import FIRST_DECISION, LAST, harm_so_far
 from ethbrake_marl.episode.step import stands
-from ethbrake_marl.extensions.search.pricing import LARGEST, WHOLE, UInt64s
+from ethbrake_marl.extensions.search.pricing import UInt64s, worth
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, drive
 from ethbrake_marl.motion.elementary import exp
-from ethbrake_marl.motion.layout import FIRST, LINE_ROWS, TOTAL, Floats, Ints
+from ethbrake_marl.motion.layout import Floats, Ints
 
 OTHER_WEIGHT = 1e-8  # weight of the other count of harm in what is minimised: it decides ties
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store and exactly repeatable
@@ -71,28 +71,11 @@ class Field(NamedTuple):
     values: Floats  # [M] what is minimised (m2/s2)
 
 
-def room_for(line: Floats, phases: int, controlled: int) -> Room:
-    """Return working memory for a world whose line at the first decision is ``line``."""
-    lines = np.zeros((phases + 1, LINE_ROWS, line.shape[1]))
-    lines[0] = line
-    return Room(lines, lines.copy(), np.zeros(phases, np.int64), np.zeros((phases, controlled)), np.zeros(CHANGE))
-
-
 @kernel
 def value_of(line, shares, numbers):
-    """Return what is minimised (m2/s2); it never falls in an episode."""
-    total, aim = numbers[IS_TOTAL] == 1.0, numbers[AIM]
-    other = OTHER_WEIGHT * harm_so_far(line, not total)
-    if aim == WHOLE:
-        return harm_so_far(line, total) + other
-    row, value, from_ahead = TOTAL if total else FIRST, 0.0, 0.0
-    for i in range(line.shape[1]):
-        borne = from_ahead
-        if i < line.shape[1] - 1:
-            borne += shares[0, i] * line[row, i]
-            from_ahead = shares[1, i] * line[row, i]
-        value = max(value, borne) if aim == LARGEST else value + borne
-    return value + other
+    """Return what is minimised (m2/s2): with a little of the other count of harm."""
+    total = numbers[IS_TOTAL] == 1.0
+    return worth(line, shares, total, numbers[AIM]) + OTHER_WEIGHT * harm_so_far(line, not total)
 
 
 @kernel

@@ -13,24 +13,18 @@ from ethbrake_marl.extensions.search.tables import best_known as stored
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 
-_asked: dict[bytes, dict[str, Floats]] = {}  # of the worlds that were last asked for: all agents drive the same ones
-
 
 def least(game: Game, alert: State) -> dict[str, Floats]:
     """Return the least harm known, count -> [n] m2/s2. Raises ``InvalidInput`` if a world is in no shipped table."""
     problem = problem_of(game, alert)
-    key = problem.identity.tobytes()
-    if key not in _asked:
-        known = {count: stored(problem, count)[0] for count in COUNTS}
-        missing = int(np.isnan(list(known.values())).any(axis=0).sum())
-        if missing:
-            raise InvalidInput(
-                f"no shipped table holds {count_of(missing, 'world')} of {alert.n}; the measures limits need the first"
-                " worlds of seed 7 of a scenario with a table; elsewhere compare with the agent best_harm"
-            )
-        _asked.clear()
-        _asked[key] = known
-    return _asked[key]
+    known = {count: stored(problem, count)[0] for count in COUNTS}
+    missing = int(np.isinf(list(known.values())).any(axis=0).sum())
+    if missing:
+        raise InvalidInput(
+            f"no shipped table holds {count_of(missing, 'world')} of {alert.n}; the measures limits need the first"
+            " worlds of seed 7 of a scenario with a table; elsewhere compare with the agent best_harm"
+        )
+    return known
 
 
 def best_known(game: Game, alert: State, last: State) -> Given:

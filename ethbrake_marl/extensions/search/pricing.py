@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
-from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State
+from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State, harm_so_far
 from ethbrake_marl.episode.step import advance, begin
 from ethbrake_marl.errors import InvalidInput, PhysicsError
-from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
@@ -104,6 +104,14 @@ class Profiles(NamedTuple):
         return Profiles(*(np.concatenate(arrays) for arrays in zip(*Profiles.padded(parts), strict=True)))
 
 
+def best_of(found: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
+    """Return the least of some harms [n] in each world, and the profile [n] with it; of equal ones, the first."""
+    harms = np.stack([harm for harm, _ in found])
+    pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
+    every = Profiles.padded([profiles for _, profiles in found])
+    return harms[pick, rows], Profiles(*(np.stack(arrays)[pick, rows] for arrays in zip(*every, strict=True)))
+
+
 class Problem(NamedTuple):
     """Which commands of some vehicles are best in each of n worlds? Made by ``problem_of``.
 
@@ -129,6 +137,11 @@ class Problem(NamedTuple):
     def n(self) -> int:
         """Number of worlds."""
         return self.state.n
+
+    @property
+    def harm_count(self) -> str:
+        """Count of harm that is minimised: ``first`` or ``total``."""
+        return "total" if self.total else "first"
 
     @property
     def last_step(self) -> Ints:
@@ -166,6 +179,10 @@ class Problem(NamedTuple):
         commands = np.repeat(commands_mps2.reshape(n * Q, 1, B), MOST_PHASES, axis=1)
         return Profiles(np.repeat(ends, Q, axis=0), commands)
 
+    def coasting(self) -> Profiles:
+        """Return the profiles of coasting, [n]."""
+        return Profiles(self.last_step[:, np.newaxis].copy(), np.zeros((self.n, 1, len(self.bodies))))
+
     def follow(self, profiles: Profiles) -> State:
         """Return the last states of the episodes in which the controlled vehicles follow their profiles.
 
@@ -187,17 +204,8 @@ class Problem(NamedTuple):
 
     def value(self, last: State, count: str | None = None) -> Floats:
         """Return what the search minimises, [n] m2/s2, of episodes with these last states. ``count`` None: its own."""
-        total = self.total if count is None else count == "total"
-        if self.aim == WHOLE:
-            return last.harm("total" if total else "first")
-        pairs = last.line[:, TOTAL if total else FIRST]
-        borne = self.shares[:, 0] * pairs
-        borne[:, 1:] += (self.shares[:, 1] * pairs)[:, :-1]
-        if self.aim == LARGEST:
-            return borne.max(axis=1)
-        value = np.zeros(self.n)
-        for i in range(borne.shape[1]):
-            value = value + borne[:, i]
+        total, value = self.total if count is None else count == "total", np.empty(self.n)
+        worths(last.line, self.shares, total, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:
@@ -256,16 +264,12 @@ def problem_of(
         objective: what the controlled vehicles minimise, as under a scenario's key ``objective``.
         deciders: the first decision is at their shortest latency; None: ``bodies``.
 
-    Raises ``InvalidInput`` for vehicles that do not exist, an objective that is no weighted harm, a script that looks
-    at the state, whose commands are not known at the alert, and a horizon before the first decision.
+    Raises ``InvalidInput`` for vehicles that do not exist, an objective that is no weighted harm, and a script that
+    looks at the state, whose commands are not known at the alert.
 
     """
     chosen = np.array(game.rules.learners if bodies is None else bodies, np.int64)
-    if (
-        not len(chosen)
-        or len(set(chosen.tolist())) < len(chosen)
-        or not set(chosen.tolist()) <= {*range(1, alert.vehicles + 1)}
-    ):
+    if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
         raise InvalidInput(f"vehicles {chosen.tolist()}: must be one or more of 1 to {alert.vehicles}, each once")
     for body, script in game.scripts.items():
         if body not in chosen:
@@ -279,8 +283,6 @@ def problem_of(
     dt, horizon = game.rules.time_step_s, game.rules.horizon_s
     decide = chosen if deciders is None else np.array(deciders, np.int64)
     state = begin(alert._replace(wanted=wanted, memories={}), decide, dt, horizon)
-    if not (state.time_s < horizon).all():
-        raise InvalidInput(f"horizon_s = {horizon:g}: must be after the first decision at {state.time_s.max():g} s")
     shares = np.zeros((alert.n, 2, wanted.shape[1]))
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST]]]
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack([*times, np.full((alert.n, 1), horizon)]))
@@ -331,6 +333,28 @@ def aimed(problem: Problem, objective: Declared) -> Problem:
             " minimises one; give all of them the same, for instance weighted:1,4,1"
         )
     return problem.minimising(weights[0])
+
+
+@kernel
+def worth(line, shares, total, aim):
+    """Return what a search minimises (m2/s2) of one world; it never falls in an episode."""
+    if aim == WHOLE:
+        return harm_so_far(line, total)
+    row, value, from_ahead = TOTAL if total else FIRST, 0.0, 0.0
+    for i in range(line.shape[1]):
+        borne = from_ahead
+        if i < line.shape[1] - 1:
+            borne += shares[0, i] * line[row, i]
+            from_ahead = shares[1, i] * line[row, i]
+        value = max(value, borne) if aim == LARGEST else value + borne
+    return value
+
+
+@large
+def worths(line, shares, total, aim, out):
+    """Write what a search minimises to ``out`` [n]."""
+    for k in range(len(out)):
+        out[k] = worth(line[k], shares[k], total, aim)
 
 
 @large

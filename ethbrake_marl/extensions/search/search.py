@@ -1,4 +1,4 @@
-"""Search every world of a problem: for the best profile, around given commands, or among random templates."""
+"""Search every world of a problem: for the best profile, or around given commands."""
 
 from __future__ import annotations
 
@@ -7,18 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
-from ethbrake_marl.extensions.search.kernels import (
-    DRAWING,
-    PLAN,
-    STEPWISE,
-    Field,
-    Room,
-    World,
-    follow,
-    gather,
-    improve,
-    room_for,
-)
+from ethbrake_marl.extensions.search.kernels import CHANGE, DRAWING, PLAN, STEPWISE, Field, Room, World, gather, improve
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, UInt64s
 from ethbrake_marl.motion.layout import Floats, Ints, scratch_for
 
@@ -91,7 +80,7 @@ def search_world(world: World, room: Room, given: Profiles, last: int, budget: i
     M, rounds = SMALLEST_FIELD, 3
     while budget >= 2 * M * PER_PROFILE and M < LARGEST_FIELD:
         M, rounds = 2 * M, rounds + 1
-    field = Field(np.zeros((M, K), np.int64), np.zeros((M, K, B)), np.zeros(M, np.int64), np.full(M, np.inf))
+    field = field_for(M, K, B)
     drawn = max(int(DRAWN_SHARE * budget) - len(given.ends), 0)
     in_rounds, stepwise = int(ROUNDS_SHARE * budget), int(STEPWISE_SHARE * budget)
     gather(world, room, *given, (given.ends == last).argmax(axis=1) + 1, drawn, PROFILES, SAME, field)
@@ -147,14 +136,9 @@ def divide(field: Field, attention: int) -> None:
 def select(world: World, room: Room, given: Profiles, field: Field) -> None:
     """Simulate step by step from now on; the best one of the field's first and of the given profiles becomes first."""
     world.numbers[STEPWISE] = 1.0
-    K, few = field.ends.shape[1], slice(SMALLEST_FIELD)
-    phases = np.concatenate([field.phases[few], np.full(len(given.ends), K)])
-    ends = np.concatenate([field.ends[few], given.ends])
-    commands = np.concatenate([field.commands[few], given.commands_mps2])
-    best = Field(
-        np.zeros((1, K), np.int64), np.zeros((1, *commands.shape[1:])), np.zeros(1, np.int64), np.array([np.inf])
-    )
-    gather(world, room, ends, commands, phases, 0, PROFILES, 0.0, best)
+    best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
+    gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
+    gather(world, room, *given, np.full(len(given.ends), given.ends.shape[1]), 0, PROFILES, 0.0, best)
     for array, one in zip(field, best, strict=True):
         array[0] = one[0]
 
@@ -163,60 +147,39 @@ def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 
     """Improve one vehicle's commands of every decision; return the best, [n, T] m/s2, and their values, [n] m2/s2.
 
     They are at least as good as the given commands ``commands_mps2`` [n, T]. Beside these, the best of some random
-    templates is improved, because small changes may miss the best commands.
+    templates is improved, because small changes may miss the best commands. A template is one command, another for a
+    while, then full braking.
 
     Raises ``InvalidInput`` for several controlled vehicles, commands that do not fit, or a budget below 1, and
     ``PhysicsError`` for worlds in which the given commands cannot be simulated.
     """
     check_whole_number("budget", budget, 1)
-    best, last_step, random = commands_mps2.copy(), problem.last_step, seeded(problem.identity, seed)
-    problem.check(Profiles.of_steps(best[:, :, np.newaxis], last_step))
+    if len(problem.bodies) != 1:
+        raise InvalidInput(f"vehicles {problem.bodies.tolist()}: plans are searched for one controlled vehicle")
+    plans, random = (
+        Profiles.of_steps(commands_mps2[:, :, np.newaxis].copy(), problem.last_step),
+        seeded(problem.identity, seed),
+    )
+    problem.check(plans)
     templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_SHARE * budget)
+    times = ATTENTION_S, LONGEST_CHANGE_S, LONGEST_WHILE_S
+    drawing = np.array([PLAN, *(max(int(time / problem.time_step_s + 0.5), 1) for time in times)])
     failed = []
-    for k in range(problem.n):
-        drawing = drawing_of(problem, k)
-        world, room = prepared(problem, k, random, best.shape[1], True)
-        ends, mine = steps_of(best.shape[1], last_step[k]), best[k][:, np.newaxis]
+    for k, (ends, mine) in enumerate(zip(*plans, strict=True)):
+        world, room = prepared(problem, k, random, len(ends), True)
         value, active = improve(world, room, ends, mine, budget - templates - theirs, drawing, NO_HARM)
         if active == 0:
             failed.append(k)
         elif value > NO_HARM:
-            other = best_template(world, room, value + WORSE, templates, drawing)
-            if other is not None and improve(world, room, ends, other, theirs, drawing, NO_HARM)[0] < value:
+            best = field_for(1, 3, 1)
+            best.values[0] = value + WORSE
+            gather(world, room, *field_for(0, 3, 1)[:3], templates, drawing, 0.0, best)
+            other = np.ascontiguousarray(Profiles(best.ends, best.commands).stepwise(len(ends))[0])
+            if best.phases[0] and improve(world, room, ends, other, theirs, drawing, NO_HARM)[0] < value:
                 mine[:] = other
     if failed:
         raise PhysicsError(dict.fromkeys(failed, "the given commands cannot be simulated"))
-    return best, problem.value(problem.follow(Profiles.of_steps(best[:, :, np.newaxis], last_step)))
-
-
-def best_templates(problem: Problem, bound: Floats, *, number: int, seed: int = 0) -> tuple[Floats, Ints]:
-    """Draw random templates for one vehicle; return the best one's commands, [n, T] m/s2, and number of steps, [n].
-
-    A template is one command, another for a while, then full braking. A random one that does little harm tolerates
-    small errors, so a policy can imitate it. The number of steps is 0 where none is better than ``bound`` [n] (m2/s2).
-
-    Raises ``InvalidInput`` for several controlled vehicles, or if ``number``, of templates in each world, is below 1.
-    """
-    check_whole_number("templates", number, 1)
-    T, random = int(problem.last_step.max(initial=0)), seeded(problem.identity, seed)
-    commands, steps = np.zeros((problem.n, T)), np.zeros(problem.n, np.int64)
-    for k in range(problem.n):
-        world, room = prepared(problem, k, random, T, True)
-        best = best_template(world, room, bound[k], number, drawing_of(problem, k))
-        if best is not None:
-            steps[k] = follow(world, room.lines, steps_of(T, problem.last_step[k]), best, 0, np.inf)[1]
-            commands[k] = best[:, 0]
-    return commands, steps
-
-
-def best_template(world: World, room: Room, bound: float, number: int, drawing: Ints) -> Floats | None:
-    """Return the commands of the best of some templates, [T, 1] m/s2; None if none is better than ``bound``."""
-    field = Field(np.zeros((1, 3), np.int64), np.zeros((1, 3, 1)), np.zeros(1, np.int64), np.array([bound]))
-    nothing = np.zeros((0, 3), np.int64), np.zeros((0, 3, 1)), np.zeros(0, np.int64)
-    gather(world, room, *nothing, number, drawing, 0.0, field)
-    if field.phases[0] == 0:
-        return None
-    return np.ascontiguousarray(Profiles(field.ends, field.commands).stepwise(len(room.ends))[0])
+    return plans.commands_mps2[:, :, 0], problem.value(problem.follow(plans))
 
 
 def seeded(identity: UInt64s, seed: int) -> UInt64s:
@@ -228,6 +191,13 @@ def seeded(identity: UInt64s, seed: int) -> UInt64s:
         return z ^ (z >> np.uint64(31))
 
 
+def field_for(profiles: int, phases: int, controlled: int) -> Field:
+    """Return an empty field for so many profiles."""
+    commands = np.zeros((profiles, phases, controlled))
+    ends, used = np.zeros((profiles, phases), np.int64), np.zeros(profiles, np.int64)
+    return Field(ends, commands, used, np.full(profiles, np.inf))
+
+
 def prepared(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
     """Return world k of a problem, and working memory for profiles of so many phases."""
     state = problem.state
@@ -236,17 +206,7 @@ def prepared(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: b
         state.car[k], state.clock[k], state.wanted[k].copy(), problem.bodies, problem.bounds[k], problem.shares[k],
         numbers, random[k : k + 1], scratch_for(state.wanted.shape[1]),
     )  # fmt: skip
-    return world, room_for(state.line[k], phases, len(problem.bodies))
-
-
-def steps_of(decisions: int, last_step: int) -> Ints:
-    """Return the ends of a plan with one phase for each decision."""
-    return np.minimum(np.arange(1, decisions + 1), last_step)
-
-
-def drawing_of(problem: Problem, k: int) -> Ints:
-    """Return how changes and templates are drawn for plans. Raises ``InvalidInput`` for several controlled vehicles."""
-    if len(problem.bodies) != 1:
-        raise InvalidInput(f"vehicles {problem.bodies.tolist()}: plans are searched for one controlled vehicle")
-    times = ATTENTION_S, LONGEST_CHANGE_S, LONGEST_WHILE_S
-    return np.array([PLAN, *(max(int(time / problem.time_step_s + 0.5), 1) for time in times)])
+    lines = np.zeros((phases + 1, *state.line[k].shape))
+    lines[0] = state.line[k]
+    profile = np.zeros(phases, np.int64), np.zeros((phases, len(problem.bodies)))
+    return world, Room(lines, lines.copy(), *profile, np.zeros(CHANGE))

@@ -6,7 +6,7 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -16,16 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, describe_error
-from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, UInt64s
+from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, UInt64s, best_of
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.store import write_file
-from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.motion.layout import Floats
 
-FORMAT = 1
+FORMAT = 2
 SIZE_LIMIT_BYTES, UNPACKED_LIMIT_BYTES = 64 << 20, 256 << 20
-DECODED_LIMIT = 1 << 26  # largest count of numbers in the profiles of one count of harm
 SHIPPED = Path(__file__).with_name("_tables")
 ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # entries of the header that messages show
+ARRAYS = {"identity": ("<u8", 1)}  # name of an array -> its type and number of axes,
+OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # and of those of one count of harm
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,32 +49,29 @@ class BestHarmTable:
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
         try:
             arrays = _unpacked(data)
-            counts = [count for count in COUNTS if f"{count}_harm" in arrays] or [*COUNTS]
-            _check_arrays(arrays, counts)
-            header = parse_strict_json(arrays["header"].tobytes())
+            header = parse_strict_json(arrays.pop("header", np.zeros(0)).tobytes())
             if not isinstance(header, dict) or header.pop("format", None) is not FORMAT:
                 raise ValueError(f"header: must be an object with the entry format: {FORMAT}")
-            harm = {count: arrays[f"{count}_harm"].astype(np.float64) for count in counts}
-            profiles = {count: _profiles(arrays, count) for count in counts}
+            counts = [count for count in COUNTS if f"{count}_harm" in arrays]
+            _check(arrays, counts)
         except ValueError as error:
             raise CorruptBundle(f"{path}: is not a table of best known harm: {error}") from None
-        return cls(arrays["identity"].astype(np.uint64), harm, profiles, header)
+        harm = {count: arrays[f"{count}_harm"] for count in counts}
+        ends = {count: arrays[f"{count}_ends"].astype(np.int64) for count in counts}
+        profiles = {count: Profiles(ends[count], arrays[f"{count}_commands"]) for count in counts}
+        return cls(arrays["identity"], harm, profiles, header)
 
     def save(self, path: Path) -> None:
         """Write the table: a compressed .npz without pickles. If writing fails, an old file stays as it was."""
         write_file(path, self.content())
 
     def content(self) -> bytes:
-        """Return the content of the file. Empty phases are left out; bytes of one place stand together, to compress."""
+        """Return the content of the file."""
         header = np.frombuffer(json.dumps({"format": FORMAT, **self.header}).encode(), np.uint8)
-        arrays: dict[str, NDArray[Any]] = {"header": header, "identity": self.identity.astype("<u8")}
+        arrays: dict[str, NDArray[Any]] = {"header": header, "identity": self.identity}
         for count, (ends, commands) in self.profiles.items():
-            used = (ends == ends[:, -1:]).argmax(axis=1) + 1
-            inside = np.arange(ends.shape[1]) < used[:, np.newaxis]
-            flat = np.ascontiguousarray(commands[inside], "<f8")
-            arrays[f"{count}_harm"] = self.harm[count].astype("<f8")
-            arrays[f"{count}_phases"], arrays[f"{count}_ends"] = used.astype("<u2"), ends[inside].astype("<u2")
-            arrays[f"{count}_commands"] = flat.view(np.uint8).reshape(*flat.shape, 8).transpose(2, 0, 1).copy()
+            arrays[f"{count}_harm"], arrays[f"{count}_ends"] = self.harm[count], ends.astype("<u2")
+            arrays[f"{count}_commands"] = commands
         buffer = io.BytesIO()
         np.savez_compressed(buffer, allow_pickle=False, **arrays)
         return buffer.getvalue()
@@ -85,18 +83,18 @@ class BestHarmTable:
         return np.where(self.identity[rows] == identity, rows, -1)
 
     def stored(self, problem: Problem, count: str) -> tuple[Floats, Profiles]:
-        """Return the least harm known of the problem's worlds, [n] m2/s2, NaN: not in the table; and its profiles.
+        """Return the least harm known of the problem's worlds, [n] m2/s2, and its profiles.
 
-        A world that is not in the table has the profile of coasting.
+        A world that is not in the table has infinite harm and the profile of coasting.
         """
-        rows, last = self.rows(problem.identity), problem.last_step
-        if count not in self.harm:
-            nothing = np.zeros((problem.n, 1, len(problem.bodies)))
-            return np.full(problem.n, np.nan), Profiles(last[:, np.newaxis].copy(), nothing)
-        known, (ends, commands) = rows >= 0, self.profiles[count].take(rows)
-        ends = np.where(known[:, np.newaxis], ends, last[:, np.newaxis])
+        rows = self.rows(problem.identity)
+        known = rows >= 0
+        if count not in self.harm or not known.any():
+            return np.full(problem.n, np.inf), problem.coasting()
+        ends, commands = self.profiles[count].take(rows)
+        ends = np.where(known[:, np.newaxis], ends, problem.last_step[:, np.newaxis])
         profiles = Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], commands, 0.0))
-        return np.where(known, self.harm[count][rows], np.nan), profiles
+        return np.where(known, self.harm[count][rows], np.inf), profiles
 
     def check_holds_any(self, identity: UInt64s) -> None:
         """Raise ``InvalidInput`` if the table holds none of these worlds."""
@@ -115,21 +113,9 @@ def shipped_tables() -> tuple[BestHarmTable, ...]:
 
 
 def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
-    """Return the least harm of each world in the shipped tables, [n] m2/s2, and its profiles; NaN: in no table."""
-    least, profiles = (
-        np.full(problem.n, np.nan),
-        Profiles(problem.last_step[:, np.newaxis].copy(), np.zeros((problem.n, 1, len(problem.bodies)))),
-    )
-    for table in shipped_tables():
-        if (table.rows(problem.identity) < 0).all():
-            continue
-        harm, stored = table.stored(problem, count)
-        better: Bools = np.isfinite(harm) & ~(harm >= least)
-        profiles, stored = Profiles.padded([profiles, stored])
-        least[better] = harm[better]
-        for mine, its in zip(profiles, stored, strict=True):
-            mine[better] = its[better]
-    return least, profiles
+    """Return the least harm of each world in the shipped tables, [n] m2/s2, and its profiles, as ``stored`` does."""
+    found = [table.stored(problem, count) for table in shipped_tables()]
+    return best_of([each for each in found if np.isfinite(each[0]).any()] or found[:1])
 
 
 def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
@@ -145,47 +131,21 @@ def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
         raise ValueError(f"the archive is damaged ({describe_error(error)})") from None
 
 
-def _check_arrays(arrays: Mapping[str, NDArray[Any]], counts: Sequence[str]) -> None:
-    """Check names, types and shapes: n worlds, m phases of one count in all, B controlled vehicles."""
-    wanted: dict[str, tuple[str, int]] = {"header": ("|u1", 1), "identity": ("<u8", 1)}  # type, number of axes
-    for count in counts:
-        wanted |= {f"{count}_harm": ("<f8", 1), f"{count}_phases": ("<u2", 1), f"{count}_ends": ("<u2", 1)}
-        wanted[f"{count}_commands"] = ("|u1", 3)
+def _check(arrays: Mapping[str, NDArray[Any]], counts: list[str]) -> None:
+    """Check names, types and shapes: n worlds, K phases and B controlled vehicles in each count. Check all numbers."""
+    wanted = ARRAYS | {f"{count}_{name}": kind for count in counts for name, kind in OF_COUNT.items()}
     for name in sorted(wanted.keys() ^ arrays.keys()):
         raise ValueError(f"array {name!r}: {'is missing' if name in wanted else 'must not be in this file'}")
     for name, (kind, axes) in wanted.items():
-        if arrays[name].dtype != np.dtype(kind) or arrays[name].ndim != axes:
-            raise ValueError(f"array {name!r}: has type {arrays[name].dtype} and {arrays[name].ndim} axes")
-    n = len(arrays["identity"])
+        if arrays[name].dtype != np.dtype(kind) or arrays[name].ndim != axes or not arrays[name].size:
+            raise ValueError(f"array {name!r}: has type {arrays[name].dtype} and shape {arrays[name].shape}")
     for count in counts:
-        m = len(arrays[f"{count}_ends"])
-        shapes = [arrays[f"{count}_{name}"].shape for name in ("harm", "phases")]
-        if shapes != [(n,), (n,)] or arrays[f"{count}_commands"].shape[:2] != (8, m):
-            raise ValueError(f"arrays of {count}: do not have {n} worlds and {m} phases")
-
-
-def _profiles(arrays: Mapping[str, NDArray[Any]], count: str) -> Profiles:
-    """Return the profiles of one count. Raises ``ValueError`` for impossible numbers."""
-    harm, used = arrays[f"{count}_harm"], arrays[f"{count}_phases"].astype(np.int64)
-    flat = np.ascontiguousarray(arrays[f"{count}_commands"].transpose(1, 2, 0)).view("<f8")[..., 0].astype(np.float64)
-    if not len(harm):
-        raise ValueError("the table holds no world")
-    if not (np.isfinite(harm).all() and (harm >= 0.0).all()):
-        raise ValueError(f"{count}_harm: must be finite and at least 0 m2/s2")
-    if not np.isfinite(flat).all():
-        raise ValueError(f"{count}_commands: must be finite")
-    if not (used > 0).all() or used.sum() != len(flat):
-        raise ValueError(f"{count}_phases: {used.sum()} phases with {len(flat)} commands; must be one for each phase")
-    width, controlled = int(used.max()), flat.shape[1]
-    if not 1 <= controlled <= 64 or len(used) * width * (controlled + 1) > DECODED_LIMIT:
-        raise ValueError(
-            f"{controlled} vehicles, {width} phases, {len(used)} worlds: at most 64 vehicles and {DECODED_LIMIT:,}"
-            " numbers"
-        )
-    inside, last = np.arange(width) < used[:, np.newaxis], np.minimum(np.arange(width), used[:, np.newaxis] - 1)
-    ends, commands = np.zeros(inside.shape, np.int64), np.zeros((*inside.shape, controlled))
-    ends[inside], commands[inside] = arrays[f"{count}_ends"], flat
-    ends = np.take_along_axis(ends, last, 1)
-    if not (np.diff(ends, axis=1) >= 0).all() or not (ends[:, -1] > 0).all():
-        raise ValueError(f"{count}_ends: must not decrease within a world, and end above 0")
-    return Profiles(ends, np.take_along_axis(commands, last[:, :, np.newaxis], 1))
+        harm, ends, commands = (arrays[f"{count}_{name}"] for name in OF_COUNT)
+        if not len(harm) == len(ends) == len(arrays["identity"]) or commands.shape[:2] != ends.shape:
+            raise ValueError(f"arrays of {count}: their shapes {harm.shape}, {ends.shape}, {commands.shape} do not fit")
+        if not (np.isfinite(harm) & (harm >= 0.0)).all():
+            raise ValueError(f"{count}_harm: must be finite and at least 0 m2/s2")
+        if not np.isfinite(commands).all():
+            raise ValueError(f"{count}_commands: must be finite")
+        if (ends[:, 1:] < ends[:, :-1]).any() or not ends[:, -1].all():
+            raise ValueError(f"{count}_ends: must not decrease within a world, and end above 0")

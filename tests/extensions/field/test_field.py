@@ -1,13 +1,14 @@
 """Agents of the field, by hand: car following, RSS, UN R157's models and AEB."""
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.extensions.field.controllers import LAWS, Parameters, Seen, fuzzy
+from ethbrake_marl.extensions.field.controllers import LAWS, Seen, fuzzy
 from ethbrake_marl.motion.layout import GAP
 from ethbrake_marl.names import group, make_agent
 from tests.refused import refused
@@ -20,20 +21,13 @@ def seen(gap, speed, front, front_force=0.0, own=0.0):
 
 def called(name, *given, **parameters):
     law = LAWS[name]
-    return np.round(law.command(seen(*given), Parameters(**{**law.parameters, **parameters})), 6).tolist()
+    return np.round(law.command(seen(*given), SimpleNamespace(**{**law.parameters, **parameters})), 6).tolist()
 
 
 TWO = eb.Scenario(
-    name="two",
-    vehicles=2,
-    gaps_m=50,
-    speeds_mps=30,
-    braking_capacity_mps2=[6, 9],
-    driving_capacity_mps2=3,
-    mass_t=1,
-    latency_s=[0, 0.05],
-    restitution=0,
-)
+    name="two", vehicles=2, gaps_m=50, speeds_mps=30, braking_capacity_mps2=[6, 9], driving_capacity_mps2=3, mass_t=1,
+    latency_s=[0, 0.05], restitution=0,
+)  # fmt: skip
 
 
 def driven(spec, scenario=TWO, steps=22):
@@ -73,7 +67,7 @@ def test_aeb__brakes_by_time_to_collision_and_required_deceleration() -> None:
 def test_fuzzy_model__by_hand() -> None:
     # The fuzzy criteria, 20 m/s behind 20 m/s: safe beyond 15 + 50 - 200/7 + 2 + 2 = 40.43 m of gap, unsafe within 15
     # + 33.33 - 28.57 + 2 = 21.76 m; 2 m/s closing adds the critical one: 1.5 + 4 / 8 = 2 m and 1.5 + 4 / 12 = 1.83 m.
-    p = Parameters(**LAWS["r157_fsm"].parameters)
+    p = SimpleNamespace(**LAWS["r157_fsm"].parameters)
     assert [np.round(each, 4).tolist() for each in fuzzy(seen([41, 31.0952381, 21], 20, 20), p)] == [
         [0.0, 0.5, 1.0],
         [0.0, 0.0, 0.0],
@@ -86,21 +80,15 @@ def test_fuzzy_model__by_hand() -> None:
     assert fuzzy(seen([0.49, 0.51], 20, 18, 0, -4), p)[1].tolist() == [1.0, 0.0]
 
 
-def test_human_driver__reacts_eases_off_and_brakes_with_a_jerk() -> None:
+def test_un_r157__reacts_eases_off_and_brakes_with_a_jerk() -> None:
     # He sees at once that Vehicle 1 brakes with 6 m/s2 at less than 2 s ahead: nothing for 0.4 s, then 0.4 m/s2 for
     # 0.75 s, and then 12.65 m/s3 up to 0.774 g. He stays with it.
     jerk = [-1.665, -2.93, -4.195, -5.46, -6.725]
     assert driven("r157_human") == [0.0] * 4 + [-0.4] * 7 + jerk + [-7.593] * 6
     assert driven("r157_human:reaction=0.15:jerk=100", steps=8) == [0.0] * 4 + [-0.4] + [-7.593] * 3
-
-
-def test_fuzzy_model__waits_and_lets_go_where_nothing_is_near() -> None:
-    assert driven("r157_fsm", steps=12) == [-0.0] * 7 + [-1.265, -2.53, -3.795, -4.0, -4.0]
-
-
-def test_human_driver__notices_gentle_braking_by_the_time_to_collision() -> None:
-    gentle = TWO.replace(braking_capacity_mps2=[4.9, 9])
+    gentle = TWO.replace(braking_capacity_mps2=[4.9, 9])  # he notices it by the time to collision
     assert driven("r157_human", gentle, 34)[-8:] == [0.0] * 7 + [-0.4]
+    assert driven("r157_fsm", steps=12) == [-0.0] * 7 + [-1.265, -2.53, -3.795, -4.0, -4.0]
 
 
 @pytest.mark.parametrize(
@@ -179,7 +167,7 @@ def test_field__has_the_harm_of_version_0_5(scenario: str) -> None:
     assert [round(float(each["first_impact_harm"].mean()), 4) for each in result.columns.values()] == GOLDEN[scenario]
 
 
-@pytest.mark.parametrize("spec", ["acc", "aeb:ttc=2", "cacc:T=0.8", "idm:T=1.0", "r157_fsm", "r157_human", "rss"])
+@pytest.mark.parametrize("spec", ["idm:T=1.0", "r157_human"])
 def test_role__is_the_same_agent_as_a_driver_from_its_first_decision_on(spec: str) -> None:
     """Vehicle 2 coasts until its latency has elapsed; then it decides at the same times."""
     base = eb.load_scenario("paper-random").replace(early_impacts="keep", latency_s=[0.0, 0.0, 0.8])

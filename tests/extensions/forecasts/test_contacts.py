@@ -125,17 +125,3 @@ def test_who_is_not_known__is_not_forecast_whatever_it_does() -> None:
     line[~known[:, 3], at.SPEED, 3] = 39.0
     bits = [CONTACT.observe(s, np.array([2]), 0.1)[~known[:, 3]].tobytes() for s in (state, state._replace(line=line))]
     assert bits[0] == bits[1]
-
-
-def test_at_the_alert__only_vehicle_1_knows_anything() -> None:
-    state = state_of([7.0, 7.0], [20.0, 18.0, 20.0], latency_s=[0.0, 0.5, 0.8])
-    assert not any(values.any() for body in (2, 3) for values in seen(state, body).values())
-    assert (seen(state, 1)["brake_front_time"] == 0.0).all() and (seen(state, 1)["brake_rear_time"] > 0.0).all()
-
-
-def test_some_forecasts__have_the_bits_of_all() -> None:
-    state = later(PAPER.sample(20, 3), 0.0, 0.8)
-    some = View(["contact.brake_rear_fraction", "own.speed", "contact.drive_total_harm"])
-    whole = dict(zip(CONTACT.names, CONTACT.observe(state, np.array([2]), 0.1)[:, 0].T, strict=True))
-    picked = some.observe(state, np.array([2]), 0.1)[:, 0]
-    assert [picked[:, k].tobytes() == whole[some.names[k]].tobytes() for k in (0, 2)] == [True, True]

@@ -99,17 +99,6 @@ def test_believed__is_nan_where_nothing_is_known() -> None:
     assert np.isfinite(state.line[:, :6, 1:3]).all()  # the state itself has not changed
 
 
-def test_gaps__add_up_to_the_distance_of_who_tells_its_place() -> None:
-    game, state = played({"tells": {"vehicle_2": []}}, {"vehicle_3": ["own", "front_1", "front_2"]})
-    for _ in range(6):
-        state = stepped(game, state, -0.5)
-    three, distance = believed(state, 3), float(state.gaps_m.sum())
-    assert three.line[0, GAP, 1:3] == pytest.approx([distance, 0.0])
-    seen = seen_by(game, state, 3)
-    assert (seen["front_1.known"], seen["front_2.known"], seen["front_1.gap"]) == (0.0, 1.0, 0.0)
-    assert seen["front_2.gap"] == pytest.approx(distance / 10)
-
-
 def test_sight__measures_place_speed_and_acceleration() -> None:
     v2x = {"link_latency_s": 0.0, "senses": "front", "sensing_s": [0.7, 0.7], "tells": ["mass"]}
     game, state = played(v2x, SEEN)

@@ -5,9 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.explain import scenario_json_schema, sentences
+from ethbrake_marl.worlds.explain import sentences
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.extensions.messages.line import LINE
@@ -67,12 +66,6 @@ def test_what_cannot_be__is_refused(message: str) -> None:
         REFUSED[message]()
 
 
-def test_error__names_the_line_of_the_file() -> None:
-    content = {**PAPER.declared(), "v2x": {"tells": ["mas"]}}
-    with refused("mine.yaml, line 9: v2x.tells[0] = mas: did you mean mass?"):
-        Scenario.from_document(Document("mine.yaml", content, {("v2x", "tells"): 9}))
-
-
 def test_scenario__says_what_is_declared_and_can_be_made_of_it() -> None:
     v2x = {"preset": "nominal", "persistence": "periodic", "tells": {"vehicle_2": ["mass", "place"]}}
     scenario = PAPER.replace(v2x=v2x)
@@ -82,14 +75,6 @@ def test_scenario__says_what_is_declared_and_can_be_made_of_it() -> None:
     words = "persistence: periodic, tells: {vehicle_2: [place, mass]}"
     assert any(words in sentence for sentence in sentences(scenario))
     assert scenario.v2x.drawn and PAPER.v2x.extensions == ()
-
-
-def test_schema__has_the_keys_and_no_others() -> None:
-    schema = scenario_json_schema()
-    mapping = schema["$defs"]["V2X"]["anyOf"][1]
-    assert mapping["additionalProperties"] is False
-    assert mapping["properties"]["persistence"]["enum"] == ["first", "periodic"]
-    assert "tells" in mapping["properties"]
 
 
 def test_given_worlds__have_messages_if_no_message_can_be_lost() -> None:

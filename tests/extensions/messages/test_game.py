@@ -1,7 +1,5 @@
 """A game with messages: infos, scripts, plans, interfaces; and a game without them, which pays nothing."""
 
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,6 @@ from ethbrake_marl.extensions.messages.belief import believed, require_pieces
 from ethbrake_marl.extensions.messages.game import GameWithMessages
 from ethbrake_marl.extensions.messages.links import NAME
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
-from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import game_of
@@ -118,17 +115,6 @@ def test_infos__tell_when_news_counts_and_how_old_it_is() -> None:
     assert set(game.own_infos(game.start(1, 7, 0))) == set(names[:3])
 
 
-def test_vector_env__goes_on_with_new_worlds() -> None:
-    env = EthBrakeVectorEnv(4, PAPER.replace(v2x=PERIODIC, horizon_s=3.0))
-    seen, _ = env.reset(seed=1)
-    ended = 0
-    for _ in range(60):
-        seen, _, terminated, truncated, _ = env.step(np.full((4, 1), -0.3, np.float32))
-        ended += int((terminated | truncated).sum())
-        assert np.isfinite(seen).all()
-    assert ended > 4
-
-
 def test_usual_contents__written_out_change_no_bit_of_an_observation() -> None:
     usual = ["place", "speed", "acceleration", "braking_capacity", "latency", "mass"]
     games = [played(v2x, n=30, scenario=PAPER) for v2x in ("nominal", {"preset": "nominal", "tells": usual})]
@@ -144,13 +130,3 @@ def test_without_messages__there_is_no_memory_and_no_other_game() -> None:
     game, state = played("nominal")
     assert type(game) is Game and type(played(PERIODIC)[0]) is GameWithMessages
     assert NAME not in stepped(game, state, 0.0).memories and game.own_infos(state) == {}
-
-
-def test_without_messages__nothing_of_the_extension_is_imported() -> None:
-    code = (
-        "import sys; from ethbrake_marl.faces.gymnasium import EthBrakeEnv;"
-        " from ethbrake_marl.worlds.catalogue import load_scenario;"
-        " env = EthBrakeEnv(load_scenario('paper-random').replace(v2x='nominal')); env.reset(seed=1); env.step([0.0]);"
-        " assert not any('extensions.messages' in name for name in sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -202,14 +202,6 @@ def test_later_states__give_the_same_verdict_and_a_witness_from_there():
     assert impacts_of_witnesses(first, from_there) == 0
 
 
-def test_world_alone__gives_the_same_bits():
-    state = wide_worlds(100, 3, seed=27)
-    together = avoidability(state)
-    for k in range(0, 100, 7):
-        alone = avoidability(state.take([k]))
-        assert all(one[0].tobytes() == several[k].tobytes() for one, several in zip(alone, together, strict=True))
-
-
 def changed(array, row, body, value):
     state = worlds([9, 9], [9, 9, 9], 5, [0, 0.5, 0.8])
     getattr(state, array)[0, row, body] = value

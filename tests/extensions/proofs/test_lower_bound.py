@@ -12,9 +12,9 @@ from ethbrake_marl.extensions.proofs import line as row
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, lacking
 from ethbrake_marl.extensions.proofs.flights import lead, widest_flight
-from ethbrake_marl.extensions.proofs.followers import after, after_rear, held_by_leader, slowed_by_rear
+from ethbrake_marl.extensions.proofs.followers import after, after_rear, held_by_leader
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, REAR_FIRST
-from ethbrake_marl.extensions.proofs.lower_bound import front_first, last_soft, lower_bound, rear_first, rounding
+from ethbrake_marl.extensions.proofs.lower_bound import front_first, lower_bound, rear_first, rounding
 from ethbrake_marl.extensions.proofs.meetings import gentlest, gentlest_front, meet_front, meet_rear
 from ethbrake_marl.motion.layout import SPEED
 from tests.extensions.proofs.worlds import opening, play, searched_harm, wide_worlds, worlds
@@ -48,8 +48,7 @@ def test_pair__by_hand_less_what_rounding_can_do_which_is_next_to_nothing(name):
     assert bound.impact_proven[0] == (harm > 0)
 
 
-@pytest.mark.parametrize("body", [1, 2])
-@pytest.mark.parametrize("step", [0.1, 0.02])
+@pytest.mark.parametrize(("body", "step"), [(1, 0.1), (2, 0.02)])
 def test_bound__is_never_above_what_its_own_optimum_reaches_in_steps(body, step):
     # Full braking behind a leader, or full drive ahead of a follower, attains the bound; rounding alone decides.
     rng, n = np.random.default_rng(61), 4000
@@ -132,11 +131,11 @@ def test_decisions__leave_less_room_and_no_plan_is_below():
     assert np.all(any_time <= decided) and decided.mean() > 1.02 * any_time.mean()
     assert often.mean() < 1.01 * any_time.mean()
     begun, least = game.begin(state), np.full(100, np.inf)
-    for early, late, switch in product((-1, -0.5, 0, 0.5, 1), (-1, -0.5, 0, 1), range(0, 40, 2)):
+    for early, late, switch in product((-1, -0.5, 0, 0.5, 1), (-1, -0.5, 0, 1), range(0, 40, 4)):
         plan = np.where(np.arange(75) < switch, float(early), float(late))
         least = np.minimum(least, eb.price(game, begun, np.tile(plan[:, np.newaxis], (100, 1, 1)), "first"))
     near = (decided > 0) & (least < 1.02 * decided + 1e-6)
-    assert np.all(decided <= least) and near.sum() > 15
+    assert np.all(decided <= least) and near.sum() > 10
 
 
 # What a first contact leaves, and what the command in force costs.
@@ -170,7 +169,7 @@ def follows(kind, values, time, closing):
 
 def test_gentlest_contact__is_reached_and_falls_with_the_time():
     met = 0
-    for values in random_rows(200, seed=43):
+    for values in random_rows(60, seed=43):
         for kind, meet in ((FRONT_FIRST, meet_front), (REAR_FIRST, meet_rear)):
             coming = meet(values, np.inf if kind == FRONT_FIRST else 99.0)
             times = np.array([meet(values, parameter) for parameter in np.linspace(0, 3, 13)])
@@ -181,12 +180,12 @@ def test_gentlest_contact__is_reached_and_falls_with_the_time():
             for time, (_, parameter) in zip(times, softest, strict=True):
                 if np.isfinite(parameter):
                     assert meet(values, parameter) == pytest.approx(time, abs=1e-5)
-    assert met > 130
+    assert met > 40
 
 
 def test_what_follows__falls_with_the_closing_speed_and_rises_with_the_time():
     some = 0
-    for values in random_rows(300, seed=44):
+    for values in random_rows(80, seed=44):
         apart, stand = values[row.GAP_L] + values[row.GAP_R], values[row.V_L] / values[row.A_L]
         for kind in (FRONT_FIRST, REAR_FIRST):
             times = [t for t in (0.1, 0.4, 0.8, 1.6) if row.leader(values, t)[1] - row.follower(values, t)[1] > -apart]
@@ -197,7 +196,7 @@ def test_what_follows__falls_with_the_closing_speed_and_rises_with_the_time():
             some += np.any(harm > 0)
             assert np.all(np.diff(harm, axis=1) < 1e-7)
             assert kind == REAR_FIRST or np.all(np.diff(harm, axis=0) > -1e-7)
-    assert some > 100
+    assert some > 25
 
 
 # kind, gaps, speeds, rear vehicle's latency, command, first-impact harm of both pairs
@@ -224,8 +223,6 @@ def test_after__is_nearly_attained_by_bouncing_off(name):
 
 CELL_MEMORY = np.empty((CELLS, CELL_COLUMNS))
 HELD = dict(V_L=10, A_L=8, V_F=20, A_F=4, U_F=2, LIMIT_F=40, V_R=30, A_R=4, FRONT_SHARE=0.9, GAP_R=100 - 121 / 14)
-SLOWED = dict(V_L=0, A_L=5, V_F=18, A_F=8, V_R=20, A_R=4, REAR_SHARE=0.5)
-SOFT = dict(V_L=30, A_L=1, V_F=18, A_F=5, U_F=4, V_R=21, A_R=7, GAP_L=50, GAP_R=1)
 CONTACTS = {  # function, row, further arguments -> value
     # Both at 19 after 20 against 18 m/s; the rear one, braking harder, is no help: 19^2 - 2 * 4 * 7.
     "after rear, of one that brakes less": (
@@ -236,16 +233,6 @@ CONTACTS = {  # function, row, further arguments -> value
     # rest after 11^2 / 14 m. The rear one, at 30 m/s with 4, comes there after 100 m in all: 900 - 800.
     "held by the leader": (held_by_leader, HELD, (0.0, 0.0, 10.0), 10.0),
     "not held by one that brakes harder": (held_by_leader, {**HELD, "A_F": 9}, (0.0, 0.0, 10.0), 0),
-    # 20 against 18 m/s: both at 19, slowing by 6, and by 7 on average for f alone. 7 m before one that stands.
-    "slowed by the rear": (
-        slowed_by_rear, SLOWED, (0.0, 2.0, 7.0), 19 - 7 * (19 - math.sqrt(19**2 - 2 * 6 * 7)) / 6,
-    ),
-    "slowed, but the closing speed may rise": (slowed_by_rear, {**SLOWED, "A_L": 7.5}, (0.0, 2.0, 7.0), 0),
-    # It was faster by 2 t a time t before, over 1 m: t is at most 1 s, and 1.5 s for 3 m/s.
-    "last soft contact": (last_soft, SOFT, (9.0,), 1.0),
-    "last soft contact, from far": (last_soft, {**SOFT, "GAP_R": 90}, (9.0,), 1.5),
-    # Till its onset it can be left behind by up to 4, or be come towards by up to 5.
-    "last soft contact, late": (last_soft, {**SOFT, "GAP_R": 90, "ONSET_R": 0.2}, (9.0,), 0.2 + 4 / 2),
 }  # fmt: skip
 
 
@@ -345,9 +332,7 @@ def test_horizon__what_comes_later_does_not_count():
 
 
 @pytest.mark.parametrize("time_step_s", [None, 0.1])
-@pytest.mark.parametrize(
-    ("mass", "bounce", "drive"), [(1.0, 0.0, 3.0), ([4.5, 5.5, 5.9], 1.0, 0.0), ([50, 1, 1], 0.1, 1e-9)]
-)
+@pytest.mark.parametrize(("mass", "bounce", "drive"), [(1.0, 0.0, 3.0), ([4.5, 5.5, 5.9], 1.0, 0.0)])
 def test_who_stands_at_the_leader__is_struck_together_with_it(time_step_s, mass, bounce, drive):
     """One impact of all three: the front pair closes at 0 in it, and no second one follows."""
     state = worlds([0, 20], [0, 0, 20], 6.0, drive=drive, mass=mass, restitution=bounce)
@@ -385,6 +370,9 @@ def test_measures__are_asked_for_by_name():
     assert result["coast"]["avoidable_reason"].tolist() == ["front", "front", "", "", "", "rear"]
     assert result["full_brake"]["proven_harm"] == pytest.approx(RECORDED["paper-random"][2], rel=1e-12)
     assert (result["full_brake"]["proven_harm"] <= result["full_brake"]["first_impact_harm"]).all()
+    soon = eb.load_scenario("paper-random").replace(horizon_s=1.5)
+    near = eb.evaluate(soon, "full_brake", episodes=6, measures="proven_harm")["full_brake"]["proven_harm"]
+    assert near.sum() < 0.8 * sum(RECORDED["paper-random"][2])
     with refused("avoidable, proven_harm: a vehicle that does not learn does not brake fully"):
         coasts = eb.load_scenario("paper-random").replace(roles={"vehicle_2": "learner", "vehicle_3": "coast"})
         eb.evaluate(coasts, "full_brake", episodes=2, measures="avoidable")
