@@ -1,7 +1,7 @@
 """Controllers from the literature: car-following models, the driver models of UN R157, emergency braking.
 
 A *law* is the formula of a controller: it computes a command from the motion of the vehicle itself and of the vehicle
-ahead. ``LAWS`` lists all laws with their parameters and sources. In a law, ``p`` holds its parameters, in SI units.
+ahead. ``LAWS`` lists all laws with their parameters and sources.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +23,16 @@ from ethbrake_marl.registry import Part
 
 TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap
 SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
+
+
+class Parameters:
+    """Parameters of one law, with the names in ``LAWS``, in SI units."""
+
+    def __init__(self, **values: float) -> None:
+        self.__dict__.update(values)
+
+    def __getattr__(self, name: str) -> float:
+        raise AttributeError(name)
 
 
 class Seen(NamedTuple):
@@ -72,23 +81,23 @@ class Seen(NamedTuple):
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
-def _idm(seen: Seen, p: SimpleNamespace) -> Floats:
+def _idm(seen: Seen, p: Parameters) -> Floats:
     wanted = p.s0 + np.maximum(
         0.0, seen.speed_mps * p.T + seen.speed_mps * seen.closing_mps / (2 * math.sqrt(p.a * p.b))
     )
     return p.a * (1.0 - np.square(np.square(seen.speed_mps / p.v0)) - np.square(wanted / seen.gap_m))
 
 
-def _is_free(seen: Seen, p: SimpleNamespace) -> Bools:
+def _is_free(seen: Seen, p: Parameters) -> Bools:
     return seen.gap_m > p.free * np.maximum(seen.speed_mps, 1.0) + p.s0
 
 
-def _acc(seen: Seen, p: SimpleNamespace) -> Floats:
+def _acc(seen: Seen, p: Parameters) -> Floats:
     gap = p.gap * (seen.gap_m - p.s0 - p.T * seen.speed_mps) - p.rate * seen.closing_mps
     return np.where(_is_free(seen, p), p.speed * (p.v0 - seen.speed_mps), gap)
 
 
-def _cacc(seen: Seen, p: SimpleNamespace) -> Floats:
+def _cacc(seen: Seen, p: Parameters) -> Floats:
     wide = seen.gap_m - p.s0 - p.T * seen.speed_mps
     rate = -seen.closing_mps - p.T * seen.own_mps2
     keeps, closes = p.gap * wide + p.rate * rate, 0.005 * wide + 0.05 * rate
@@ -96,22 +105,22 @@ def _cacc(seen: Seen, p: SimpleNamespace) -> Floats:
     return np.where(_is_free(seen, p), p.speed * (p.v0 - seen.speed_mps), change / seen.step_s)
 
 
-def _safe_distance(seen: Seen, p: SimpleNamespace) -> Floats:
+def _safe_distance(seen: Seen, p: Parameters) -> Floats:
     speed = np.maximum(seen.speed_mps, 0.0)
     ahead = np.square(np.maximum(seen.front_mps, 0.0)) / (2.0 * p.b_max)
     way = speed * p.rho + 0.5 * p.a * p.rho * p.rho + np.square(speed + p.rho * p.a) / (2.0 * p.b_min)
     return np.maximum(way - ahead, 0.0)
 
 
-def _rss(seen: Seen, p: SimpleNamespace) -> Floats:
+def _rss(seen: Seen, p: Parameters) -> Floats:
     return np.where(seen.gap_m < _safe_distance(seen, p), -p.b_min, 0.0)
 
 
-def _human(seen: Seen, p: SimpleNamespace) -> Floats:
+def _human(seen: Seen, p: Parameters) -> Floats:
     return seen.built_up(np.full_like(seen.gap_m, -p.most), p.jerk)
 
 
-def _human_notices(seen: Seen, p: SimpleNamespace) -> Bools:
+def _human_notices(seen: Seen, p: Parameters) -> Bools:
     brakes = (seen.front_mps2 < -p.front) & (seen.headway_s < p.headway)
     return brakes | (seen.until_contact_s < p.ttc)
 
@@ -122,7 +131,7 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
 
-def fuzzy(seen: Seen, p: SimpleNamespace) -> tuple[Floats, Floats]:
+def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n].
 
     Each criterion is a number from 0 (no danger) to 1 (full danger). ``p`` are parameters of the law ``r157_fsm``.
@@ -144,18 +153,18 @@ def fuzzy(seen: Seen, p: SimpleNamespace) -> tuple[Floats, Floats]:
     return proactive, np.where(speed > front, critical, 0.0)
 
 
-def _fsm_notices(seen: Seen, p: SimpleNamespace) -> Bools:
+def _fsm_notices(seen: Seen, p: Parameters) -> Bools:
     proactive, critical = fuzzy(seen, p)
     return (seen.closing_mps > 0.0) & (proactive + critical > 0.0)
 
 
-def _fsm(seen: Seen, p: SimpleNamespace) -> Floats:
+def _fsm(seen: Seen, p: Parameters) -> Floats:
     proactive, critical = fuzzy(seen, p)
     wanted = np.where(critical > 0.0, critical * (p.b_max - p.b_min) + p.b_min, proactive * p.b_min)
     return seen.built_up(-np.minimum(wanted, p.most), p.jerk)
 
 
-def _aeb(seen: Seen, p: SimpleNamespace) -> Floats:
+def _aeb(seen: Seen, p: Parameters) -> Floats:
     required = np.square(np.maximum(seen.closing_mps, 0.0)) / (2.0 * seen.gap_m)
     return np.where((seen.until_contact_s < p.ttc) | (required > p.required), -np.inf, 0.0)
 
@@ -167,9 +176,9 @@ class Law:
     about: str  # name of the controller
     source: str  # publication of the formula
     parameters: Mapping[str, float]  # default value of each parameter, in SI units
-    command: Callable[[Seen, SimpleNamespace], Floats]  # function that returns the acceleration, [n] m/s2
+    command: Callable[[Seen, Parameters], Floats]  # function that returns the acceleration, [n] m/s2
     # Function that returns for each world whether there is a danger, [n] bool. None: the law acts from the start.
-    notices: Callable[[Seen, SimpleNamespace], Bools] | None = None
+    notices: Callable[[Seen, Parameters], Bools] | None = None
     stays: bool = False  # whether the reaction continues after the danger is over
 
 
@@ -231,7 +240,7 @@ class Controller:
     needs_ahead = ("place", "speed", "acceleration")  # pieces of messages without which it does not drive
 
     def __init__(self, name: str, law: Law, parameters: Mapping[str, float], step_s: float) -> None:
-        self.name, self.law, self.parameters, self.step_s = name, law, SimpleNamespace(**parameters), step_s
+        self.name, self.law, self.parameters, self.step_s = name, law, Parameters(**parameters), step_s
 
     def check(self, game: Game, body: int) -> None:
         """Raise ``InvalidInput`` if decisions come at another time step."""

@@ -1,14 +1,13 @@
 """Agents of the field, by hand: car following, RSS, UN R157's models and AEB."""
 
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.extensions.field.controllers import LAWS, Seen, fuzzy
+from ethbrake_marl.extensions.field.controllers import LAWS, Parameters, Seen, fuzzy
 from ethbrake_marl.motion.layout import GAP
 from ethbrake_marl.names import group, make_agent
 from tests.refused import refused
@@ -21,7 +20,7 @@ def seen(gap, speed, front, front_force=0.0, own=0.0):
 
 def called(name, *given, **parameters):
     law = LAWS[name]
-    return np.round(law.command(seen(*given), SimpleNamespace(**{**law.parameters, **parameters})), 6).tolist()
+    return np.round(law.command(seen(*given), Parameters(**{**law.parameters, **parameters})), 6).tolist()
 
 
 TWO = eb.Scenario(
@@ -67,7 +66,7 @@ def test_aeb__brakes_by_time_to_collision_and_required_deceleration() -> None:
 def test_fuzzy_model__by_hand() -> None:
     # The fuzzy criteria, 20 m/s behind 20 m/s: safe beyond 15 + 50 - 200/7 + 2 + 2 = 40.43 m of gap, unsafe within 15
     # + 33.33 - 28.57 + 2 = 21.76 m; 2 m/s closing adds the critical one: 1.5 + 4 / 8 = 2 m and 1.5 + 4 / 12 = 1.83 m.
-    p = SimpleNamespace(**LAWS["r157_fsm"].parameters)
+    p = Parameters(**LAWS["r157_fsm"].parameters)
     assert [np.round(each, 4).tolist() for each in fuzzy(seen([41, 31.0952381, 21], 20, 20), p)] == [
         [0.0, 0.5, 1.0],
         [0.0, 0.0, 0.0],
