@@ -17,32 +17,6 @@ LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in 
 
 _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
-RENAMED: dict[str, str] = {  # old name -> new name, for messages
-    "counterfactual": "vine",
-    "options": "rollout-classification",
-    "modes": "experts",
-    "counterfactuals": "tried",
-    "among": "policies",
-    "gate": "gating",
-    "gate_states": "gating_states",
-    "gate_memory": "gating_memory",
-    "gate_steps": "gating_steps",
-    "alone": "pretraining_first",
-    "further": "pretraining_others",
-    "believed": "estimated",
-    "ppo-paper-random-obstacle": "ppo-obstacle",
-    "options-paper-random-obstacle-total": "rollout-obstacle",
-    "counterfactual-paper-random-preference": "vine-preference",
-    "counterfactual-cooperation-1-front": "vine-front",
-    "counterfactual-cooperation-3-pair": "vine-pair",
-    "counterfactual-cooperation-4-all": "vine-all",
-    "ppo@shipped": "ppo (ppo-obstacle on paper-random-obstacle)",
-    "policy@shipped": "universal (the policies for one scenario: ethbrake agent list)",
-    "team@shipped": "universal (the policies for one scenario: ethbrake agent list)",
-    "options@shipped": "rollout-obstacle",
-    "counterfactual@shipped": "vine-preference, vine-front, vine-pair or vine-all",
-}
-
 
 def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
@@ -226,39 +200,17 @@ class Unfamiliar(UserWarning):
     """Warning: a trained policy is used in worlds that differ from the worlds of its training."""
 
 
-def new_name(name: object, known: Collection[str]) -> str | None:
-    """Return the new name if ``name`` was renamed and the new name is in ``known``; otherwise None.
-
-    Each of the words between colons in ``name`` is looked up separately.
-    """
-    new = ":".join(RENAMED.get(word, word) for word in name.split(":")) if isinstance(name, str) else None
-    return new if new != name and new in known else None
-
-
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name; its message shows the new name, a similar name, or all known names.
+    """Return the error for an unknown name; its message shows a similar name, or all known names.
 
     ``kind`` says what the name should denote, for example ``scenario``. ``may_be_own`` means that users can register
     names of this kind; the message then says that such a name must first be registered or installed.
     """
     names = sorted(known)
-    if new := new_name(name, names):
-        return UnknownName(f"unknown {kind} {name!r}; it is now called {new!r}")
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
     own = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
-
-
-def refuse_shipped_path(path: str, agent: str = "") -> None:
-    """Raise ``UnknownName`` if ``path`` is ``shipped`` or ``shipped/NAME``, the former way to name a shipped policy.
-
-    ``agent`` is the name before the ``@`` in ``agent@path``; empty if there is no ``@``.
-    """
-    folder, _, name = path.partition("/")
-    if folder == "shipped":
-        old, name = f"{agent}@{path}" if agent else path, name or f"{agent}@{path}"
-        raise UnknownName(f"{old!r} is now written {RENAMED.get(name, name.partition('@')[0])}")
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:

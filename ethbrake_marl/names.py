@@ -22,7 +22,7 @@ from typing import Any
 
 from ethbrake_marl.agents.drive import Agent, Team, check_agent
 from ethbrake_marl.episode.game import Game, Script
-from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, describe_error, refuse_shipped_path
+from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, describe_error
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -264,7 +264,6 @@ def _make(core: str, settings: AgentSettings) -> Driver:
         raise InvalidInput(f"agent {core!r}: must be NAME[:ARGUMENT][@PATH] or FILE.py:FUNCTION[:ARGUMENT][@PATH]")
     name, argument, policy = match["name"], match["argument"], match["policy"]
     if policy is not None:
-        refuse_shipped_path(policy, name)
         if not policy:
             raise InvalidInput(f"agent {core!r}: a path must follow '@'")
         settings = replace(settings, policy=os.path.expanduser(policy))

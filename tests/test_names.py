@@ -92,7 +92,6 @@ def test_a_script__has_the_name_that_it_was_asked_for_by(spec: str):
         ("a@", "a path must follow '@'"),
         ("a b", "unknown agent 'a b'"),
         ("A", "unknown agent 'A'"),
-        ("ppo@shipped", "is now written ppo"),
     ],
 )
 def test_a_bad_name__is_refused_in_one_line(spec: Any, message: str):

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, NoReturn, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from ethbrake_marl.errors import InvalidInput, new_name
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.plain import parse_strict_json
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, parse_numeral, read_yaml
 
@@ -242,13 +242,11 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Return a hint for an unknown ``key``: "did you mean ...?" or the key's new name; empty if no key is similar.
+    """Return a hint for an unknown ``key``: "did you mean ...?"; empty if no key is similar.
 
     A valid key with a wrong or missing unit is also recognised: ``gaps_km``, ``mass``.
     """
     names = sorted(known)
-    if new := new_name(key, names):
-        return f"it is now called {new}"
     stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}
     same = stems.get(key.rsplit("_", 1)[0]) or stems.get(key)
     close = [same] if same else get_close_matches(key, names, n=1)

@@ -14,7 +14,7 @@ from pydantic import Field, field_validator, model_validator
 
 from ethbrake_marl.episode.features import listed_features
 from ethbrake_marl.episode.reward import RewardParams, own_terms
-from ethbrake_marl.errors import InvalidInput, new_name, unknown_name
+from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_model, refuse
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.policies.network import Activation, NetworkSpec
@@ -295,8 +295,7 @@ def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
     """Return the recipe that a document describes; ``shipped`` is its file if it comes with the package."""
     name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
-        new = new_name(name, ALGORITHMS)
-        right = f"is now called {new}" if new else f"must be one of {', '.join(ALGORITHMS)}"
+        right = f"must be one of {', '.join(ALGORITHMS)}"
         if shipped is not None:
             right += f"; this algorithm belongs to the extension {shipped.parent.name}, which is not installed"
         raise InvalidInput(f"{document.where(('algorithm',))}: algorithm = {flow_text(name, 60)}: {right}")

@@ -281,7 +281,8 @@ class V2X(Part):
 
     def latest_reaction_s(self, own_latency: Floats, unheard: Bools) -> Floats:
         """Return upper bounds of the times from which vehicles can react, [n, N] s, from their own latencies."""
-        slowest = np.tile([1.0, 0.0, 0.0, 1.0], (len(own_latency), own_latency.shape[1] ** 2))  # numbers of links
+        n, N = own_latency.shape
+        slowest = np.tile([1.0, 0.0, 0.0, 1.0], (n, N * N))  # numbers of links
         return self.news(own_latency, slowest, unheard)[0]
 
 

@@ -60,7 +60,6 @@ EVALUATIONS = [
         "scenario 'cooperation-0-sensors' has no learner that the agents could drive; choose the scenario",
     ),
     ("evaluate --agents team@.", ".: contains no policy; give the folder of a policy bundle"),
-    ("evaluate --agents policy@shipped+step", "'policy@shipped' is now written universal (the policies"),
     ("evaluate --output /proc/out", "/proc/out: cannot be written to (No such file or directory)"),
     ("evaluate --per-world csv", "--per-world: needs a folder for its file; add --output FOLDER"),
 ]

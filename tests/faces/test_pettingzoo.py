@@ -104,7 +104,7 @@ REFUSED: dict[str, Callable[[], Any]] = {
     "reset: listed_world = {'seed': 7}: must be seed and number": lambda: began().reset(
         options={"listed_world": {"seed": 7}}
     ),
-    "first world = -1: must be a whole number, at least 0": lambda: began().reset(
+    "first world = -1: must be a whole number in 0..": lambda: began().reset(
         options={"listed_world": {"seed": 7, "number": -1}}
     ),
 }

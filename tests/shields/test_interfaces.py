@@ -220,7 +220,7 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     ),
     (lambda: shield(EthBrakeEnv(), {2: COAST}), InvalidInput, "2: must be the name of a vehicle"),
     (lambda: shield(EthBrakeEnv(), allowance=-1), InvalidInput, "allowance = -1"),
-    (lambda: shield(EthBrakeParallelEnv(SCRIPTED)), InvalidInput, "has no learner to shield"),
+    (lambda: shield(EthBrakeParallelEnv(SCRIPTED)), InvalidInput, "has no learner; pass learners"),
 ]
 
 

@@ -72,7 +72,7 @@ def test_resume__after_a_kill_everything_is_the_same(run: Path, whole: Made) -> 
     assert kept(run) == whole("ppo")
     events = EventAccumulator(str(run / "tensorboard"))
     events.Reload()
-    assert [event.step for event in events.Scalars("train/loss")] == [128 * k for k in range(1, 7)]
+    assert {event.step for event in events.Scalars("train/loss")} == {128 * k for k in range(1, 7)}
     with refused("this training has finished and cannot be resumed"):
         go_on(run)
 
@@ -212,7 +212,7 @@ def forged(saved: dict[str, Any], place: str, value: Any) -> None:
 
 
 FORGED = {
-    "model/environment/stream": [1, "2"],
+    "model/environment/stream": [1],
     "model/environment/episode": [torch.zeros(8, 7, 3, dtype=torch.float64)],
     "model/environment/_steps": torch.zeros(8),
     "model/environment": {},

@@ -401,7 +401,7 @@ HOSTILE: dict[str, Any] = {
     ": is not the folder of a run; name the folder": lambda run: [path.unlink() for path in run.glob("*.json")],
     "run.json: status = 'done': must be": lambda run: changed(run, "run.json", status="done"),
     "run.json: is damaged: ": lambda run: (run / "run.json").write_text("{"),
-    "config.json: is missing": lambda run: (run / "config.json").unlink(),
+    "config.json: the file does not exist": lambda run: (run / "config.json").unlink(),
     "config.json: does not describe a training ('recipe')": lambda run: (run / "config.json").write_text("{}"),
     "config.json: does not describe a training": lambda run: changed(run, "config.json", scenario=3),
     "config.json: scenario 'paper-random': horizon_s": lambda run: changed(

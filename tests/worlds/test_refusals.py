@@ -299,7 +299,7 @@ REFUSED: dict[str, Callable[[], object]] = {
         table={"columns": ["gap_1_m", "recording"], "rows": [[1, 2]]}
     ),
     "missing.yaml: the file does not exist": lambda: load_scenario("missing.yaml"),
-    "braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2 (metres per second squared) (and 2 more mist": (
+    "braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2 (metres per second squared)": (
         lambda: given(braking_capacity_mps2="0", mass_t="0", restitution="2")
     ),
 }
@@ -310,11 +310,6 @@ REFUSED: dict[str, Callable[[], object]] = {
 def test_mistake__is_refused_with_its_place_and_what_would_be_right(message: str) -> None:
     with refused(message):
         REFUSED[message]()
-
-
-def test_first_mistake__is_shown() -> None:
-    with refused("braking_capacity_mps2 = 0: must be finite and in (0, 100] m/s2 (metres per second squared)"):
-        given(braking_capacity_mps2="0", mass_t="0", restitution="2")
 
 
 @pytest.mark.parametrize("copied", [PAPER, pickle.loads(pickle.dumps(PAPER)), copy.deepcopy(PAPER)])

@@ -56,11 +56,11 @@ class Cells(NamedTuple):
 
 @contextmanager
 def reading(file: Path) -> Iterator[BufferedReader]:
-    """Open a file; what goes wrong inside pyarrow is one ``InvalidInput``."""
+    """Open a file; bytes that are no text, and what goes wrong inside pyarrow, are one ``InvalidInput``."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             yield stream
-    except pyarrow.ArrowException as error:
+    except (pyarrow.ArrowException, UnicodeDecodeError) as error:
         right = "rows are counted from the header; is the file complete?"
         raise InvalidInput(f"{file}: cannot be read ({plain_text(str(error))[:200]}); {right}") from None
 

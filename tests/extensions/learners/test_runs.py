@@ -136,8 +136,6 @@ def choose(**changes: Any) -> Callable[[], object]:
 
 REFUSED: dict[str, Callable[[], object]] = {
     "algorithm = trpo: must be one of ppo, sac": lambda: VINE.replace(algorithm="trpo"),
-    "algorithm = options: is now called rollout-classification": lambda: VINE.replace(algorithm="options"),
-    "unknown recipe 'modes'; it is now called 'experts'": lambda: load_recipe("modes"),
     "reward.shaping = 0.1: must be 0: this algorithm plays tried actions to the end": lambda: VINE.replace(
         reward={"harm": 1.0, "shaping": 0.1}
     ),
