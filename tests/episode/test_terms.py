@@ -121,7 +121,14 @@ def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, coun
     while not state.ended.all():
         state, step = game.step(state, np.full((20, 1), -0.2))
         cost += arrays(game, state, step, 7, 2)["cost"]
-    assert cost == near(state.harm(count)) and (state.harm("total") > state.harm("first")).any()
+    infos = [arrays(game, state, step, 7, body) for body in (1, 2, 3)]
+    for name, harms in (("first_impact_harm", state.borne_harm("first")), ("total_harm", state.borne_harm("total"))):
+        assert np.stack([info[name] for info in infos], axis=1) == near(harms)
+    assert (
+        state.line[:, TOTAL, 0].any()
+        and cost == near(state.harm(count))
+        and (state.harm("total") > state.harm("first")).any()
+    )
 
 
 # ---------------------------------------------------------------- shaping
