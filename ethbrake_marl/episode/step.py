@@ -204,7 +204,7 @@ def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) ->
     line, clock = alert.line.copy(), alert.clock.copy()
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
     wanted = alert.wanted.copy()
-    failed = advance_worlds(line, alert.car, alert.time_s, first, wanted, scratch_for(wanted.shape[1]))
+    failed = drive_worlds(line, alert.car, alert.time_s.copy(), first, wanted, scratch_for(wanted.shape[1]))
     if failed >= 0:
         raise failure(alert, failed, 0.0, first[failed])
     clock[:, TIME] = clock[:, FIRST_DECISION] = first
@@ -245,13 +245,16 @@ def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
     shape = n, len(rules.learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
         raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
-    return actions.astype(np.float64, order="C")
+    return np.ascontiguousarray(actions, np.float64)
 
 
 def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
     """Return proposed actions in memory of their own, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for others."""
     actions = numbers_of(rules, actions, n)
-    for row in actions[(np.abs(actions) > LARGEST_ACTION).any(axis=1)]:
+    size = np.abs(actions)
+    if not (size > 1.0).any():
+        return actions.copy()
+    for row in actions[(size > LARGEST_ACTION).any(axis=1)]:
         _check_actions(rules, np.where(np.isnan(row), 0.0, row))
     return np.clip(actions, -1.0, 1.0)
 
