@@ -202,14 +202,15 @@ def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) ->
     Until then ``alert.wanted`` is commanded.
     """
     line, clock = alert.line.copy(), alert.clock.copy()
+    car = alert.car if alert.car.flags.writeable else alert.car.copy()  # a kernel is compiled again for read-only ones
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
     wanted = alert.wanted.copy()
-    failed = drive_worlds(line, alert.car, alert.time_s.copy(), first, wanted, scratch_for(wanted.shape[1]))
+    failed = drive_worlds(line, car, alert.time_s.copy(), first, wanted, scratch_for(wanted.shape[1]))
     if failed >= 0:
         raise failure(alert, failed, 0.0, first[failed])
     clock[:, TIME] = clock[:, FIRST_DECISION] = first
     clock[:, LAST] = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
-    return State(line, alert.car, clock, alert.know, wanted, alert.memories)
+    return State(line, car, clock, alert.know, wanted, alert.memories)
 
 
 def step(
