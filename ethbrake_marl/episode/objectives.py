@@ -51,7 +51,7 @@ class Harm(NamedTuple):
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             whole = whole + pairs[:, p]
-        split_harm(pairs.copy(), car[:, MASS].copy(), borne)
+        split_harm(pairs, car[:, MASS], borne)
         return cls(pairs, borne, whole, car)
 
     def weighted(self, weights: Floats) -> Floats:

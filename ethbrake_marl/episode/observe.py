@@ -52,7 +52,7 @@ class Plan(NamedTuple):
     offsets: Ints  # of the observed neighbours: -1 is the next vehicle ahead
     role: bool
     obstacle: bool
-    places: Ints  # [F] of each feature among the kernel's values; -1: it is computed by one of the next two
+    places: Ints  # [F] of each feature among the kernel's values; -1: one of the next two; empty: all in this order
     groups: tuple[tuple[Group, list[int], list[int]], ...]  # of other packages: group, columns, features in the group
     own: tuple[tuple[int, Own, int], ...]  # column, feature, offset (0: of the vehicle itself)
     scaling: Floats  # [3, F] 1 / scale, low and high
@@ -88,6 +88,8 @@ class View:
             state.line, state.car, state.clock, state.know, observers, plan.offsets, plan.role, plan.obstacle,
             plan.places, plan.scaling, np.empty(N_OWN + N_NEIGHBOUR * len(plan.offsets) + N_ROLE + N_OBSTACLE), seen,
         )  # fmt: skip
+        if not plan.groups and not plan.own:
+            return seen
         functions = {group.function for group, *_ in plan.groups}
         values = {function: function(state, observers, time_step_s) for function in functions}
         for group, columns, places in plan.groups:
@@ -118,10 +120,10 @@ class View:
             for column, (side, _, last) in enumerate(split)
             if self.names[column] not in place and side not in GROUPS
         ]
+        places = [] if list(self.names) == known else [place.get(name, -1) for name in self.names]
         return Plan(
-            np.array(offsets, np.int64), "role" in listed, "obstacle" in listed,
-            np.array([place.get(name, -1) for name in self.names]), tuple(groups), tuple(own),
-            scaling_of(self.features),
+            np.array(offsets, np.int64), "role" in listed, "obstacle" in listed, np.array(places, np.int64),
+            tuple(groups), tuple(own), scaling_of(self.features),
         )  # fmt: skip
 
 
@@ -175,11 +177,18 @@ def fitting_deceleration(speed, latency_left, room):
     return speed * speed / (2.0 * max(room - speed * latency_left, 1e-3))
 
 
+@kernel
+def bounded(value, scaling, f):
+    """Return what is observed of the value of feature f."""
+    return min(max(value * scaling[0, f], scaling[1, f]), scaling[2, f])
+
+
 @large
 def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out):
     """Write the features of the groups own, neighbours, role and obstacle, scaled, to ``out`` [n, observers, F].
 
-    They are computed in this order in ``value``, of which ``places`` [F] are written; none where it is -1.
+    They are computed in this order in ``value``, of which ``places`` [F] are written, none where it is -1; all of them
+    in order if ``places`` is empty.
     """
     bodies = line.shape[2]
     for k in range(len(out)):
@@ -218,6 +227,9 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
                         gap += w[GAP, p]
                     value[f], value[f + 1], value[f + 2] = 1.0, gap, w[HIT, 0]
                     value[f + 3], value[f + 4] = gap - own, fitting_deceleration(w[SPEED, i], left, gap)
+            if len(places) == 0:
+                for f in range(scaling.shape[1]):
+                    out[k, o, f] = bounded(value[f], scaling, f)
             for f in range(len(places)):
                 if places[f] >= 0:
-                    out[k, o, f] = min(max(value[places[f]] * scaling[0, f], scaling[1, f]), scaling[2, f])
+                    out[k, o, f] = bounded(value[places[f]], scaling, f)

@@ -174,7 +174,7 @@ class Rewarding(NamedTuple):
 
     params: RewardParams
     counted: tuple[str, ...]  # names of the terms whose weight is not 0
-    terms: tuple[tuple[str, TermFunction], ...]  # name and function
+    terms: tuple[tuple[str, float, TermFunction], ...]  # name, weight (0: only a component) and function
     shaping: Shaping | None
     components: tuple[str, ...]  # of a vector reward
 
@@ -216,7 +216,7 @@ class Rewarding(NamedTuple):
             **{name: component(name, params.harm_count) for name in components if name not in counted},
         }
         needed = {*counted, *components} - ({"harm"} if whole else set())
-        terms = tuple((name, function) for name, function in functions.items() if name in needed)
+        terms = tuple((n, params.weights.get(n, 0.0), function) for n, function in functions.items() if n in needed)
         shaping = Shaping(rules, params.shaping_discount) if params.shaping else None
         return cls(params, counted, terms, shaping, components), rules
 
@@ -227,18 +227,21 @@ class Rewarding(NamedTuple):
 
     def complete(self, before: State, step: Step, after: State) -> tuple[State, Step]:
         """Return the state with the memory of the reward, and the step with the whole reward."""
-        values = {name: function(before, step, after) for name, function in self.terms}
+        values = {name: function(before, step, after) for name, _, function in self.terms}
         if self.shaping is not None:
             values["shaping"], memory = self.shaping.value(before, step, after)
             after = after._replace(memories={**after.memories, "shaping": memory})
-        extra, weights = np.zeros(step.reward.shape), self.params.weights
-        for name, value in values.items():
-            if name in self.counted:
-                extra += weights[name] * _wide(value)
+        extra = np.zeros(step.reward.shape)
+        for name, weight, _ in self.terms:
+            if weight:
+                extra += weight * _wide(values[name])
+        if self.shaping is not None:
+            extra += self.params.shaping * values["shaping"]
         extra[before.ended] = 0.0
         known = {**self.shared(step), **values}
-        step = step._replace(reward=step.reward + extra, terms={n: v for n, v in known.items() if n in self.counted})
+        step = step._replace(reward=step.reward + extra, terms=known)
         if self.components:
+            step = step._replace(terms={name: known[name] for name in known if name in self.counted})
             vector = np.stack([np.broadcast_to(_wide(known[name]), extra.shape) for name in self.components], axis=2)
             vector[before.ended] = 0.0
             step = step._replace(vector=vector)

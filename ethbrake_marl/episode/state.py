@@ -178,10 +178,9 @@ class State(NamedTuple):
 
     def harm(self, count: str = "first") -> Floats:
         """Return the harm of each world so far, [n] m2/s2. ``count``: ``first`` impact of each pair, or ``total``."""
-        row, harm = TOTAL if count == "total" else FIRST, np.zeros(self.n)
-        for p in range(self.vehicles):
-            harm += self.line[:, row, p]
-        return harm
+        out = np.empty(self.n)
+        _harm(self.line, count == "total", out)
+        return out
 
     def pair_harm(self, count: str = "first") -> Floats:
         """Return the harm of each pair of neighbours so far, [n, N - 1] m2/s2."""
@@ -190,7 +189,7 @@ class State(NamedTuple):
     def borne_harm(self, count: str = "first") -> Floats:
         """Return the harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
         out = np.empty((self.n, self.vehicles))
-        split_harm(self.line[:, TOTAL if count == "total" else FIRST].copy(), self.car[:, MASS].copy(), out)
+        split_harm(self.line[:, TOTAL if count == "total" else FIRST], self.car[:, MASS], out)
         return out
 
 
@@ -210,9 +209,9 @@ def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """Return ``rows`` of a memory, contiguous: a kernel is compiled again for another layout."""
+    """Return ``rows`` of a memory. Those of a slice are copied: a kernel is compiled again for another layout."""
     if isinstance(rows, slice):
-        return mapped(lambda array: np.ascontiguousarray(array[rows]), memory)
+        return mapped(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)
     places = np.flatnonzero(places) if places.dtype == np.bool_ else places
     return mapped(lambda array: array.take(places, axis=0), memory)  # more than twice as fast as array[rows]
@@ -236,6 +235,12 @@ def harm_so_far(line, total):
     for p in range(line.shape[1] - 1):
         harm += line[TOTAL if total else FIRST, p]
     return harm
+
+
+@large
+def _harm(line, total, out):
+    for k in range(len(out)):
+        out[k] = harm_so_far(line[k], total)
 
 
 @kernel

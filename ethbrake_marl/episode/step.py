@@ -198,12 +198,13 @@ def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: I
 
 def advanced(state: State, until_s: Floats) -> State:
     """Return the state at ``until_s`` [n] if all hold ``state.wanted``."""
-    line, clock = state.line.copy(), state.clock.copy()
-    failed = advance_worlds(line, state.car, state.time_s, until_s, state.wanted, scratch_for(line.shape[2]))
+    line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
+    car = np.require(state.car, requirements="CW")  # a kernel is compiled again for others
+    failed = drive_worlds(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
     if failed >= 0:
         raise failure(state, failed, state.time_s[failed], until_s[failed])
     clock[:, TIME] = until_s
-    return state._replace(line=line, clock=clock)
+    return state._replace(line=line, car=car, clock=clock, wanted=wanted)
 
 
 def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
@@ -215,7 +216,7 @@ def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) ->
     state = advanced(alert, first)
     state.clock[:, FIRST_DECISION] = first
     state.clock[:, LAST] = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
-    return state._replace(wanted=alert.wanted.copy())
+    return state
 
 
 def step(
@@ -251,13 +252,16 @@ def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
     shape = n, len(rules.learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
         raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
-    return actions.astype(np.float64, order="C")
+    return np.ascontiguousarray(actions, np.float64)
 
 
 def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
     """Return proposed actions in memory of their own, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for others."""
     actions = numbers_of(rules, actions, n)
-    for row in actions[(np.abs(actions) > LARGEST_ACTION).any(axis=1)]:
+    size = np.abs(actions)
+    if not (size > 1.0).any():
+        return actions.copy()
+    for row in actions[(size > LARGEST_ACTION).any(axis=1)]:
         _check_actions(rules, np.where(np.isnan(row), 0.0, row))
     return np.clip(actions, -1.0, 1.0)
 

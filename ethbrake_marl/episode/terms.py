@@ -132,7 +132,7 @@ def potential(rules: Rules, state: State) -> Floats:
 
 
 class Shaping(NamedTuple):
-    """The term shaping. Its memory in a state is the potential, [n], 0 where the episode has terminated."""
+    """The term shaping. Its memory in a state is the potential, [n], which is 0 at rest and at the horizon."""
 
     rules: Rules
     discount: float
@@ -144,7 +144,6 @@ class Shaping(NamedTuple):
     def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
         """Return the value, [n, N], and the new memory, [n]."""
         new = potential(self.rules, after)
-        new[step.terminated] = 0.0
         value = np.zeros((after.n, after.vehicles))
         value[:, self.rules.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
         return value, new

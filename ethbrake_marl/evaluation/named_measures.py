@@ -123,7 +123,7 @@ def _summed(name: str, term: TermFunction, unit: str) -> Measure:
 def _rewarded(name: str, before: State, step: Step, after: State) -> Values:
     learners, times = np.zeros(0, np.int64), (step.time_step_s, 0.0)
     rewarding, _ = Rewarding.of({"harm": 0.0, name: 1.0}, "total", after.vehicles, learners, times, None)
-    return rewarding.terms[0][1](before, step, after)
+    return rewarding.terms[0][2](before, step, after)
 
 
 def _objective(name: str, game: Game, alert: State, last: State) -> Given:

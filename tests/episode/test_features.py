@@ -11,6 +11,7 @@ import pytest
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import game_of, views_of
 from tests.episode.lines import later, state_of
@@ -167,11 +168,13 @@ def test_role_and_obstacle__are_observed_only_where_there_is_an_obstacle() -> No
     assert {name.partition(".")[0] for name in ahead.names[27:]} == {"role", "obstacle"}
 
 
-@pytest.mark.parametrize(("name", "size"), [("paper-random", 7 * 3 + 2 * 2 + 1), ("cooperation-4-all", 28)])
-def test_full_state__has_every_vehicle_pair_time_and_obstacle(name: str, size: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "size", "steps"), [("paper-random", 7 * 3 + 2 * 2 + 1, 1), ("cooperation-4-all", 28, 15)]
+)
+def test_full_state__has_every_vehicle_pair_time_and_obstacle(name: str, size: int, steps: int) -> None:
     scenario, game = game_of(name)
     state = game.begin(scenario.sample(5, 7))
-    for _ in range(15):
+    for _ in range(steps):
         state, _ = game.step(state, np.full((5, len(game.rules.learners)), -0.5))
     obstacle = scenario.has_obstacle
     features = state_features(scenario.vehicles, scenario.horizon_s, obstacle)
@@ -189,3 +192,19 @@ def test_full_state__has_every_vehicle_pair_time_and_obstacle(name: str, size: i
     np.testing.assert_allclose(columns["time"], state.time_s, rtol=1e-6)
     if obstacle:
         np.testing.assert_allclose(columns["obstacle.gap"], np.minimum(state.obstacle_gap_m, 100.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("listed", "text"),
+    [
+        ([], "must be a list of groups and features"),
+        ("own", "must be a list of groups and features"),
+        ([1], "1: must be the name of a group or of a feature"),
+        (["own", "own.speed"], "own.speed is listed twice"),
+        (["harm_weight"], "describes a neighbour; write front_1.harm_weight"),
+        (["own.sped"], "did you mean 'own.speed'"),
+    ],
+)
+def test_view__refuses_what_is_no_list_of_features(listed: Any, text: str) -> None:
+    with pytest.raises(InvalidInput, match=text):
+        View(listed)

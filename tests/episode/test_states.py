@@ -162,6 +162,20 @@ class Counts:
         return np.zeros(state.n), memory
 
 
+class Eases(Counts):
+    """A script that brakes with 3 m/s2."""
+
+    def act(self, state: State, memory: Any, body: int) -> Any:
+        return np.full(state.n, -3.0), memory
+
+
+def test_script__commands_from_the_alert_on() -> None:
+    _, game = game_of("paper-random")
+    state = game._replace(scripts={1: Eases()}).start(2, 7, 0)
+    assert (state.wanted[:, 1] == -3.0).all()
+    assert state.speeds_mps[:, 0] == pytest.approx(game.draw(2, 7, 0).speeds_mps[:, 0] - 3.0 * state.time_s)
+
+
 def test_memory_of_a_script__cannot_be_changed_in_place_because_plays_share_it() -> None:
     _, game = game_of("paper-random")
     with pytest.raises(AgentFailed, match="vehicle_3: act fails: ValueError: output array is read-only"):

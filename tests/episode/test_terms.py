@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
@@ -111,6 +112,23 @@ def test_terminal__is_paid_once_at_a_safe_end(
         assert bool(step.truncated[0]) == (k == truncated)
         assert step.reward[0].tolist() == [3.0 * (k == when)] * 2
         assert bool(step.safe_end[0]) == (k == when)
+
+
+@pytest.mark.parametrize(("reward", "count"), [("harm", "first"), ("total-harm", "total")])
+def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, count: str) -> None:
+    _, game = game_of("paper-random-obstacle", reward=reward)
+    state, cost = game.start(20, 7, 0), np.zeros(20)
+    while not state.ended.all():
+        state, step = game.step(state, np.full((20, 1), -0.2))
+        cost += arrays(game, state, step, 7, 2)["cost"]
+    infos = [arrays(game, state, step, 7, body) for body in (1, 2, 3)]
+    for name, harms in (("first_impact_harm", state.borne_harm("first")), ("total_harm", state.borne_harm("total"))):
+        assert np.stack([info[name] for info in infos], axis=1) == near(harms)
+    assert (
+        state.line[:, TOTAL, 0].any()
+        and cost == near(state.harm(count))
+        and (state.harm("total") > state.harm("first")).any()
+    )
 
 
 # ---------------------------------------------------------------- shaping
