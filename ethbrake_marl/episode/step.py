@@ -199,7 +199,7 @@ def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: I
 def advanced(state: State, until_s: Floats) -> State:
     """Return the state at ``until_s`` [n] if all hold ``state.wanted``."""
     line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
-    car = np.require(state.car, requirements="CW")  # a kernel is compiled again for others
+    car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others
     failed = drive_worlds(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
     if failed >= 0:
         raise failure(state, failed, state.time_s[failed], until_s[failed])
