@@ -41,7 +41,8 @@ def test_machine_code__is_loaded_until_a_source_changes(tmp_path: Path) -> None:
 
     def ask(factor: float) -> list[str]:
         (tmp_path / "kernels.py").write_text(KERNELS.format(factor=factor))
-        done = subprocess.run([sys.executable, "-c", ASK], env=environment, text=True, capture_output=True, check=True)
+        command = [sys.executable, "-B", "-c", ASK]  # byte code is not made again for a change within a second
+        done = subprocess.run(command, env=environment, text=True, capture_output=True, check=True)
         assert done.stderr == ""
         return done.stdout.split()
 

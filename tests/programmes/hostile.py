@@ -349,6 +349,7 @@ def warm_up(folder: Path) -> None:
         for words in (("scenario", "validate", "mine.yaml"), ("evaluate", "--episodes", "2", "--agents", "ppo")):
             assert run_command(words) == 0, words
     read_states()
+    eb.parallel_env().reset(seed=0)
     put("mine.yaml", RECIPE, folder)
     eb.load_recipe("mine.yaml")
 
