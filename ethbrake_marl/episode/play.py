@@ -1,8 +1,8 @@
-"""What would happen? Two functions answer, with the motion of the episode itself; nothing else is ever asked.
+"""What would happen? Two functions answer, with the motion of the episode itself.
 
-``price``: the harm of every episode that follows a plan, decision by decision. To the last bit this is the harm that
-happens if the plan is followed. ``hold``: the harm if bodies hold constant commands, for many commands, in one piece:
-fast, but rounded differently.
+``played``: the end of every episode that follows a plan, decision by decision; its harm is the plan's ``price``. To the
+last bit this is the harm that happens if the plan is followed. ``hold``: the harm if bodies hold constant commands, for
+many commands, in one piece: fast, but rounded differently.
 """
 
 from __future__ import annotations
@@ -65,7 +65,8 @@ def played(
 
     ``plans`` [n, T, L] are the learners' actions at every decision; the last one repeats. An episode stops where its
     harm is above ``most`` [n]. The harm is infinite where a check of the physics fails. Scripts that look at the state
-    are asked as in the episode. ``donate``: the memory of ``state`` may be reused.
+    are asked as in the episode, which raises ``PhysicsError`` instead. ``donate``: the memory of ``state`` may be
+    reused.
     """
     most = np.full(len(plans), most)
     if game.scripts:

@@ -159,8 +159,11 @@ class SummaryTable(list[SummaryRow]):
     def _below(self) -> str:
         worlds = (
             f"Worlds: {caption(self.parameters)}. Harms are means per world in m²/s². The 95 % interval of a value is"
-            " in brackets or below the value. A decrease is relative to the baseline, by default full braking."
+            " in brackets or below the value."
         )
+        compared = [key for key, (_, statistic) in self.shown.items() if statistic.kind in COMPARE]
+        if any(row[key] is not None for row in self for key in compared):
+            worlds += " A decrease is relative to the baseline, by default full braking."
         return "\n\n".join([worlds, *self.notes()])
 
 

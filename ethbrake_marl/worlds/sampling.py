@@ -156,16 +156,16 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
     drawn = draw_once(scenario, numbers_of(seed, channel, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn
-    pending, rejected = np.flatnonzero(has_early_impact(scenario, drawn.worlds)), 0
-    for attempt in range(1, MOST_ATTEMPTS):
-        rejected += len(pending)
-        if not len(pending):
-            return drawn._replace(rejected=rejected)
+    pending, rejected, attempt = np.flatnonzero(has_early_impact(scenario, drawn.worlds)), 0, 0
+    while len(pending) and attempt < MOST_ATTEMPTS - 1:
+        rejected, attempt = rejected + len(pending), attempt + 1
         again = draw_once(scenario, numbers_of(seed, channel, attempt, index[pending]), index[pending])
         drawn.worlds.put(pending, again.worlds, donate=True)
         for whole, part in zip(drawn[1:5], again[1:5], strict=True):
             whole[pending] = part
         pending = pending[has_early_impact(scenario, again.worlds)]
+    if not len(pending):
+        return drawn._replace(rejected=rejected)
     learners = ", ".join(scenario.vehicle_names[i - 1] for i in scenario.learners)
     gaps = "time_gaps_s" if scenario.gaps_m is None else "gaps_m"
     raise InvalidInput(

@@ -26,15 +26,17 @@ A module imports only from its own folder or from folders that this page lists b
 | question | file |
 |---|---|
 | How does one step of an episode go? | `episode/game.py`, `Game.step`; `episode/step.py`; [the game](../game.md) |
-| What does one impact cost? | `motion/impact.py`; who bears it: `episode/state.py`, `split_harm` |
-| What would happen? | `episode/play.py`: `price` (a plan), `hold` (constant commands) |
+| What does one impact cost? | `motion/impact.py`; who bears it: `episode/state.py`, `split_harm`; in infos: `infos.py` |
+| How does a scenario become a game? | `worlds/`: `catalogue.py`, `game.py`; worlds are drawn in `sampling.py` |
+| How do environments play it? | `faces/face.py`, on `faces/stream.py`: its episodes, drawn again when they end |
+| What would happen? | `episode/play.py`: `played`, `price` (a plan), `hold` (constant commands) |
 | Where does a number in a table come from? | `evaluation/`: `measures.py`, `statistics.py`, `summary.py` |
 | Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/decision.py` |
 | What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
 | Which agents are there? | `pyproject.toml`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
 | Who lets agents drive? | `agents/drive.py`: `play`, `drive` |
 | What can a scenario file say? | `worlds/`: `scenario.py`, `rules.py`; [scenarios](../scenarios.md) |
-| How does a training run? | `training/train.py`, `train`; algorithms in `ppo.py` and `sac.py` |
+| How does a training run? | `training/`: `train.py`, `ppo.py`, `sac.py`; between two updates: `updates.py` |
 | How do I add a column to an evaluation? | [a measure](../extend.md#a-measure) |
 
 From a name to a number, as in `ethbrake evaluate --agents universal`:
@@ -43,6 +45,7 @@ From a name to a number, as in `ethbrake evaluate --agents universal`:
 cli/evaluate.py         evaluate_command
 names.py                teams_of, make_agent; pyproject.toml says: agents/trained.py, make_trained
 policies/bundle.py      load_shipped
+evaluation/compared.py  Compared.of (in Python one begins with the next line)
 evaluation/door.py      evaluate; worlds/sampling.py, draw: the fixed list of worlds
 evaluation/evaluate.py  evaluate, _driven
 agents/drive.py         play, and in each step:
@@ -51,6 +54,7 @@ episode/step.py           step; asked: agents/policy_agent.py, policies/actor.py
 motion/drive.py           drive; motion/impact.py, resolve_impacts: the harm
 evaluation/measures.py  harm: episode/state.py, State.harm
 evaluation/summary.py   summarise; statistics.py, mean
+files/sheet.py          Sheet: columns become text
 ```
 """
 END = """

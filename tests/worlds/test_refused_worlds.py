@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ethbrake_marl.worlds import sampling
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.given import read_worlds, worlds_from_state, worlds_from_table
 from ethbrake_marl.worlds.scenario import Scenario
@@ -19,6 +20,17 @@ COLUMNS = {name: [7, 8, 9] for name in HEADER.split(",")}
 
 # All at 20 m/s: Vehicle 1, braking with 6 m/s2, is 3 m closer to Vehicle 2 at 1 s, when this one may act.
 CLOSE = PAPER.replace(gaps_m=3, speeds_mps=20, latency_s=[0, 1, 1])
+
+
+def test_world__that_the_last_draw_accepts_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenario = PAPER.replace(gaps_m={"uniform": [0.5, 6.0]}, early_impacts="reject")
+    drawn = scenario.draw(1, 7, first=1)
+    assert drawn.rejected == 2
+    monkeypatch.setattr(sampling, "MOST_ATTEMPTS", 3)
+    assert scenario.sample(1, 7, first=1).line.tobytes() == drawn.worlds.line.tobytes()
+    monkeypatch.setattr(sampling, "MOST_ATTEMPTS", 2)
+    with refused("but in all 2 draws of world 1 an impact happens before vehicle_2 can act"):
+        scenario.sample(1, 7, first=1)
 
 
 def read(text: str, scenario: Scenario = PAPER) -> object:
