@@ -26,7 +26,7 @@ A module imports only from its own folder or from folders that this page lists b
 | question | file |
 |---|---|
 | How does one step of an episode go? | `episode/game.py`, `Game.step`; `episode/step.py`; [the game](../game.md) |
-| What does one impact cost? | `motion/impact.py`; who bears it: `episode/state.py`, `split_harm`; in infos: `infos.py` |
+| What does one impact cost? | `motion/impact.py`; who bears it: `state.py`, `split_harm`; in infos: `infos.py` |
 | How does a scenario become a game? | `worlds/`: `catalogue.py`, `game.py`; worlds are drawn in `sampling.py` |
 | How do environments play it? | `faces/face.py`, on `faces/stream.py`: its episodes, drawn again when they end |
 | What would happen? | `episode/play.py`: `played`, `price` (a plan), `hold` (constant commands) |

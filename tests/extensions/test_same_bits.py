@@ -20,4 +20,5 @@ REMAINS = {
 
 
 def test_extensions__call_nothing_that_differs_by_processor_but_what_is_listed() -> None:
-    assert calls_in(PACKAGE / "extensions") == set(REMAINS)
+    here = {each for each in REMAINS if (PACKAGE / "extensions" / each[0]).exists()}
+    assert calls_in(PACKAGE / "extensions") == here and here

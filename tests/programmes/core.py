@@ -30,6 +30,7 @@ OPTIONS = {
 COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefile", "README.md", "pyproject.toml")
 APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
 INSTALLATION = ("test_imports.py",)  # start many processes
+OF_ALL = ("extensions/test_pages.py", "extensions/test_printed.py")  # what all extensions print together
 RUN = "runs/core"
 COMMANDS = {
     "trains PPO on paper-random": ("train", "--steps", "20000", "--output", RUN),
@@ -57,7 +58,7 @@ def cases(given: Given) -> Cases:
 
 def passes(copy: Path, *, whole: bool) -> Told:
     """Run the tests of a copy: all cases, or the first case of each test."""
-    apart = APART if whole else (*APART, *INSTALLATION)
+    apart = APART if whole else (*APART, *INSTALLATION, *OF_ALL)
     how = ["-n", "2", "--dist", "worksteal"] if whole else ["--first-case"]
     return ended(copy, ["-m", "pytest", "-q", *how, *(f"--ignore=tests/{each}" for each in apart), "tests"])
 
