@@ -206,7 +206,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     ``kind`` says what the name should denote, for example ``scenario``. ``may_be_own`` means that users can register
     names of this kind; the message then says that such a name must first be registered or installed.
     """
-    names = sorted(known)
+    names = sorted({*known})
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
     own = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"

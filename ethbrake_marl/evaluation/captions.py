@@ -28,7 +28,8 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
     ranges: dict[str, Any] = {}
     for key, rule in RULES.items():
         names = [name for i in range(len(worlds)) if (name := rule.column_of(i)) in worlds] if rule.column else []
-        ends = [[float(np.nanmin(worlds[name])), float(np.nanmax(worlds[name]))] for name in dict.fromkeys(names)]
+        here = [worlds[name] for name in dict.fromkeys(names) if not np.isnan(worlds[name]).all()]
+        ends = [[float(np.nanmin(each)), float(np.nanmax(each))] for each in here]
         plain = [low if low == high else [low, high] for low, high in ends]
         if plain:
             ranges[key] = plain[0] if rule.per == "world" else plain

@@ -22,8 +22,8 @@ def evaluate(
     agents: Any = "full_brake,e_v2x_bm",
     *,
     scenario: AnyScenario | None = None,
-    episodes: int = EPISODES,
-    seed: int = SEED,
+    episodes: int | None = None,
+    seed: int | None = None,
     harm_count: str = "first",
     measures: Iterable[str] | str = (),
     jobs: int = 1,
@@ -40,8 +40,8 @@ def evaluate(
         agents: names, or a mapping from names of your own to names, agents, or mappings from vehicles to agents:
             ``{"mine": agent, "both": {"vehicle_2": agent, "vehicle_3": "coast"}}``.
         scenario: of the worlds.
-        episodes: number of worlds of the list.
-        seed: of the list.
+        episodes: number of worlds of the list; None: 10,000.
+        seed: of the list; None: 7.
         harm_count: what optimising agents minimise, harm of the ``first`` impact of each pair or ``total``.
         measures: names of measures beside the usual ones (``evaluation.named_measures``).
         jobs: number of processes.
@@ -66,6 +66,9 @@ def evaluate(
         if given is not None:
             raise InvalidInput("evaluate: worlds need their scenario, for instance scenario='paper-random'")
         scenario = "paper-random"
+    if given is not None and (episodes, seed) != (None, None):
+        raise InvalidInput("evaluate: episodes and seed choose worlds of a list; leave them out if worlds are given")
+    episodes, seed = EPISODES if episodes is None else episodes, SEED if seed is None else seed
     loaded, game = open_game(scenario)
     check_learners(loaded)
     about = about_scenario(loaded, None if given is not None else seed)

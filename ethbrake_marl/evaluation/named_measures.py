@@ -85,6 +85,8 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
 
     Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
     """
+    if not isinstance(names, Iterable):
+        raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'injury,sampled_harm'")
     found: dict[str, Measure] = {}
     for name in names.split(",") if isinstance(names, str) else names:
         found |= {measure.name: measure for measure in _called(name)}

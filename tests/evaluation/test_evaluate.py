@@ -426,3 +426,15 @@ def test_what_others_bring__cannot_change_what_happens() -> None:
     for name in ("world", "gap_1_m"):
         with refused(f"measure '{name}': is the name of a column of the worlds"):
             evaluate(worlds, teams(GENTLE), game, [Measure(name, lambda game, alert, last: last.time_s)])
+
+
+def test_evaluate__refuses_measures_that_are_no_names_and_a_list_beside_worlds() -> None:
+    with refused("measures = 5: must be names of measures"):
+        eb.evaluate("paper-random", "coast", episodes=1, measures=5)
+    worlds = eb.load_scenario("paper-random").sample(2, 7)
+    for given in ({"episodes": 1}, {"seed": 3}):
+        with refused("leave them out if worlds are given"):
+            eb.evaluate(worlds, "coast", scenario="paper-random", **given)
+    with pytest.raises(UnknownName) as told:
+        eb.evaluate("paper-random", "coast", episodes=1, measures="harmm")
+    assert str(told.value).count(" injury,") <= 1

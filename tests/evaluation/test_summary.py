@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.evaluate import Result
@@ -207,3 +208,8 @@ def test_lists__stand_below_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
         ["pair"], ["full_brake", "failed", "100.0", "%", "10.8", "9.00", "9.00"],
         ["far"], ["full_brake", "passed", "0.0", "%", "0.0", "0.00", "0.00"],
     ]  # fmt: skip
+
+
+def test_summary__of_one_scenario_of_a_mixture_has_no_range_of_what_is_not_there() -> None:
+    tables = eb.summarise_by(eb.evaluate("mixture-universal", "coast", episodes=8), "scenario")
+    assert any("obstacle_gap_m" not in table.parameters for table in tables.values())

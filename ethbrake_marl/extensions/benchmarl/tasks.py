@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from benchmarl.environments import task_config_registry
-from benchmarl.environments.common import Task
-from hydra.core.config_store import ConfigStore
+from ethbrake_marl.errors import naming_extras
+
+with naming_extras():
+    from benchmarl.environments import task_config_registry
+    from benchmarl.environments.common import Task
+    from hydra.core.config_store import ConfigStore
 
 from ethbrake_marl.extensions.benchmarl.task import LineTask
 from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
