@@ -28,7 +28,7 @@ help:
 	@echo "make venv             make only the environment $(VENV)"
 	@echo "make run [ARGS=...]   train, evaluate and write a report to runs/ (ethbrake run)"
 	@echo "make core [ARGS=...]   check a copy without extensions: tests of the core, training, evaluation, shield"
-	@echo "make test [ARGS=...]  run the tests, except those marked slow or long (.ci/run also runs the slow tests)"
+	@echo "make test [ARGS=...]  run the tests; ARGS=--all also runs the slow ones, as .ci/run does"
 	@echo "make lint             check the code: ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make docs             build the site in docs/_build/html and run its notebooks; a warning is an error"
 	@echo "make figures          make blocks, tables and pictures of README and docs again, and compare them (minutes)"

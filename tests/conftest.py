@@ -63,7 +63,13 @@ def _one_torch_thread() -> None:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--all", action="store_true", help="the slow tests, too, as continuous integration")
     parser.addoption("--first-case", action="store_true", help="of each parametrised test the first case alone")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("all"):
+        config.option.markexpr = "not long"
 
 
 @pytest.hookimpl(trylast=True)  # behind the choice by marks

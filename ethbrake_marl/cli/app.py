@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 from typer.exceptions import TyperException
-from typer.main import get_command
+from typer.main import get_command, get_group
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
@@ -264,5 +264,8 @@ def whole_command() -> Any:
         with_installed(whole.commands[name], name)
     installed = [name for name in points(COMMANDS.group) if "." not in name]
     whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
+    for name in {entry.partition(".")[0] for entry in points(COMMANDS.group)} - whole.commands.keys():
+        group = get_group(typer.Typer(name=name, help="Commands of installed packages.", add_completion=False))
+        whole.commands[name] = with_installed(group, name)
     whole.commands["doctor"] = whole.commands.pop("doctor")  # the last one of the help
     return whole

@@ -103,6 +103,14 @@ def test_entry_point__is_loaded_when_its_name_is_used(install: Install, capsys: 
     assert run_command(["hi", "you"]) == 0 and capsys.readouterr().out == "hello you\n"
 
 
+def test_command__in_a_group_that_nobody_defines_makes_the_group(
+    install: Install, capsys: pytest.CaptureFixture[str]
+) -> None:
+    install("hills", HILLS, commands={"lab.hi": "hills:hello"})
+    assert run_command(["lab", "hi", "you"]) == 0 and capsys.readouterr().out == "hello you\n"
+    assert run_command(["lab", "--help"]) == 0 and "Command of the installed package hills." in capsys.readouterr().out
+
+
 def test_entry_points__of_every_kind_stand_beside_ours(install: Install, capsys: pytest.CaptureFixture[str]) -> None:
     parts = {
         WRAPPERS.group: {"softer": "hills:softer"}, MEASURES.group: {"worst": "hills:WORST"},
