@@ -264,7 +264,8 @@ def whole_command() -> Any:
         with_installed(whole.commands[name], name)
     installed = [name for name in points(COMMANDS.group) if "." not in name]
     whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
-    for name in {entry.partition(".")[0] for entry in points(COMMANDS.group)} - whole.commands.keys():
+    groups = dict.fromkeys(entry.partition(".")[0] for entry in points(COMMANDS.group))
+    for name in (each for each in groups if each not in whole.commands):
         group = get_group(typer.Typer(name=name, help="Commands of installed packages.", add_completion=False))
         whole.commands[name] = with_installed(group, name)
     whole.commands["doctor"] = whole.commands.pop("doctor")  # the last one of the help
