@@ -9,7 +9,7 @@ from ethbrake_marl.progress import Progress, ShownProgress
 
 
 def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *, terminal: bool) -> str:
-    """What is printed of a task that goes on at a quarter, is half done after 4 s, done after 12 s, and followed by another one."""
+    """What is printed of a task that goes on at a quarter, is done after 12 s, and is followed by another one."""
     seconds = iter([0.0, 4.0, 12.0, 13.0])
     monkeypatch.setattr(progress.time, "monotonic", lambda: next(seconds))
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)

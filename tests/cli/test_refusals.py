@@ -50,6 +50,7 @@ EVALUATIONS = [
     ("evaluate --set harm_count=both", "harm_count = 'both': must be 'first' or 'total'"),
     ("evaluate --episodes 100000000000000", "number of worlds = 100000000000000: must be a whole number in 1.."),
     ("evaluate --set recipe.gamma=1", "--set recipe.gamma: this command uses no recipe; remove this setting"),
+    ("train --set observation=own", "--set observation: both scenario and recipe have this key; write scenario."),
     ("evaluate --agents ladder,coast", "agent 'coast' is listed twice; list each agent once"),
     (
         "evaluate --agents ppo@runs/nothing-here",
