@@ -145,6 +145,15 @@ def evaluate(
     for measure in chosen:
         if measure.name in of_worlds:
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")
+    shown: dict[str, Measure] = {}
+    for measure in chosen:
+        for statistic in measure.shown:
+            other = shown.setdefault(statistic.key, measure)
+            if other != measure:
+                raise InvalidInput(
+                    f"measures {other.name!r} and {measure.name!r}: both have the statistic {statistic.key!r}; give one"
+                    " of them another key"
+                )
     calls: Any = (
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
