@@ -22,7 +22,8 @@ def least(game: Game, alert: State) -> dict[str, Floats]:
     if missing:
         raise InvalidInput(
             f"measures limits: scenario {game.name!r}: the least harm of {missing:,} of these"
-            f" {count_of(alert.n, 'world')} is not known; {_where_known(game.name)}; elsewhere compare with the agent best_harm"
+            f" {count_of(alert.n, 'world')} is not known; {_where_known(game.name)}; elsewhere compare with the agent"
+            " best_harm"
         )
     return known
 
