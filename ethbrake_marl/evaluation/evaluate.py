@@ -27,7 +27,7 @@ from ethbrake_marl.worlds.sampling import Drawn
 
 CHUNK = 2_500  # worlds that are driven together, to limit memory
 
-KNOWLEDGE = (SENSORS, MESSAGES, "estimated model", TRUE_STATE, MODEL)  # from little to much
+KNOWLEDGE = (SENSORS, MESSAGES, TRUE_STATE, MODEL)  # from little to much; other words follow in alphabetical order
 UNSTATED = "not stated"
 
 Columns = dict[str, Values]
@@ -236,7 +236,7 @@ def known_by(team: Team) -> str:
     """Return what a team has to know, as one text: ``messages + true model``."""
     each = {getattr(agent, "knows", UNSTATED) for agent in team.drivers.values()}
     each |= {getattr(team.shield, "knows", MODEL)} if team.shield is not None else set()
-    return " + ".join(sorted(each, key=lambda word: (*KNOWLEDGE, word).index(word)))
+    return " + ".join(sorted(each, key=lambda word: ((*KNOWLEDGE, word).index(word), word)))
 
 
 def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:
