@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent, Team, propose
+from ethbrake_marl.agents.drive import MODEL, Agent, propose
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import played
 from ethbrake_marl.episode.state import State, take
@@ -47,6 +47,7 @@ from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.decision import ShieldReason, check_harm_count, check_learners, checked_drivers, spread
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
+from ethbrake_marl.shields.named import NamedShield
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
 
@@ -299,9 +300,4 @@ def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, mo
     return rollout(game, shield.drivers, nominal, plans, shield.count, most), np.zeros(len(plans))
 
 
-def make_step(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team ``TEAM+step``."""
-    return team._replace(shield=StepShield(team.drivers, harm_count=settings.harm_count))
-
-
-STEP = Part(make_step, form="step", about="shield: every action is certified, or replaced", knows=MODEL)
+STEP = Part(NamedShield(StepShield), form="step", about="shield: every action is certified, or replaced", knows=MODEL)

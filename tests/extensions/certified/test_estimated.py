@@ -287,14 +287,14 @@ def test_a_role_is_the_same_agent_as_a_driver() -> None:
 
 
 def test_the_environment_says_that_the_bound_is_of_the_estimate() -> None:
-    env = eb.shield(eb.parallel_env("cooperation-2-blocked"), mode="estimated", corners=True)
+    env = eb.shield(eb.parallel_env("cooperation-2-blocked"), mode="robust:estimated")
     info = env.reset(seed=7)[1]["vehicle_2"]
     bound = info["shield_bound_harm"]
     while env.agents:
         info = env.step({"vehicle_2": [0.0]})[4]["vehicle_2"]
     assert np.isfinite(bound) and isinstance(info["shield_trusted"], bool)
-    team = eb.shield(eb.make_agent("coast"), mode="estimated", scenario="cooperation-2-blocked")
-    assert team.name == "coast+estimated" and team.shield.lines.alert.n == 1
+    team = eb.shield(eb.make_agent("coast"), mode="step:estimated", scenario="cooperation-2-blocked")
+    assert team.name == "coast+step:estimated" and team.shield.lines.alert.n == 1
 
 
 def test_latencies_that_are_over__are_not_waited_for_again() -> None:
@@ -316,7 +316,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "has 2 learners; an estimated shield needs exactly one": lambda: eb.make_agent(
         "coast+step:estimated", scenario="cooperation-3-pair"
     ),
-    "nothing but estimated can follow the colon": lambda: eb.make_agent("coast+step:gaps_m=1:estimated", scenario=BASE),
+    "'gaps_m=1' cannot follow the colon": lambda: eb.make_agent("coast+step:gaps_m=1:estimated", scenario=BASE),
     "must be e_v2x_bm:estimated or e_v2x_bm:pairwise:estimated": lambda: eb.make_agent(
         "e_v2x_bm:coupled:estimated", scenario=BASE
     ),

@@ -234,8 +234,11 @@ def test_uncertainty__as_a_text_is_refused(text: str) -> None:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "ppo+robust': needs intervals, for instance ppo+robust:braking": lambda: eb.make_agent(
+    "uncertainty = None: must be a text, for instance 'braking_capacity": lambda: eb.make_agent(
         "ppo+robust", scenario=PAPER
+    ),
+    "shield 'ppo+robust:gaps_m=1': 'gaps_m=1' cannot follow the colon": lambda: eb.shield(
+        eb.Team("ppo", {}), mode="robust:gaps_m=1", uncertainty="mass_t=1"
     ),
     "uncertainty = 0.1: must be a text": lambda: RobustShield(uncertainty=0.1),
     "the first decision may be as late as 1000.5 s": lambda: first(PAPER, uncertainty="latency_s.vehicle_2=1000"),
@@ -262,8 +265,3 @@ def test_capacity__is_that_on_the_road() -> None:
     assert members("braking_capacity_mps2.vehicle_2=10%", wet).car[:, BRAKING, 2] == pytest.approx(
         3.924 * np.array([1.0, 0.9, 1.1])
     )
-
-
-def test_mode__says_which_option_it_needs() -> None:
-    with refused("shield: mode 'robust': missing a required argument: 'uncertainty'"):
-        eb.shield(eb.parallel_env("paper-random"), mode="robust")
