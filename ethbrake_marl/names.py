@@ -339,11 +339,20 @@ def open_game(
     observation: Any = None,
     reward_vector: Any = None,
 ) -> tuple[Scenario, Game]:
-    """Return a scenario and its game, in which roles that name agents are played by these (``worlds.game.game_of``)."""
+    """Return a scenario and its game, in which roles that name agents are played by these.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
+        learners: names of the vehicles that learn; None: the scenario's.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: features of all vehicles, or vehicle -> features; None: the scenario's.
+        reward_vector: components of a vector reward (``episode.terms``).
+
+    """
     loaded = load_scenario(scenario)
     if learners is not None:
         loaded = loaded.with_learners(learners)
-    return game_of(loaded, None, reward, observation, reward_vector, scripts_of(loaded))
+    return game_of(loaded, scripts_of(loaded), reward, observation, reward_vector)
 
 
 def check_learners(scenario: Scenario) -> None:

@@ -16,11 +16,10 @@ from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 from ethbrake_marl.names import open_game, register_agent
 from ethbrake_marl.shields.step import StepShield
-from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 
-PAPER, GAME = game_of("paper-random")
-PAIR = game_of("cooperation-3-pair")
+PAPER, GAME = open_game("paper-random")
+PAIR = open_game("cooperation-3-pair")
 
 
 class Counting:

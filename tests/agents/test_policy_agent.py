@@ -32,13 +32,13 @@ from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.motion.layout import BRAKING, DRIVING
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.step import StepShield
-from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 
-PAPER, GAME = game_of("paper-random")
-OBSTACLE = game_of("paper-random-obstacle")
+PAPER, GAME = open_game("paper-random")
+OBSTACLE = open_game("paper-random-obstacle")
 WORLDS = PAPER.sample(12, 7)
 PPO = load_shipped("ppo")
 OTHERS = ["own", "rear_1", "front_1"]  # as many features as the usual ones
@@ -249,7 +249,7 @@ def test_onnx__observes_what_its_metadata_name() -> None:
 
 @pytest.mark.parametrize("given", [brake, small_net()], ids=["function", "torch module"])
 def test_policy_that_says_nothing__is_asked_for_its_features_where_they_are_not_the_usual_ones(given: Any) -> None:
-    own = game_of("paper-random", observation=OTHERS)
+    own = open_game("paper-random", observation=OTHERS)
     for scenario, game in (OBSTACLE, own):
         with refused("nothing says which features the policy observes, and vehicle_2 of scenario 'paper-random"):
             harms(policy_agent(given), game, scenario.sample(3, 7))

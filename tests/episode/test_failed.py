@@ -12,7 +12,7 @@ from ethbrake_marl.episode.play import hold, price
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.layout import GAP, SPEED
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 
 N, PLANTED = 5, 3
 
@@ -26,7 +26,7 @@ def planted(state: State) -> State:
 
 @pytest.fixture
 def game() -> Game:
-    return game_of("paper-random")[1]
+    return open_game("paper-random")[1]
 
 
 def test_step__names_world_and_time_and_changes_nothing(game: Game) -> None:
