@@ -134,15 +134,15 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
 def step_worlds(
     line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, horizon_s, harm, terminal, total
 ):
-    """Advance every running episode by one step, in place; return the row of a world that failed, otherwise -1.
+    """Advance every running episode by one step, in place; return the row of a refused action and of a failed world.
 
-    For an action that is no number in [-1, 1] its row is returned, and nothing has moved.
+    -1: there is none. An action is refused if it is no number in [-1, 1]; then nothing has moved.
     """
     n, bodies = wanted.shape
     for k in range(n):
         for c in range(learners.shape[0]):
             if not -LARGEST_ACTION <= actions[k, c] <= LARGEST_ACTION:
-                return k
+                return k, -1
     failed = -1
     for k in range(n):
         for row in range(out.shape[0]):
@@ -168,7 +168,7 @@ def step_worlds(
         shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * out[TOTAL_HARM if total else HARM, k]
         for i in range(bodies - 1):
             reward[k, i] = shared
-    return failed
+    return -1, failed
 
 
 @large
@@ -240,9 +240,11 @@ def step(
     for i, command_mps2 in commands.items():
         np.copyto(wanted[:, i], command_mps2, where=running)
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
-    failed = step_worlds(line, car, clock, wanted, actions, scratch_for(wanted.shape[1]), out, reward, *rules)
+    scratch = scratch_for(wanted.shape[1])
+    refused, failed = step_worlds(line, car, clock, wanted, actions, scratch, out, reward, *rules)
+    if refused >= 0:
+        _check_actions(rules, actions[refused])
     if failed >= 0:
-        _check_actions(rules, actions[failed])
         raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
 
