@@ -260,11 +260,12 @@ def split_world(pair_harm, mass, borne):
 
     ``pair_harm`` [N + 1] is the harm of each pair (m2/s2), ``mass`` [N + 1] the mass of each body (t).
     """
-    borne[:] = 0.0
+    rear = 0.0
     for p in range(1, len(borne)):
         front = front_share(pair_harm[p], mass[p], mass[p + 1])
-        borne[p - 1] += front
-        borne[p] += pair_harm[p] - front
+        borne[p - 1] = rear + front
+        rear = pair_harm[p] - front
+    borne[len(borne) - 1] = rear
     borne[0] += pair_harm[0]
 
 
