@@ -56,7 +56,7 @@ class Step(NamedTuple):
     >>> import numpy as np
     >>> import ethbrake_marl as eb
     >>> scenario, game = eb.open_game("paper-random", reward={"harm": 1.0, "risk": 0.05})
-    >>> _, step = game.step(game.begin(scenario.sample(2, seed=7)), np.zeros((2, 1)))
+    >>> _, step = game.step(game.reset(scenario.sample(2, seed=7)), np.zeros((2, 1)))
     >>> step.terminated, step.first_impact_harm, [*step.terms]
     (array([False, False]), array([0., 0.]), ['harm', 'risk'])
 
@@ -207,7 +207,7 @@ def advanced(state: State, until_s: Floats) -> State:
     return state._replace(line=line, car=car, clock=clock, wanted=wanted)
 
 
-def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
+def first_decision(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
     """Return episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
 
     Until then ``alert.wanted`` is commanded.
@@ -268,7 +268,7 @@ def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
     return np.clip(actions, -1.0, 1.0)
 
 
-def begun(script: Any, alert: State, body: int) -> Any:
+def begin(script: Any, alert: State, body: int) -> Any:
     """Return the memory of a script for new episodes. Raises ``AgentFailed`` if the script raises something."""
     return _remembered(script, _called(script, "begin", alert, body), alert.n, body)
 

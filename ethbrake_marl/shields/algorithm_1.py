@@ -19,7 +19,7 @@ from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import begun
+from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
@@ -70,7 +70,7 @@ class EpisodeShield:
         """Return the memory at the first decision ``state``, with the driver of each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
-        remembered = begun(game.agents({body: agent})[body], alert, body)
+        remembered = begin(game.agents({body: agent})[body], alert, body)
         known = alert._replace(wanted=state.wanted)
         choice = coupled(known, body, self.count, game.rules.horizon_s) if self.coupled else pairwise(known, body)
         backup = to_action(alert, body, -choice.deceleration_mps2)[:, np.newaxis]

@@ -158,7 +158,7 @@ def test_commands_and_actions__are_each_others_inverse_and_clipped() -> None:
 
 
 def test_proposals__stand_in_the_order_of_the_drivers() -> None:
-    state = PAIR[1].start(3, 1, 0)
+    state = PAIR[1].reset(PAIR[1].draw(3, 1, 0))
     drivers = {2: Held("full_brake"), 3: Held("coast")}
     actions, after = propose(drivers, state, {body: agent.begin(state, body) for body, agent in drivers.items()})
     assert (actions == [[-1.0, 0.0]] * 3).all() and set(after) == {2, 3}

@@ -19,7 +19,7 @@ BEYOND = float(np.nextafter(np.float32(1), np.float32(2)))
 
 def stepped(*action: float) -> State:
     _, game = open_game(PAIR)
-    return game.step(game.start(1, 0, 0), np.array([action]))[0]
+    return game.step(game.reset(game.draw(1, 0, 0)), np.array([action]))[0]
 
 
 @pytest.mark.parametrize(
@@ -49,4 +49,4 @@ def test_action__further_beyond_is_refused() -> None:
 def test_actions__of_another_shape_or_kind_are_refused(actions: object) -> None:
     _, game = open_game(PAIR)
     with pytest.raises(InvalidInput, match=r"must be an array of numbers with the shape \(1, 2\)"):
-        game.step(game.start(1, 0, 0), actions)  # type: ignore[arg-type]
+        game.step(game.reset(game.draw(1, 0, 0)), actions)  # type: ignore[arg-type]

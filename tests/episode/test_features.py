@@ -174,7 +174,7 @@ def test_role_and_obstacle__are_observed_only_where_there_is_an_obstacle() -> No
 )
 def test_full_state__has_every_vehicle_pair_time_and_obstacle(name: str, size: int, steps: int) -> None:
     scenario, game = open_game(name)
-    state = game.begin(scenario.sample(5, 7))
+    state = game.reset(scenario.sample(5, 7))
     for _ in range(steps):
         state, _ = game.step(state, np.full((5, len(game.rules.learners)), -0.5))
     obstacle = scenario.has_obstacle

@@ -197,7 +197,7 @@ OBJECTIVES = ["total", "own", "social:30", "maximin", "mass-weighted", "weighted
 @pytest.mark.parametrize("objective", [*OBJECTIVES, ["total", "own", "social:45"]], ids=str)
 def test_rewards__add_up_to_minus_the_objective_of_the_last_state(objective: Any, count: str) -> None:
     scenario, game = open_game("paper-random", reward={"harm": 1.0, "objective": objective, "harm_count": count})
-    state, total = game.begin(scenario.sample(40, 4)), np.zeros((40, 3))
+    state, total = game.reset(scenario.sample(40, 4)), np.zeros((40, 3))
     actions = np.random.default_rng(2).uniform(-1.0, 0.0, (40, 1))
     while not state.ended.all():
         state, step = game.step(state, actions)

@@ -106,7 +106,7 @@ def test_terminal__is_paid_once_at_a_safe_end(
     scenario: Scenario, action: float, when: int | None, truncated: int | None
 ) -> None:
     _, game = open_game(scenario, reward={"harm": 0.0, "terminal": 3.0})
-    state = game.start(1, 0, 0)
+    state = game.reset(game.draw(1, 0, 0))
     for k in range(11):
         state, step = game.step(state, np.full((1, 1), action))
         assert bool(step.truncated[0]) == (k == truncated)
@@ -117,7 +117,7 @@ def test_terminal__is_paid_once_at_a_safe_end(
 @pytest.mark.parametrize(("reward", "count"), [("harm", "first"), ("total-harm", "total")])
 def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, count: str) -> None:
     _, game = open_game("paper-random-obstacle", reward=reward)
-    state, cost = game.start(20, 7, 0), np.zeros(20)
+    state, cost = game.reset(game.draw(20, 7, 0)), np.zeros(20)
     while not state.ended.all():
         state, step = game.step(state, np.full((20, 1), -0.2))
         cost += arrays(game, state, step, 7, 2)["cost"]
@@ -138,7 +138,7 @@ def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, coun
 def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount: float) -> None:
     reward = {"harm": 0.0, "shaping": 1.0, "shaping_discount": discount}
     scenario, game = open_game("paper-random", reward=reward)
-    state = game.begin(scenario.sample(50, 7))
+    state = game.reset(scenario.sample(50, 7))
     tried = state.car[:, BRAKING, [2]] * -np.linspace(0.0, 1.0, 9)
     least = hold(state, -state.car[:, BRAKING], [2], tried[:, :, np.newaxis], scenario.horizon_s, "first")[0].min(
         axis=1
@@ -178,14 +178,14 @@ def test_components__of_a_step_by_hand() -> None:
 
 def test_components__of_vehicles_add_up_to_the_reward() -> None:
     _, game = open_game("cooperation-4-all", reward="harm", reward_vector="vehicles")
-    state = game.start(30, 1, 0)
+    state = game.reset(game.draw(30, 1, 0))
     while not state.ended.all():
         state, step = game.step(state, np.full((30, len(game.rules.learners)), -0.2))
         assert step.vector is not None and step.vector.shape == (30, 3, 3)
         assert step.vector.sum(axis=2) == near(step.reward, abs=1e-9)
     assert state.collided.any()
     _, game = open_game("paper-random", reward="harm", reward_vector=["harm", "harm_2"])
-    _, step = game.step(game.start(3, 1, 0), np.zeros((3, 1)))
+    _, step = game.step(game.reset(game.draw(3, 1, 0)), np.zeros((3, 1)))
     assert step.vector is not None and step.vector.shape == (3, 3, 2) and [*step.terms] == ["harm"]
 
 
@@ -195,7 +195,7 @@ def test_components__of_vehicles_add_up_to_the_reward() -> None:
 def rewards(reward: Any, scenario: Any = "paper-random", n: int = 40) -> tuple[np.ndarray, State]:
     """Return the sum of rewards of each vehicle, and the last state."""
     loaded, game = open_game(scenario, reward=reward)
-    state, total = game.begin(loaded.sample(n, 4)), np.zeros((n, 3))
+    state, total = game.reset(loaded.sample(n, 4)), np.zeros((n, 3))
     actions = np.random.default_rng(2).uniform(-1.0, 0.0, (n, 1))
     while not state.ended.all():
         state, step = game.step(state, actions)

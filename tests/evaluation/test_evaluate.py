@@ -344,7 +344,7 @@ class Wild(Careless):
 def refusals() -> dict[str, Any]:
     scenario, game = open_game("paper-random")
     drawn, mine = scenario.draw(3, 7), teams(FULL_BRAKE)
-    begun = game.begin(drawn.worlds)
+    begun = game.reset(drawn.worlds)
     pair = open_game(open_game("cooperation-2-five")[0])[0].draw(2, 7)
     local, wrong = Careless(), Team("x", {1: FULL_BRAKE})
     local.lock = threading.Lock()  # type: ignore[attr-defined]

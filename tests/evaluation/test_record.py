@@ -68,7 +68,7 @@ def test_record__that_is_refused() -> None:
     with refused("record_episode: world has 2 worlds; pass exactly 1"):
         record_episode(worlds, team, game)
     with refused("pass exactly 1 at the alert"):
-        record_episode(game.begin(worlds.take([0])), team, game)
+        record_episode(game.reset(worlds.take([0])), team, game)
     for bad in (0.0, -1.0, np.inf, np.nan, "1"):
         with refused("must be a finite number of seconds above 0"):
             record_episode(worlds.take([0]), team, game, bad)  # type: ignore[arg-type]

@@ -35,7 +35,7 @@ def test_shield__is_not_worse_than_recorded(
     learners, rng = game.rules.learners.tolist(), np.random.default_rng(0)
     drivers: Any = dict.fromkeys(learners, LearnedAgent(load_shipped("ppo"))) if way == "ppo" else None
     game = game._replace(shield=StepShield(drivers, harm_count=count))
-    state, shape = game.begin(scenario.sample(N, 7)), (N, len(learners))
+    state, shape = game.reset(scenario.sample(N, 7)), (N, len(learners))
     while not state.ended.all():
         drawn = rng.uniform(-1.0, 1.0, shape)
         actions = {"random": drawn, "drive": np.ones(shape), "brake": -np.ones(shape), "ppo": None}[way]

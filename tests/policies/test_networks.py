@@ -165,7 +165,7 @@ def test_onnx__asks_for_the_same_acceleration(kind: str) -> None:
         tensors["policy.output.weight"] *= np.float32(3.0)  # so that some actions reach the bounds
     policy = Policy.make(tensors, network=spec, observation=View(), **FIELDS)
     scenario, game = open_game("paper-random")
-    state = game.begin(scenario.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5))
+    state = game.reset(scenario.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5))
     seen = View().observe(state, np.array([2]), 0.1)[:, 0]
     expected, _ = LearnedAgent(policy).act(state, None, 2)
     session = onnxruntime.InferenceSession(policy.to_onnx(), providers=["CPUExecutionProvider"])

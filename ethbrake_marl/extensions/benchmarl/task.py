@@ -98,10 +98,10 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         """Start the next episode in all worlds, or in those where the mask ``_reset`` in ``tensordict`` is True."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            self.episode = self.stream.draw(self.batch_size[0])
+            self.episode = self.stream.next_episodes(self.batch_size[0])
         else:
             rows = np.flatnonzero(mask.numpy().reshape(-1))
-            self.episode = self.episode.put(rows, self.stream.draw(len(rows)), donate=True)
+            self.episode = self.episode.put(rows, self.stream.next_episodes(len(rows)), donate=True)
         return TensorDict(self._observe(), batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:

@@ -67,7 +67,7 @@ class EstimatedShield(MembersShield):
         """Return the memory at the first decision ``state``."""
         lines, possible, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
         median = lines.take(np.arange(0, lines.n, self.lines.alert.n))
-        memory = self.start(game, median, median, lines, self.agents_at(game, alert))
+        memory = self.first_memory(game, median, median, lines, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(lines, state.n), possible))
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:

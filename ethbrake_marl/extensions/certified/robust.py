@@ -109,7 +109,7 @@ class RobustShield(MembersShield):
                 f"uncertainty: {self.uncertainty}: the first decision may be as late as {states.time_s.max():g} s; must"
                 f" be before the horizon, {game.rules.horizon_s:g} s"
             )
-        memory = self.start(game, alert, state, states, self.agents_at(game, alert))
+        memory = self.first_memory(game, alert, state, states, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
@@ -122,7 +122,7 @@ class RobustShield(MembersShield):
 
 def opened(game: Game, alerts: State) -> State:
     """Return worlds at their first decision."""
-    return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).begin(alerts)
+    return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).reset(alerts)
 
 
 def apart(states: State, n: int) -> State:

@@ -28,7 +28,7 @@ def lines_at(scenario: eb.Scenario, n: int = 20, steps: int = 0, action: float =
     """The median lines of Vehicle 2, the true state, and the lines, after some steps."""
     loaded, game = eb.open_game(scenario)
     lines, alert = Lines.of(loaded, 2, corners=False), loaded.sample(n, 7)
-    state = game.begin(alert)
+    state = game.reset(alert)
     median = lines.heard(state, opened(game, lines.at_alert(alert, state)))[0]
     for _ in range(steps):
         state = game.step(state, np.full((n, 1), action))[0]
@@ -150,7 +150,7 @@ def test_true_corners__do_at_most_the_first_bound_to_the_bit(name: str, count: s
 def test_news_remove_corners__and_the_bound_falls() -> None:
     loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
     game = game._replace(shield=EstimatedShield(scenario=loaded, corners=True))
-    state, fell = game.begin(loaded.sample(12, 7)), 0
+    state, fell = game.reset(loaded.sample(12, 7)), 0
     for _ in range(12):
         before, heard = state.memories["shield"], state.know[:, 2, 3] <= state.time_s
         state, _ = game.step(state, np.full((12, 1), np.nan))
@@ -166,7 +166,7 @@ def test_news__never_make_the_shield_drop_a_better_plan() -> None:
     loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
     shield = EstimatedShield(scenario=loaded, corners=True)
     game = game._replace(shield=shield)
-    state = game.begin(loaded.sample(6, 7))
+    state = game.reset(loaded.sample(6, 7))
     bound, plan = state.memories["shield"].price, state.memories["shield"].plan
     shield.plans = lambda game, median, *states: [np.ones((median.n, *plan.shape[1:]))]  # type: ignore[method-assign]
     for _ in range(8):
@@ -197,7 +197,7 @@ def test_where_everything_is_known__the_bound_is_that_of_step_mode(corners: bool
     loaded, game = eb.open_game(BASE)
     alert = loaded.sample(20, 7)
     found = attacked(game, alert, EstimatedShield(scenario=loaded, corners=corners), "first", "random", 0)
-    plain = game._replace(shield=eb.shield(eb.make_agent("coast"), scenario=BASE).shield).begin(alert)
+    plain = game._replace(shield=eb.shield(eb.make_agent("coast"), scenario=BASE).shield).reset(alert)
     assert found.above == 0 and found.trusted.all() and (found.first <= found.first.max()).all()
     np.testing.assert_allclose(np.minimum(found.first, plain.memories["shield"].first + 0.01), found.first)
 

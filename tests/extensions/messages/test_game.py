@@ -41,7 +41,7 @@ class Follower:
 def test_script__acts_on_what_its_vehicle_believes() -> None:
     script = Follower()
     _, game = game_of(LINE.replace(v2x=PERIODIC), {3: script})
-    state = game.start(1, 7, 0)
+    state = game.reset(game.draw(1, 7, 0))
     for _ in range(8):
         expected = believed(state, 3)
         state = stepped(game, state, -1.0)
@@ -53,7 +53,7 @@ def test_script__acts_on_what_its_vehicle_believes() -> None:
 @pytest.mark.parametrize("v2x", [PERIODIC, {**PERIODIC, "tells": ["place"]}], ids=["usual", "place"])
 def test_price__is_the_harm_of_the_plan_to_the_bit(v2x: dict[str, Any]) -> None:
     _, game = game_of(PAPER.replace(v2x=v2x), {3: Follower()})
-    state, rng = game.start(40, 3, 0), np.random.default_rng(1)
+    state, rng = game.reset(game.draw(40, 3, 0)), np.random.default_rng(1)
     for _ in range(3):
         state, _ = game.step(state, np.full((40, 1), -0.4))
     plans = rng.uniform(-1.0, 1.0, (40, 5, 1))
@@ -71,10 +71,10 @@ def test_script__that_needs_a_missing_piece_is_refused() -> None:
 
     _, game = game_of(LINE.replace(v2x={"tells": {"vehicle_2": ["place"]}}), {3: Heavy()})
     with refused("script of vehicle_3: messages of vehicle_2 do not contain its speed (key v2x.tells), but place,"):
-        game.start(1, 7, 0)
+        game.reset(game.draw(1, 7, 0))
     _, game = game_of(LINE.replace(v2x={"tells": {}} | PERIODIC | {"tells": ["place", "mass"]}), {3: Heavy()})
     with refused("script of vehicle_3: messages of vehicle_1 do not contain its speed"):
-        game.start(1, 7, 0)
+        game.reset(game.draw(1, 7, 0))
 
 
 def test_require_pieces__of_who_looks_ahead() -> None:
@@ -87,7 +87,7 @@ def test_require_pieces__of_who_looks_ahead() -> None:
     with refused("pair: messages of vehicle_2 do not contain its place"):
         require_pieces(state, [2, 3], "pair", ["place"])
     _, plain = open_game(LINE)
-    require_pieces(plain.start(1, 7, 0), [2], "e_v2x_bm")
+    require_pieces(plain.reset(plain.draw(1, 7, 0)), [2], "e_v2x_bm")
 
 
 def test_feature_of_another_package__is_unknown_where_it_needs_a_missing_piece() -> None:
@@ -113,7 +113,7 @@ def test_infos__tell_when_news_counts_and_how_old_it_is() -> None:
     *_, infos = env.step({"vehicle_2": np.array([-1.0], np.float32)})
     assert infos["vehicle_2"]["age_s_vehicle_1"] == pytest.approx(0.2)
     _, game = open_game(LINE.replace(v2x={"tells": ["place"]}))
-    assert set(game.own_infos(game.start(1, 7, 0))) == set(names[:3])
+    assert set(game.own_infos(game.reset(game.draw(1, 7, 0)))) == set(names[:3])
 
 
 def test_usual_contents__written_out_change_no_bit_of_an_observation() -> None:
