@@ -21,6 +21,7 @@ STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehic
 MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
 
 NOBODY = np.zeros(0, np.int64)
+CHUNK = 2_500  # worlds of a list that are driven together, to limit memory
 
 
 class Agent(Script, Protocol):
