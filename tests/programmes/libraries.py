@@ -320,11 +320,11 @@ def run(library: str, function: str, given: Given) -> Told:
     status, told = watched([str(python), "-W", "ignore", "-c", call], limit, **variables)
     if status is None:
         return Told(None if limit < given.limit else False, f"not finished after {limit:.0f} s")
-    last = (told.strip().splitlines() or [""])[-1]
+    lines = told.strip().splitlines() or [""]
     if status:
-        return Told(False, f"exit status {status}: {last}")
-    cells = json.loads(last)
-    return Told(True, "  ".join(filter(None, cells)))
+        return Told(False, f"exit status {status}: {lines[-1]}")
+    row = next(line for line in reversed(lines) if line.startswith('["'))  # a library may print something after it
+    return Told(True, "  ".join(filter(None, json.loads(row))))
 
 
 def lowered(title: str) -> str:
