@@ -128,6 +128,10 @@ class StepShield:
             harm[(last.borne_harm(self.count) > caps).any(axis=1)] = np.inf
         return harm
 
+    def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
+        """Return the plans if the shield's agents drive on from the nominal ``state``, as long as harm <= ``most``."""
+        return rollout(game, self.drivers, state, plans, self.count, most)
+
     def bound(self, memory: Memory) -> Floats:
         """Return the bound on the harm of each episode, [n] m2/s2."""
         return np.maximum(memory.price, memory.first + self.allowance) if self.allowance else memory.price
@@ -152,7 +156,7 @@ class StepShield:
         caps = played(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
         if agents:
             check_learners(game, agents)
-            own = rollout(game, self.drivers, state._replace(memories={**state.memories, **agents}), plan, self.count)
+            own = self.rolled_out(game, state._replace(memories={**state.memories, **agents}), plan)
             value = self.price(game, states, own, caps=caps)
             better = value <= harm
             plan[better], harm[better] = own[better], value[better]
@@ -297,7 +301,7 @@ def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
     """Fallback: the shield's own agents drive on, from the nominal state."""
     nominal = after if after.n == len(plans) else after.take(np.arange(0, after.n, after.n // len(plans)))
-    return rollout(game, shield.drivers, nominal, plans, shield.count, most), np.zeros(len(plans))
+    return shield.rolled_out(game, nominal, plans, most), np.zeros(len(plans))
 
 
 STEP = Part(NamedShield(StepShield), form="step", about="shield: every action is certified, or replaced", knows=MODEL)

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS
@@ -244,6 +245,17 @@ class Lines(NamedTuple):
         if body > 1:
             line[:, HIT, 0] = np.where(pieces[:, 1, P_PLACE], news[:, OBSTACLE_HIT, 1], line[:, HIT, 0])
         return lines._replace(line=line, car=car, wanted=wanted)
+
+
+def without_channel(game: Game, lines: State) -> tuple[Game, State]:
+    """Return the game and its lines as if everybody knew everything: for agents that drive in an estimated line.
+
+    Each vehicle's own latency is then over when it reacts. When the truth would be received is not known in a line.
+    """
+    car = lines.car.copy()
+    car[:, OWN_LATENCY] = car[:, LATENCY]
+    memories = {name: memory for name, memory in lines.memories.items() if name != NAME}
+    return Game._make(game), lines._replace(car=car, know=np.zeros_like(lines.know), memories=memories)
 
 
 def in_order(place: Floats, known: Bools) -> Floats:

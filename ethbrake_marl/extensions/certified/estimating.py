@@ -27,7 +27,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines
+from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines, without_channel
 from ethbrake_marl.extensions.certified.robust import Members, MembersShield, apart, joined, opened
 from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
@@ -80,6 +80,10 @@ class EstimatedShield(MembersShield):
         state = state._replace(memories={**state.memories, "shield": memory})
         return super().decide(game, state, proposed, donate=donate)
 
+    def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
+        """Return the plans if the shield's agents drive on in the median line, where they know everything."""
+        return super().rolled_out(*without_channel(game, state), plans, most)
+
     def planned_again(self, game: Game, memory: Memory, lines: State, rows: Ints) -> Memory:
         """Return the memory in which the worlds ``rows`` hold the cheapest of their plan and new first plans."""
         here = part(lines, rows, self.lines.alert.n)
@@ -118,6 +122,7 @@ class EstimatedEpisodeShield(EpisodeShield):
     def begin(self, game: Game, alert: State, state: State) -> EpisodeMemory:
         """Return the memory at the first decision ``state``."""
         median, _, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
+        game, median = without_channel(game, median)
         return super().begin(game, median, median)
 
 
