@@ -71,7 +71,6 @@ COMMANDS = (
     Call(("ethbrake", "--version")),
     Call(("ethbrake", "evaluate", "--agents", SHIPPED, "--episodes", "200")),
     Call(("ethbrake", "evaluate", "--agents", "full_brake,ppo+step", "--episodes", "20", "--json")),
-    Call(("ethbrake", "shield", "--agents", "ppo", "--episodes", "20")),
     Call(("ethbrake", "watch", "--output", "film.png")),
     Call(("ethbrake", "scenario", "validate", "paper-random")),
     Call(("ethbrake", "doctor")),
