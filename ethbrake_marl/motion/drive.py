@@ -13,6 +13,7 @@ from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
 from ethbrake_marl.motion.forces import acts, force_now, force_range, plan_force, settle
 from ethbrake_marl.motion.impact import pool, resolve_impacts
+from ethbrake_marl.motion.push import push
 from ethbrake_marl.motion.layout import (
     ACCELERATION,
     ACTIVE,
@@ -309,6 +310,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
                 break
             parting = accelerate(line, car, scratch, ahead, builds)
             passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
+            push(line, car, scratch, passed, ahead)
             if not move(line, scratch, passed, ahead, builds):
                 break
             for i in range(ahead, bodies):

@@ -80,15 +80,15 @@ def stepped(runs: Runs, step_s: float) -> Floats:
         out[k, at.SPEED, 1:], out[k, at.FORCE, 1:] = end.speeds, end.forces
         out[k, at.GAP, 1:-1] = end.gaps[1:]
         out[k, at.GAP, 0] = min(end.gaps[0], at.FAR_M)
-        out[k, [at.HIT, at.FIRST, at.TOTAL, at.COUNT], :-1] = end.book
+        out[k, [at.HIT, at.FIRST, at.TOTAL, at.COUNT, at.PUSHED], :-1] = end.book
         if not end.finished:
             out[k] = np.nan
     return out
 
 
 def differences(one: Floats, other: Floats) -> Floats:
-    """Return the largest relative difference of each world in speeds, forces, gaps and both counts of harm, [n]."""
-    rows = [at.SPEED, at.FORCE, at.GAP, at.FIRST, at.TOTAL]
+    """Return the largest relative difference of each world in speeds, forces, gaps, both counts of harm and pushes, [n]."""
+    rows = [at.SPEED, at.FORCE, at.GAP, at.FIRST, at.TOTAL, at.PUSHED]
     a, b = (np.minimum(line[:, rows, :-1], 1e9) for line in (one, other))  # no obstacle: beyond 1e9 m
     return np.asarray((np.abs(a - b) / (1.0 + np.abs(a))).max(axis=(1, 2)))
 
@@ -104,7 +104,8 @@ def exactly(runs: Runs, k: int) -> Floats:
         world = exact.Line(
             gaps, speeds, rationals(command), left, mass, limit, Fraction(float(car[at.RESTITUTION, 0])), obstacle
         )
-        gaps, speeds, hits, obstacle = exact.Run(world).to(Fraction(end - start))
+        gaps, speeds, hits, obstacle, pushed = exact.Run(world).to(Fraction(end - start))
+        line[at.PUSHED, :-1] += [float(pushed[-1]), *map(float, pushed[:-1])]
         for pair, closing in hits:
             harm, p = float(closing) ** 2, pair + 1
             line[at.FIRST, p] += 0.0 if line[at.HIT, p] else harm

@@ -95,7 +95,7 @@ def regression(gaps, mass, speeds, forces, limit, h, out):
 
 @numba.njit(cache=True, no_cfunc_wrapper=True)
 def impacts(gaps, mass, speeds, limit, restitution, book):
-    """Resolve impacts, round after round; ``book`` [4, N]: hit, first harm, total harm, count."""
+    """Resolve impacts, round after round; ``book`` [5, N]: hit, first harm, total harm, count, push."""
     n = len(speeds)
     closing, pooled, nothing = np.zeros(n), np.zeros(n), np.zeros(n)
     for _ in range(100_000):
@@ -185,6 +185,7 @@ def through(now, wanted, car, restitution, duration, step_s, book):
                     low = middle
             h = high
             trial(now, wanted, car, h, new)
+        pushes(now, new, car, h, book)
         now[:] = new
         for k in range(len(wanted)):
             now[GAP, k] = max(now[GAP, k], 0.0)
@@ -193,13 +194,41 @@ def through(now, wanted, car, restitution, duration, step_s, book):
     return True
 
 
+@numba.njit(cache=True, no_cfunc_wrapper=True)
+def pushes(now, new, car, h, book):
+    """Add to ``book`` the closing speed of every contact that lasts, if each of its two parts took the step alone."""
+    n = new.shape[1]
+    lasts = np.zeros(n + 1, np.bool_)  # of each vehicle and what is ahead of it
+    for k in range(n):
+        before, after = (now[SPEED, k - 1], new[SPEED, k - 1]) if k > 0 else (0.0, 0.0)
+        lasts[k] = now[GAP, k] <= 0.0 and new[GAP, k] <= 0.0 and new[SPEED, k] == after
+        lasts[k] = lasts[k] and abs(now[SPEED, k] - before) <= SAME_MPS
+    for k in range(n):
+        if lasts[k]:
+            behind, end = -np.inf, k
+            while end == k or lasts[end]:
+                value = rest_of_block(car[MASS], now[SPEED], new[MEAN], car[LIMIT], h, k, end)
+                behind = max(behind, value)
+                end += 1
+            ahead, start = 0.0 if k == 0 else np.inf, k - 1
+            while start >= 0:
+                value = rest_of_block(car[MASS], now[SPEED], new[MEAN], car[LIMIT], h, start, k - 1)
+                ahead = min(ahead, value)
+                if not lasts[start]:
+                    break
+                if start == 0:
+                    ahead = min(ahead, 0.0)
+                start -= 1
+            book[4, k] += max(behind - ahead, 0.0)
+
+
 class Outcome(NamedTuple):
     """A world at the end of its run."""
 
     gaps: Any
     speeds: Any
     forces: Any
-    book: Any  # [4, N] hit, first harm, total harm, count of the pair of each vehicle and what is ahead of it
+    book: Any  # [5, N] hit, first harm, total harm, count, push (m/s) of the pair of each vehicle and what is ahead of it
     finished: bool
 
 
@@ -211,7 +240,7 @@ def simulate(line: Line, times: Any, commands: Any, step_s: float) -> Outcome:
     latency = np.array(line.latency)
     now = np.array([line.gaps, line.speeds, line.forces, line.forces], np.float64)
     car = np.array([line.mass, line.limit, line.brake_rate, line.release_rate], np.float64)
-    book, finished = np.zeros((4, len(latency))), True
+    book, finished = np.zeros((5, len(latency))), True
     for (start, end), command in zip(pairwise(times), commands, strict=True):
         for one, other in pairwise(sorted({start, end, *(float(x) for x in latency if start < x < end - 1e-9)})):
             wanted, length = np.where(latency <= one, command, 0.0), other - one

@@ -1,0 +1,100 @@
+"""The push: the closing speed that a contact takes up while the bodies move as one, without an impact.
+
+Pair p, whose bodies touch and move as one, takes up the closing acceleration ``u_rear - u_front >= 0`` (m/s2): u_rear
+is what body p + 1 would do if no body were in front of it, u_front what body p would do if no body were behind it.
+Their integral over time is the push (m/s). Harm does not count it.
+
+By itself a part of the line obeys the law of resting contact (``motion.impact``). By the min-max formula of isotonic
+regression, u_rear is the largest of the mean accelerations of the bodies p + 1 to j, u_front the smallest of the bodies
+i to p, both over the bodies that move as one, weighted by mass. For two moving vehicles the push is the integral of
+``u_{p+1} - u_p``. A part that its brakes hold, and the obstacle with what leans on it, has the acceleration 0.
+
+Between two events each mean is a linear function of time, and so the largest is a convex one: the integral is exact.
+"""
+
+from __future__ import annotations
+
+import math
+
+from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.impact import SAME_MPS2
+from ethbrake_marl.motion.layout import (
+    ACCELERATION,
+    HIGH,
+    HIGH_JERK,
+    JERK,
+    JOINED,
+    LOW,
+    LOW_JERK,
+    MASS,
+    PART,
+    PART_RATE,
+    PUSHED,
+)
+
+
+@kernel
+def integral_of_largest(value, rate, count, duration):
+    """Return the integral from 0 to ``duration`` of the largest of the ``count`` lines ``value[k] + rate[k] t``.
+
+    From one crossing to the next the largest line becomes steeper, so it changes at most ``count - 1`` times.
+    """
+    best, area, start = 0, 0.0, 0.0
+    for k in range(1, count):
+        if value[k] > value[best]:
+            best = k
+    while start < duration:
+        end, following = duration, best
+        for k in range(count):
+            if rate[k] > rate[best]:
+                crossing = max((value[best] - value[k]) / (rate[k] - rate[best]), start)
+                if crossing < end:
+                    end, following = crossing, k
+        area += (value[best] + 0.5 * rate[best] * (start + end)) * (end - start)
+        start, best = end, following
+    return area
+
+
+@kernel
+def gain_alone(car, scratch, body, last, toward, side, side_jerk, held, duration):
+    """Return the speed (m/s) that ``body`` would gain if only the bodies from it to ``last`` were there.
+
+    ``toward`` is 1 for the bodies behind a contact, where the largest mean counts, and -1 for those in front, where the
+    smallest does. ``side`` and ``side_jerk`` are the rows of their own accelerations and rates. ``held``: the line
+    does not speed up or slow down, so the brakes may hold any part of it.
+    """
+    count, mass, force, rate = 0, 0.0, 0.0, 0.0
+    for i in range(body, last + toward, toward):
+        if car[MASS, i] == math.inf:
+            break
+        mass += car[MASS, i]
+        force += car[MASS, i] * scratch[side, i]
+        rate += car[MASS, i] * scratch[side_jerk, i]
+        scratch[PART, count], scratch[PART_RATE, count] = toward * force / mass, toward * rate / mass
+        count += 1
+    if held:
+        scratch[PART, count], scratch[PART_RATE, count] = 0.0, 0.0
+        count += 1
+    return toward * integral_of_largest(scratch[PART], scratch[PART_RATE], count, duration)
+
+
+@large
+def push(line, car, scratch, duration, ahead):
+    """Add what the contacts take up in ``duration`` (s), in which no event happens, to the row PUSHED of ``line``."""
+    pairs, head = line.shape[1] - 1, ahead
+    for p in range(ahead, pairs):
+        if scratch[JOINED, p] == 0.0:
+            head = p + 1
+            continue
+        tail = p + 1
+        while scratch[JOINED, tail] == 1.0:
+            tail += 1
+        value, jerk = scratch[ACCELERATION, p], scratch[JERK, p]
+        held = value == 0.0 and jerk == 0.0
+        forward = value > 0.0 or (value == 0.0 and jerk > 0.0)
+        behind, behind_jerk = (LOW, LOW_JERK) if held or forward else (HIGH, HIGH_JERK)
+        front, front_jerk = (LOW, LOW_JERK) if forward else (HIGH, HIGH_JERK)
+        taken = gain_alone(car, scratch, p + 1, tail, 1, behind, behind_jerk, held, duration)
+        taken -= gain_alone(car, scratch, p, head, -1, front, front_jerk, held, duration)
+        if taken > SAME_MPS2 * duration:  # less is rounding
+            line[PUSHED, p] += taken
