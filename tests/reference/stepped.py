@@ -4,7 +4,7 @@ Every step solves one convex problem (Moreau's time stepping). Bodies of mass m 
 the speeds x that minimise ``sum m (x - v)^2 / 2 + sum phi(x)`` where no body may be faster than a touching one in
 front. The potential phi of a brake of force b is ``h m b |x|`` (dry friction), of an engine of force f with the limit L
 it is ``-h m f min(x, L)``. The minimum is an isotonic regression, whose blocks minimise their own sum. A step in which
-a gap would close is cut at that moment, so that the error is of the order ``h^2``.
+a gap would close, or a speed passes 0 or its limit, is cut at that moment, so that the error is of the order ``h^2``.
 """
 
 from __future__ import annotations
@@ -164,6 +164,17 @@ def trial(now, wanted, car, h, new):
 
 
 @numba.njit(cache=True, no_cfunc_wrapper=True)
+def too_far(now, wanted, car, h, new):
+    """Whether a gap closes, or a speed reaches or passes 0 or its limit, in a step of ``h``."""
+    far = trial(now, wanted, car, h, new) < 0.0
+    for k in range(len(wanted)):
+        for kink in (0.0, car[LIMIT, k]):
+            before, after = now[SPEED, k] - kink, new[SPEED, k] - kink
+            far = far or (before != 0.0 and before * after <= 0.0)
+    return far
+
+
+@numba.njit(cache=True, no_cfunc_wrapper=True)
 def through(now, wanted, car, restitution, duration, step_s, book):
     """Through an interval without an onset, in place; return False if there are too many steps."""
     new, time, steps = now.copy(), 0.0, 0
@@ -173,13 +184,13 @@ def through(now, wanted, car, restitution, duration, step_s, book):
         if steps > 50.0 * (duration / step_s + 1000.0):
             return False
         h = min(step_s, duration - time)
-        if trial(now, wanted, car, h, new) < 0.0:
+        if too_far(now, wanted, car, h, new):
             low, high = 0.0, h
             for _ in range(1100):  # to the last bit
                 middle = 0.5 * (low + high)
                 if middle in (low, high):
                     break
-                if trial(now, wanted, car, middle, new) < 0.0:
+                if too_far(now, wanted, car, middle, new):
                     high = middle
                 else:
                     low = middle
@@ -196,8 +207,12 @@ def through(now, wanted, car, restitution, duration, step_s, book):
 
 @numba.njit(cache=True, no_cfunc_wrapper=True)
 def pushes(now, new, car, h, book):
-    """Add to ``book`` the closing speed of every contact that lasts, if each of its two parts took the step alone."""
-    n = new.shape[1]
+    """Add to ``book`` what every contact that lasts takes up: the two parts of the line alone, in a short step.
+
+    It begins in the middle of the step of ``h``, lest a part alone comes to rest where the line as a whole does not.
+    """
+    n, short = new.shape[1], 1e-3 * h
+    middle = 0.5 * (now[SPEED] + new[SPEED])
     lasts = np.zeros(n + 1, np.bool_)  # of each vehicle and what is ahead of it
     for k in range(n):
         before, after = (now[SPEED, k - 1], new[SPEED, k - 1]) if k > 0 else (0.0, 0.0)
@@ -207,19 +222,19 @@ def pushes(now, new, car, h, book):
         if lasts[k]:
             behind, end = -np.inf, k
             while end == k or lasts[end]:
-                value = rest_of_block(car[MASS], now[SPEED], new[MEAN], car[LIMIT], h, k, end)
+                value = rest_of_block(car[MASS], middle, new[MEAN], car[LIMIT], short, k, end)
                 behind = max(behind, value)
                 end += 1
             ahead, start = 0.0 if k == 0 else np.inf, k - 1
             while start >= 0:
-                value = rest_of_block(car[MASS], now[SPEED], new[MEAN], car[LIMIT], h, start, k - 1)
+                value = rest_of_block(car[MASS], middle, new[MEAN], car[LIMIT], short, start, k - 1)
                 ahead = min(ahead, value)
                 if not lasts[start]:
                     break
                 if start == 0:
                     ahead = min(ahead, 0.0)
                 start -= 1
-            book[4, k] += max(behind - ahead, 0.0)
+            book[4, k] += max(behind - ahead, 0.0) * (h / short)
 
 
 class Outcome(NamedTuple):
