@@ -4,7 +4,7 @@ Every step solves one convex problem (Moreau's time stepping). Bodies of mass m 
 the speeds x that minimise ``sum m (x - v)^2 / 2 + sum phi(x)`` where no body may be faster than a touching one in
 front. The potential phi of a brake of force b is ``h m b |x|`` (dry friction), of an engine of force f with the limit L
 it is ``-h m f min(x, L)``. The minimum is an isotonic regression, whose blocks minimise their own sum. A step in which
-a gap would close, or a speed passes 0 or its limit, is cut at that moment, so that the error is of the order ``h^2``.
+a gap would close, or a speed reaches or leaves 0 or its limit, is cut at that moment, so that the error is of the order ``h^2``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 TOUCH_MPS, PLASTIC_MPS = 1e-5, 0.05
 SAME_MPS = 1e-9  # closing speeds below this are rounding
+LEAST_S = 1e-9  # a speed that leaves 0 or its limit does so in a step of this length
 ALIKE_MPS = 1e-12  # touching bodies whose speeds differ by less move as one: rounding does not part them
 
 
@@ -165,12 +166,13 @@ def trial(now, wanted, car, h, new):
 
 @numba.njit(cache=True, no_cfunc_wrapper=True)
 def too_far(now, wanted, car, h, new):
-    """Whether a gap closes, or a speed reaches or passes 0 or its limit, in a step of ``h``."""
+    """Whether a gap closes, or a speed reaches, passes or leaves 0 or its limit, in a step of ``h``."""
     far = trial(now, wanted, car, h, new) < 0.0
     for k in range(len(wanted)):
         for kink in (0.0, car[LIMIT, k]):
             before, after = now[SPEED, k] - kink, new[SPEED, k] - kink
             far = far or (before != 0.0 and before * after <= 0.0)
+            far = far or (before == 0.0 and after != 0.0 and h > LEAST_S)
     return far
 
 
@@ -206,14 +208,26 @@ def through(now, wanted, car, restitution, duration, step_s, book):
 
 
 @numba.njit(cache=True, no_cfunc_wrapper=True)
-def pushes(now, new, car, h, book):
-    """Add to ``book`` what every contact that lasts takes up: the two parts of the line alone, in a short step.
+def part_alone(mass, speeds, forces, limit, i, j):
+    """The acceleration nearest to 0 that friction and engines of the bodies i to j allow at their speeds."""
+    weight, low, high = 0.0, 0.0, 0.0
+    for k in range(i, j + 1):
+        weight += mass[k]
+        size = mass[k] * abs(forces[k])
+        if forces[k] < 0.0:
+            low -= size if speeds[k] >= 0.0 else -size
+            high -= size if speeds[k] > 0.0 else -size
+        else:
+            low += size if speeds[k] < limit[k] else 0.0
+            high += size if speeds[k] <= limit[k] else 0.0
+    return max(low, 0.0) / weight + min(high, 0.0) / weight
 
-    It begins in the middle of the step of ``h``, lest a part alone comes to rest where the line as a whole does not.
-    """
-    n, short = new.shape[1], 1e-3 * h
-    middle = 0.5 * (now[SPEED] + new[SPEED])
-    lasts = np.zeros(n + 1, np.bool_)  # of each vehicle and what is ahead of it
+
+@numba.njit(cache=True, no_cfunc_wrapper=True)
+def pushes(now, new, car, h, book):
+    """Add to ``book`` the closing speed that every contact which lasts takes up: what its two parts would do alone."""
+    n = new.shape[1]
+    middle, lasts = 0.5 * (now[SPEED] + new[SPEED]), np.zeros(n + 1, np.bool_)  # each vehicle and what is ahead of it
     for k in range(n):
         before, after = (now[SPEED, k - 1], new[SPEED, k - 1]) if k > 0 else (0.0, 0.0)
         lasts[k] = now[GAP, k] <= 0.0 and new[GAP, k] <= 0.0 and new[SPEED, k] == after
@@ -222,19 +236,17 @@ def pushes(now, new, car, h, book):
         if lasts[k]:
             behind, end = -np.inf, k
             while end == k or lasts[end]:
-                value = rest_of_block(car[MASS], middle, new[MEAN], car[LIMIT], short, k, end)
-                behind = max(behind, value)
+                behind = max(behind, part_alone(car[MASS], middle, new[MEAN], car[LIMIT], k, end))
                 end += 1
             ahead, start = 0.0 if k == 0 else np.inf, k - 1
             while start >= 0:
-                value = rest_of_block(car[MASS], middle, new[MEAN], car[LIMIT], short, start, k - 1)
-                ahead = min(ahead, value)
+                ahead = min(ahead, part_alone(car[MASS], middle, new[MEAN], car[LIMIT], start, k - 1))
                 if not lasts[start]:
                     break
                 if start == 0:
                     ahead = min(ahead, 0.0)
                 start -= 1
-            book[4, k] += max(behind - ahead, 0.0) * (h / short)
+            book[4, k] += max(behind - ahead, 0.0) * h
 
 
 class Outcome(NamedTuple):
