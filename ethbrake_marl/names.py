@@ -20,7 +20,7 @@ from difflib import get_close_matches
 from inspect import signature
 from typing import Any
 
-from ethbrake_marl.agents.drive import Agent, Team, check_agent
+from ethbrake_marl.agents.drive import UNSTATED, Agent, Team, check_agent, check_knows
 from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, describe_error
 from ethbrake_marl.files.python_file import load_from_file
@@ -79,7 +79,7 @@ def register_agent(
     make: Callable[[str | None, AgentSettings], Driver] | Sequence[str],
     *,
     about: str = "an agent of your own",
-    knows: str = "not stated",
+    knows: str = UNSTATED,
     form: str | None = None,
 ) -> None:
     """Give an agent a name, for every place that takes names. Entry points: ``ethbrake_marl.agents``.
@@ -91,7 +91,7 @@ def register_agent(
         make: ``make(argument, settings)`` returns the agent, or a team; ``argument`` is the text after the colon, or
             None. Instead: the specs of a group.
         about: one line.
-        knows: what it has to know (``agents.drive``).
+        knows: what it has to know: one of ``agents.drive.KNOWLEDGE``.
         form: as ``NAME[:ARGUMENT][@PATH]``; None: the name, with or without an argument.
 
     """
@@ -103,7 +103,7 @@ def register_shield(
     make: Callable[[Team, str | None, AgentSettings], Team],
     *,
     about: str = "a wrapper of your own",
-    knows: str = "",
+    knows: str = UNSTATED,
     form: str | None = None,
 ) -> None:
     """Give a shield, or a search, a name that can stand after a ``+``. Entry points: ``ethbrake_marl.shields``.
@@ -118,6 +118,7 @@ def _add(table: Registry[Entry], name: str, make: Any, about: str, knows: str, f
         raise InvalidInput(
             f"{table.kind} {name!r:.80}: the name must have the characters a-z, 0-9, _ and -, beginning with a letter"
         )
+    check_knows(knows, f"{table.kind} {name!r}")
     table.add(name, Entry(make, about, knows, form or f"{name}[:ARGUMENT]"), lambda other: other.make == make)
 
 

@@ -69,7 +69,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("all"):
-        config.option.markexpr = "not long"
+        config.option.markexpr = ""
 
 
 @pytest.hookimpl(trylast=True)  # behind the choice by marks

@@ -14,11 +14,14 @@ from ethbrake_marl.episode.step import Step, asked, begun
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
-# what an agent has to know, from little to much; each includes those before it
+# what an agent has to know, from little to much
 SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
 MESSAGES = "messages"  # also the messages that the vehicle has received
+ESTIMATED = "estimated model"  # also what the scenario says about all worlds: ranges of values, scripts, physics
 STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehicles, whether received or not
 MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
+KNOWLEDGE = (SENSORS, MESSAGES, ESTIMATED, STATE, MODEL)
+UNSTATED = "not stated"
 
 NOBODY = np.zeros(0, np.int64)
 
@@ -46,7 +49,7 @@ class Agent(Script, Protocol):
 
     @property
     def knows(self) -> str:
-        """What it has to know, for tables: one of the texts above."""
+        """What it has to know, for tables: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
 
 
 class Team(NamedTuple):
@@ -96,6 +99,14 @@ def check_agent(agent: Any, where: str) -> None:
             f"{where}: has no {' and no '.join(missing)}; must be an agent, which has name, knows, begin(alert, body)"
             " and act(state, memory, body); make one with make_agent(name), policy_agent(model) or LearnedAgent(policy)"
         )
+    check_knows(agent.knows, where)
+
+
+def check_knows(knows: Any, where: str) -> None:
+    """Raise ``InvalidInput``, which begins with ``where``, unless this says what an agent has to know."""
+    if not isinstance(knows, str) or knows not in (*KNOWLEDGE, UNSTATED):
+        right = ", ".join(repr(each) for each in KNOWLEDGE)
+        raise InvalidInput(f"{where}: knows = {knows!r:.60}: must be one of {right}, or {UNSTATED!r}")
 
 
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:

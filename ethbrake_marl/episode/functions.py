@@ -28,6 +28,8 @@ def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *sha
     """Return the numbers that ``function(*given)`` returns, in one of the ``shapes``. Raises ``InvalidInput``."""
     try:
         value = np.asarray(function(*given))
+    except InvalidInput as error:
+        raise InvalidInput(f"{what}: {error}") from error
     except Exception as error:
         raise InvalidInput(f"{what}: its function fails: {describe_error(error)}") from error
     if value.shape not in shapes or value.dtype.kind not in "fiub":

@@ -54,7 +54,7 @@ class Comparison:
             if agents:
                 yield f"Only in the {which} result: {', '.join(agents)}."
         for name, (one, other) in self.changed.items():
-            yield f"Note: {name}: {one!s:.20} in the first result, {other!s:.20} in the second."
+            yield f"Note: {name}: {_shown(one)} in the first result, {_shown(other)} in the second."
 
     def to_json(self) -> dict[str, Any]:
         """Return plain data."""
@@ -82,8 +82,8 @@ def compare_results(first: Saved | Result, second: Saved | Result) -> Comparison
         values = [_recorded(each, key) for each in (other, one)]
         if values[0] != values[1]:
             raise InvalidInput(
-                f"{other.path} and {one.path} cannot be compared: {what} ({key} is {values[0]!s:.20} and"
-                f" {values[1]!s:.20})"
+                f"{other.path} and {one.path} cannot be compared: {what} ({key} is {_shown(values[0])} and"
+                f" {_shown(values[1])})"
             )
     common = [agent for agent in one.agents if agent in other.agents]
     mine, theirs = (tuple(agent for agent in each.agents if agent not in common) for each in (one, other))
@@ -124,6 +124,10 @@ def _in_memory(result: Result) -> Saved:
 
 def _recorded(saved: Saved, key: str) -> Any:
     return saved.about.get(key, saved.about["parameters"].get(key))
+
+
+def _shown(value: Any) -> str:
+    return "missing" if value is None else f"{value!s:.20}"
 
 
 def _noted(saved: Saved, agents: list[str]) -> dict[str, Any]:

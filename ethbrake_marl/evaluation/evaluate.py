@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.drive import MESSAGES, MODEL, SENSORS, STATE as TRUE_STATE, Team, play
+from ethbrake_marl.agents.drive import KNOWLEDGE, MODEL, UNSTATED, Team, check_knows, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
@@ -26,9 +26,6 @@ from ethbrake_marl.worlds.describe import clusters_of, columns_of
 from ethbrake_marl.worlds.sampling import Drawn
 
 CHUNK = 2_500  # worlds that are driven together, to limit memory
-
-KNOWLEDGE = (SENSORS, MESSAGES, "estimated model", TRUE_STATE, MODEL)  # from little to much
-UNSTATED = "not stated"
 
 Columns = dict[str, Values]
 
@@ -145,6 +142,15 @@ def evaluate(
     for measure in chosen:
         if measure.name in of_worlds:
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")
+    shown: dict[str, Measure] = {}
+    for measure in chosen:
+        for statistic in measure.shown:
+            other = shown.setdefault(statistic.key, measure)
+            if other != measure:
+                raise InvalidInput(
+                    f"measures {other.name!r} and {measure.name!r}: both have the statistic {statistic.key!r}; give one"
+                    " of them another key"
+                )
     calls: Any = (
         (drive_chunk, alert.take(slice(first, first + CHUNK)), dict(agents), game, chosen)
         for first in range(0, n, CHUNK)
@@ -234,9 +240,13 @@ def hidden_from(alert: State, game: Game) -> Bools:
 
 def known_by(team: Team) -> str:
     """Return what a team has to know, as one text: ``messages + true model``."""
-    each = {getattr(agent, "knows", UNSTATED) for agent in team.drivers.values()}
-    each |= {getattr(team.shield, "knows", MODEL)} if team.shield is not None else set()
-    return " + ".join(sorted(each, key=lambda word: (*KNOWLEDGE, word).index(word)))
+    return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _known(team).values())
+
+
+def _known(team: Team) -> dict[str, str]:
+    """Return vehicle, or ``shield`` -> what it has to know."""
+    each = {f"vehicle_{body}": getattr(agent, "knows", UNSTATED) for body, agent in team.drivers.items()}
+    return each if team.shield is None else {**each, "shield": getattr(team.shield, "knows", MODEL)}
 
 
 def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:
@@ -253,3 +263,5 @@ def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:
         )
     for team in agents.values():
         team.game(game)
+        for who, knows in _known(team).items():
+            check_knows(knows, f"team {team.name!r}: {who}")

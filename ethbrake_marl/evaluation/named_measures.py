@@ -7,8 +7,10 @@ The sum of a term over all steps is what a learner with this reward would get (`
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import partial
+from inspect import signature
 
 import numpy as np
 
@@ -52,6 +54,18 @@ def register_measure(
     >>> eb.register_measure("rear_speed_mps", rear_speed, unit="m/s")
 
     """
+    measure = _checked(name, of, unit, shown, watch)
+    MEASURES.add(name, measure, lambda other: other == measure)
+
+
+def _checked(
+    name: str,
+    of: Callable[[Game, State, State], Given] | None = None,
+    unit: str = "1",
+    shown: Iterable[Statistic] = (),
+    watch: Callable[[Game, State], Watch | None] | None = None,
+) -> Measure:
+    """Return the measure that the arguments of ``register_measure`` describe. Raises the same errors."""
     right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
     if not isinstance(name, str) or re.fullmatch(right, name) is None:
         raise InvalidInput(
@@ -64,10 +78,9 @@ def register_measure(
             f"measure {name!r}: give one function, of(game, alert, last) or watch(game, alert), with a docstring that"
             " describes the measure"
         )
-    measure = Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
     if name in (*USUAL, *TAKEN) or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
-    MEASURES.add(name, measure, lambda other: other == measure)
+    return Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
 
 
 USUAL = tuple(measure.name for measure in DEFAULT)
@@ -83,14 +96,32 @@ _REWARDED = ("collision", "risk", "jerk")  # built-in terms of a step, with the 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     """Return the measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
 
-    Raises ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
+    A measure of a file is called ``NAME``, or ``FILE.py:NAME`` if another one of ``names`` is called ``NAME``. Raises
+    ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
     """
     if not isinstance(names, Iterable):
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'injury,sampled_harm'")
-    found: dict[str, Measure] = {}
-    for name in names.split(",") if isinstance(names, str) else names:
-        found |= {measure.name: measure for measure in _called(name)}
-    return tuple(found.values())
+    called: list[tuple[str, Measure]] = []
+    for name in dict.fromkeys(names.split(",") if isinstance(names, str) else names):
+        called += [(name, each) for each in _called(name) if each not in [measure for _, measure in called]]
+    count = Counter(measure.name for _, measure in called)
+    return tuple(_in_full(name, measure) if count[measure.name] > 1 else measure for name, measure in called)
+
+
+def _in_full(name: str, measure: Measure) -> Measure:
+    """Return a measure of a file under its full name ``FILE.py:NAME``, and any other measure as it is."""
+    file = name.removesuffix(f":{measure.name}")
+    if file == name:
+        return measure
+    shown = (
+        each._replace(
+            key=f"{file}:{each.key}",
+            heading=each.heading and f"{each.heading} ({file})",
+            short=each.short and f"{each.short}\n({file})",
+        )
+        for each in measure.shown
+    )
+    return measure._replace(name=name, shown=tuple(shown))
 
 
 def _called(name: str) -> list[Measure]:
@@ -101,21 +132,30 @@ def _called(name: str) -> list[Measure]:
     if name in _REWARDED:
         return [_summed(name, partial(_rewarded, name), "1")]
     if name in TERMS:
-        return [_summed(name, TERMS[name].value, TERMS[name].unit)]
+        term = TERMS[name].value
+        return [_summed(name, _intervention if name == "intervention" else term, TERMS[name].unit)]
     file, _, own = str(name).rpartition(":")
     if file.endswith(".py"):
-        value = load_from_file(file, own)
-        part = value if isinstance(value, Part) else Part(value)
-        try:
-            register_measure(own, *part.given, **part.settings)
-        except EthBrakeError as error:
-            raise type(error)(f"file {file!r}: {error}") from None
-        return [MEASURES[own]]
+        return [_of_file(file, own)]
     kind = str(name).partition(":")[0]
     if kind in OBJECTIVES:
         meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
         return [Measure(name, partial(_objective, name), meaning, "m2/s2")]
     raise unknown_name("measure", name, (*MEASURES, *_REWARDED, *TERMS, *OBJECTIVES), may_be_own=True)
+
+
+def _of_file(file: str, name: str) -> Measure:
+    value = load_from_file(file, name)
+    part = value if isinstance(value, Part) else Part(value)
+    try:
+        measure = _checked(**signature(register_measure).bind(name, *part.given, **part.settings).arguments)
+        if name in MEASURES and MEASURES[name] != measure:
+            raise AlreadyExists(f"measure {name!r} is registered already; give another name")
+    except TypeError as error:
+        raise InvalidInput(f"file {file!r}: measure {name!r}: {error}") from None
+    except EthBrakeError as error:
+        raise type(error)(f"file {file!r}: {error}") from None
+    return measure
 
 
 def _summed(name: str, term: TermFunction, unit: str) -> Measure:
@@ -126,6 +166,13 @@ def _rewarded(name: str, before: State, step: Step, after: State) -> Values:
     learners, times = np.zeros(0, np.int64), (step.time_step_s, 0.0)
     rewarding, _ = Rewarding.of({"harm": 0.0, name: 1.0}, "total", after.vehicles, learners, times, None)
     return rewarding.terms[0][2](before, step, after)
+
+
+def _intervention(before: State, step: Step, after: State) -> Values:
+    """Return the term, which is 0 for a team without a shield, so that a table can compare both. Rewards refuse it."""
+    if "shield" not in after.memories:
+        return np.zeros(after.speeds_mps.shape)
+    return TERMS["intervention"].value(before, step, after)
 
 
 def _objective(name: str, game: Game, alert: State, last: State) -> Given:

@@ -69,7 +69,10 @@ def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
 
 def intervention(before: State, step: Step, after: State) -> Floats:
     """Return minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
-    memory = before.memories.get("shield")
+    memory = after.memories.get("shield")
     if memory is None:
-        raise InvalidInput("this game has no shield; give the environment one, eb.shield(env), or the weight 0")
+        raise InvalidInput(
+            "this game has no shield, so the term would always be 0; give the environment a shield, eb.shield(env), or"
+            " leave the term out of the reward (training by a recipe has no shield)"
+        )
     return np.where(memory.intervened, -1.0, 0.0)

@@ -26,7 +26,7 @@ PAIR = game_of("cooperation-3-pair")
 class Counting:
     """Commands minus a tenth of the number of times that it has been asked, and remembers the time of each."""
 
-    name, knows = "counting", "nothing"
+    name, knows = "counting", "own sensors"
 
     def begin(self, alert: State, body: int) -> tuple[Floats, Floats]:
         assert (alert.time_s == 0.0).all()
@@ -108,7 +108,7 @@ def test_a_shield_of_the_game__is_never_dropped() -> None:
 class Gives:
     """Commands whatever it is given."""
 
-    name, knows = "gives", "nothing"
+    name, knows = "gives", "own sensors"
 
     def __init__(self, commands: Any) -> None:
         self.commands = commands

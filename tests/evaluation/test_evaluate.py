@@ -156,6 +156,7 @@ class Mild:
 
 
 steps = Part(watch=pushes, unit="steps")
+coloured = Part(gap, colour="red")
 number = 3
 """
 
@@ -177,6 +178,36 @@ def test_agents_and_measures_of_a_python_file__run_in_every_process(
         measures_called(f"{file}:gap_m")
     with refused("measure 'number': give one function"):
         measures_called([f"{file}:number"])
+    with refused("measure 'coloured': got an unexpected keyword argument 'colour'"):
+        measures_called([f"{file}:coloured"])
+
+
+def test_measures_of_two_files_with_one_name__stand_side_by_side_and_one_after_the_other(empty_folder: Path) -> None:
+    near = "near = Part(near, shown=[Statistic('near_rate', 'rate', 'Near')])\n"
+    for file, value in (("mine.py", 1.0), ("b/mine.py", 2.0)):
+        Path(file).parent.mkdir(exist_ok=True)
+        text = f"def worst(game, alert, last):\n    'A number.'\n    return 0.0 * last.time_s + {value}\n"
+        text += f"def near(game, alert, last):\n    'Whether.'\n    return last.time_s < {10 * value - 10}\n"
+        imports = "from ethbrake_marl import Part\nfrom ethbrake_marl.evaluation.measures import Statistic\n"
+        Path(file).write_text(imports + text + near)
+    for file, value in (("mine.py", 1.0), ("b/mine.py", 2.0)):
+        assert eb.evaluate("paper-random", "coast", episodes=2, measures=f"{file}:worst")["coast"]["worst"][0] == value
+    names = "mine.py:worst,b/mine.py:worst,mine.py:near,b/mine.py:near,./mine.py:worst"
+    result = eb.evaluate("paper-random", "coast", episodes=2, measures=names)
+    assert [each.name for each in result.measures[-4:]] == names.split(",")[:4]
+    (row,) = table = summarise(result)
+    keys = ("mine.py:worst", "b/mine.py:worst", "mine.py:near_rate", "b/mine.py:near_rate")
+    assert [row.estimates[key].value for key in keys] == [1.0, 2.0, 0.0, 1.0]  # type: ignore[union-attr]
+    assert table.sheet().names[5:7] == ["mine.py:near_rate", "b/mine.py:near_rate"]
+    assert {"Near (mine.py)", "Near (b/mine.py)"} < table.meanings().keys()
+    assert [cells[1] for cells in table.measures().rows] == ["mine.py:worst (1)", "b/mine.py:worst (1)"]  # type: ignore[union-attr]
+
+
+def test_measures__with_one_statistic_are_refused() -> None:
+    two = [Measure(name, lambda game, alert, last: last.collided, "", "", (Statistic("hit"),)) for name in ("a", "b")]
+    scenario, game = game_of(PAIR)
+    with refused("measures 'a' and 'b': both have the statistic 'hit'; give one of them another key"):
+        evaluate(scenario.draw(2, 7), teams(FULL_BRAKE), game, two)
 
 
 @pytest.mark.parametrize(

@@ -158,10 +158,10 @@ def test_comparison__notes_other_policies_settings_versions_and_physics() -> Non
     policies = {"full_brake": {"vehicle_2": "a"}, "constant:4.0": {}}
     found = compare_results(result, replace(result, about={**result.about, **about}, policies=policies))
     notes = [*found.notes()]
-    assert "Note: harm_count: None in the first result, total in the second." in notes
+    assert "Note: harm_count: missing in the first result, total in the second." in notes
     assert any(note.startswith("Note: physics_digest: ") for note in notes)
     assert any(note.startswith("Note: numpy: ") and note.endswith("1.0 in the second.") for note in notes)
-    assert "Note: policy of vehicle_2 in full_brake: None in the first result, a in the second." in notes
+    assert "Note: policy of vehicle_2 in full_brake: missing in the first result, a in the second." in notes
 
 
 def changed(**settings: Any) -> Callable[[], Result]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.features import FEATURES
 from ethbrake_marl.errors import AgentFailed, AlreadyExists, InvalidInput, UnknownName
 from tests.refused import refused
@@ -52,6 +53,8 @@ PARTS: dict[str, Callable[[], object]] = {
     "measure 'Mine': the name must be 1 to": lambda: eb.register_measure("Mine", gives(0.0)),
     "measure 'mine': give one function, of": lambda: eb.register_measure("mine", lambda game, alert, last: 0.0),
     "agent 'My agent': the name must have": lambda: eb.register_agent("My agent", gives(0.0)),
+    "agent 'mine': knows = 'all': must be one": lambda: eb.register_agent("mine", gives(0.0), knows="all"),
+    "shield or search 'mine': knows = 'all': ": lambda: eb.register_shield("mine", gives(0.0), knows="all"),
     "scenarios 'nowhere': has no file that": lambda: eb.register_scenarios("nowhere"),
 }
 
@@ -168,15 +171,25 @@ def test_agent__that_answers_wrongly_is_named_once_as_the_user_calls_it(answer: 
     assert str(caught.value).count("agent") == 1
 
 
+WORDS = "'own sensors', 'messages', 'estimated model', 'true state', 'true model', or 'not stated'"
+
+
 @pytest.mark.parametrize(
     ("agent", "message"),
     [
         (object(), "has no name and no knows and no begin and no act; must be an agent"),
+        (Held("coast", "sensors"), f"knows = 'sensors': must be one of {WORDS}"),
+        (Held("coast", np.zeros(2)), "knows = array([0., 0.]): must be one of 'own sensors', 'messages',"),
+        (
+            {"vehicle_2": Held("coast", None)},
+            "vehicle_2 = Held(name='coast', knows=None): knows = None: must be one of",
+        ),
+        (eb.Team("ours", {2: Held("coast", "a lot")}), "team 'mine': vehicle_2: knows = 'a lot': must be one of"),
         ({"vehicle_2": "coast", "vehicle_9": "coast"}, "drives vehicle_2, vehicle_9; must drive exactly vehicle_2"),
         ({1: "coast"}, "team 'mine': 1: must be the name of a vehicle, such as vehicle_2"),
         ("coats", "unknown agent 'coats'; did you mean 'coast'"),
     ],
-    ids=["nothing", "too many", "a number", "unknown"],
+    ids=["nothing", "knows", "array", "in a mapping", "in a team", "too many", "a number", "unknown"],
 )
 def test_agent__that_is_none_is_refused(agent: Any, message: str) -> None:
     with refused(message):

@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from pettingzoo.test import api_test, parallel_api_test
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
+import ethbrake_marl as eb
 from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
@@ -183,8 +184,20 @@ def test_the_term_intervention() -> None:
     assert replaced > 0
     alone = EthBrakeParallelEnv("paper-random", reward=reward)
     alone.reset(seed=7)
-    with pytest.raises(InvalidInput, match=r"term 'intervention'.*this game has no shield"):
+    with pytest.raises(
+        InvalidInput, match=r"^term 'intervention': this game has no shield, so the term would always be 0"
+    ):
         alone.step({"vehicle_2": [0.0]})
+
+
+def test_the_measure_intervention__counts_each_replaced_action_and_is_0_without_a_shield() -> None:
+    result = eb.evaluate("paper-random", "coast+step,coast", episodes=20, measures="intervention")
+    guarded, alone = (result[name] for name in ("coast+step", "coast"))
+    assert (guarded["intervention_2"] == -guarded["replaced_actions"]).all() and guarded["replaced_actions"].any()
+    assert all((alone[f"intervention_{k}"] == 0.0).all() for k in (1, 2, 3))
+    assert {row["agent"]: row["intervention_2"] < 0.0 for row in eb.summarise(result).to_json()} == {
+        "coast+step": True, "coast": False,
+    }  # fmt: skip
 
 
 def test_the_copy_can_be_pickled() -> None:

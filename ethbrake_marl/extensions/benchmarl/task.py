@@ -14,15 +14,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import torch
-from benchmarl.environments.common import TaskClass
-from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.shield import MODES
 from ethbrake_marl.faces.spaces import FeatureBox
@@ -31,6 +26,13 @@ from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.scenario import Scenario
+
+with naming_extras():
+    import torch
+    from benchmarl.environments.common import TaskClass
+    from tensordict import TensorDict
+    from torchrl.data import Bounded, Categorical, Composite, Unbounded
+    from torchrl.envs import EnvBase
 
 GROUP = "learners"
 

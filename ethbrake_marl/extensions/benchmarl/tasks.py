@@ -7,14 +7,21 @@ find these tasks, because it searches only its own folder.
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
-from ethbrake_marl.errors import naming_extras
+from ethbrake_marl.errors import MissingExtra, naming_extras
 
-with naming_extras():
-    from benchmarl.environments import task_config_registry
-    from benchmarl.environments.common import Task
-    from hydra.core.config_store import ConfigStore
+try:
+    with naming_extras():
+        from benchmarl.environments import task_config_registry
+        from benchmarl.environments.common import Task
+        from hydra.core.config_store import ConfigStore
+except MissingExtra as error:
+    if __name__ != "__main__":
+        raise
+    sys.stderr.write(f"tasks.py: error: {error}\n")
+    raise SystemExit(2) from None
 
 from ethbrake_marl.extensions.benchmarl.task import LineTask
 from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario

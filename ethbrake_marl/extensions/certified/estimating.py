@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent, Team
+from ethbrake_marl.agents.drive import ESTIMATED, Agent, Team
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
@@ -35,8 +35,6 @@ from ethbrake_marl.shields.algorithm_1 import EpisodeShield, Memory as EpisodeMe
 from ethbrake_marl.shields.step import Memory, part
 from ethbrake_marl.worlds.scenario import Scenario
 
-KNOWS = "estimated model"
-
 
 class EstimatedShield(MembersShield):
     """Shield of one learner that certifies actions in its estimated lines.
@@ -49,7 +47,7 @@ class EstimatedShield(MembersShield):
 
     """
 
-    knows = KNOWS
+    knows = ESTIMATED
 
     def __init__(
         self,
@@ -103,7 +101,7 @@ class EstimatedEpisodeShield(EpisodeShield):
 
     """
 
-    knows = KNOWS
+    knows = ESTIMATED
 
     def __init__(
         self,
@@ -139,7 +137,7 @@ class EstimatedEV2XBM:
 
     """
 
-    knows = KNOWS
+    knows = ESTIMATED
 
     def __init__(self, scenario: Scenario, is_pairwise: bool = False, count: str = "first") -> None:
         self.scenario, self.is_pairwise, self.count = scenario, is_pairwise, count
@@ -212,7 +210,7 @@ def make_e_v2x_bm(argument: str | None, settings: Any) -> EstimatedEV2XBM:
 
 
 def _entry(make: Any, form: str, about: str) -> Part:
-    return Part(make, form=form, about=about, knows=KNOWS)
+    return Part(make, form=form, about=about, knows=ESTIMATED)
 
 
 STEP = _entry(

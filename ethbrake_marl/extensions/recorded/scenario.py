@@ -99,7 +99,7 @@ def scenario_from_data(
         columns: for the format ``table`` only: names of the columns, see ``format_of``.
         based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
         every_s: time between two moments at which chains are formed, s.
-        progress: called with the name of a file, the number of files read so far, and the number of all files.
+        progress: called with ``files``, the number of files read so far, and the number of all files.
 
     Raises ``InvalidInput``, which names file, line and column, if no file can be used.
 
@@ -154,7 +154,8 @@ def read_rows(
         patterns = " or ".join(entry.files)
         raise InvalidInput(f"{folder}: must be a folder with files of {entry.title}; their names match {patterns}")
     for k, (shown, file) in enumerate(files.items()):
-        progress(f"read: {shown}", k, len(files))
+        if k > 0:
+            progress("files", k, len(files))
         try:
             with open_plain(file, LARGEST_BYTES) as stream:
                 content = hashlib.file_digest(stream, "sha256").digest()
@@ -183,6 +184,7 @@ def read_rows(
             f" longest queue has {longest}: with --based-on, give a scenario of fewer vehicles, for instance"
             " realistic-pair with 2"
         )
+    progress("files", len(files), len(files))
     each_of = len(of) * (2 * vehicles - 1) // MOST_NUMBERS + 1
     # Rows of the same vehicles are next to each other in this order, so every k-th row keeps all vehicles.
     chosen = sorted(sorted(range(len(of)), key=of.__getitem__)[each_of - 1 :: each_of])

@@ -9,7 +9,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.extensions.search.pricing import COUNTS, problem_of
-from ethbrake_marl.extensions.search.tables import best_known as stored
+from ethbrake_marl.extensions.search.tables import best_known as stored, shipped_tables
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 
@@ -21,10 +21,22 @@ def least(game: Game, alert: State) -> dict[str, Floats]:
     missing = int(np.isinf(list(known.values())).any(axis=0).sum())
     if missing:
         raise InvalidInput(
-            f"no shipped table holds {count_of(missing, 'world')} of {alert.n}; the measures limits need the first"
-            " worlds of seed 7 of a scenario with a table; elsewhere compare with the agent best_harm"
+            f"measures limits: scenario {game.name!r}: the least harm of {missing:,} of these"
+            f" {count_of(alert.n, 'world')} is not known; {_where_known(game.name)}; elsewhere compare with the agent"
+            " best_harm"
         )
     return known
+
+
+def _where_known(scenario: str) -> str:
+    headers = {table.header["scenario"]: table.header for table in shipped_tables()}
+    if scenario not in headers:
+        return f"shipped tables hold the first worlds of seed 7 of {', '.join(headers)}"
+    header = headers[scenario]
+    return (
+        f"a shipped table holds the first {header['episodes']:,} worlds of seed {header['list_seed']} of this scenario"
+        f" without changes, where {', '.join(header['vehicles'])} learns"
+    )
 
 
 def best_known(game: Game, alert: State, last: State) -> Given:

@@ -1,5 +1,6 @@
 """`train/benchmarl_mappo.py`: BenchMARL's MAPPO."""
 
+import importlib
 import runpy
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
+from ethbrake_marl.errors import MissingExtra
 from ethbrake_marl.training.training import Training
 from tests.docs.site import load
 
@@ -52,6 +54,26 @@ def test_program__refuses_what_cannot_be_before_it_trains(
     assert list(empty_folder.rglob("*")) == [empty_folder / "there"]
 
 
+@pytest.mark.parametrize("module", ["task", "tasks"])
+def test_module__without_the_extra_says_how_to_install_it(
+    module: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for loaded in ["benchmarl", *(each for each in sys.modules if each.startswith("benchmarl."))]:
+        monkeypatch.setitem(sys.modules, loaded, None)  # cannot be imported, as where the extra is missing
+    name, message = (
+        f"ethbrake_marl.extensions.benchmarl.{module}",
+        "needs the package benchmarl, which is not installed",
+    )
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    with pytest.raises(MissingExtra, match=message):
+        importlib.import_module(name)
+    if module == "tasks":
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_module(name, run_name="__main__")
+        printed = capsys.readouterr().err
+        assert ended.value.code == 2 and printed.startswith(f"tasks.py: error: {message}") and printed.count("\n") == 1
+
+
 @pytest.fixture
 def mappo() -> ModuleType:
     pytest.importorskip("benchmarl", reason="needs the extra marl")
@@ -75,11 +97,3 @@ def test_policy__acts_as_benchmarls_own(algorithm: str, mappo: ModuleType, tmp_p
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         theirs = experiment.group_policies["learners"](batch)["learners", "action"].reshape(100, 1).numpy()
     np.testing.assert_allclose(policy(seen), theirs, atol=1e-5)
-
-
-@pytest.mark.long
-def test_program__learns_to_beat_full_braking(mappo: ModuleType, tmp_path: Path) -> None:
-    mappo.train("cooperation-3-pair", "cooperation-ppo", 300_000, 0, tmp_path / "run")
-    result = eb.evaluate("cooperation-3-pair", f"full_brake,team@{tmp_path / 'run'}", episodes=300)
-    full, team = (own["first_impact_harm"].mean() for own in result.columns.values())
-    assert team < 0.9 * full

@@ -21,21 +21,16 @@ def clone() -> ModuleType:
     return load("../../train/clone")
 
 
-@pytest.mark.parametrize(
-    ("episodes", "least"),
-    [pytest.param(1000, 0.9, marks=pytest.mark.slow), pytest.param(10_000, 0.98, marks=pytest.mark.long)],
-)
-def test_clone__of_ppo_saves_most_of_what_ppo_saves(
-    clone: ModuleType, tmp_path: Path, episodes: int, least: float
-) -> None:
+@pytest.mark.slow
+def test_clone__of_ppo_saves_most_of_what_ppo_saves(clone: ModuleType, tmp_path: Path) -> None:
     """Of full braking's harm, in other worlds."""
-    to_parquet(tmp_path / "ppo.parquet", "ppo", scenario="paper-random", episodes=episodes, seed=1)
+    to_parquet(tmp_path / "ppo.parquet", "ppo", scenario="paper-random", episodes=1000, seed=1)
     clone.train(tmp_path / "ppo.parquet", 0, tmp_path / "clone")
     agents = {"full_brake": "full_brake", "ppo": "ppo"}
     agents["clone"] = f"{TRAIN / 'clone.py'}:make_agent:{tmp_path / 'clone'}"
     result = eb.evaluate("paper-random", agents, episodes=500)
     worst, shipped, cloned = (result[name]["first_impact_harm"].mean() for name in agents)
-    assert worst - cloned >= least * (worst - shipped) > 0.0
+    assert worst - cloned >= 0.9 * (worst - shipped) > 0.0
 
 
 def test_clone__drives_as_the_network_itself(clone: ModuleType, tmp_path: Path) -> None:

@@ -177,7 +177,7 @@ def test_boundary__is_where_it_is_said_to_the_last_nanometre(reason, pair, shift
 
 @pytest.mark.parametrize(("vehicles", "body", "n"), [(3, 2, 12), (2, 2, 4), (2, 1, 4)])
 @pytest.mark.parametrize(
-    ("times", "steps", "share"), [(1, 120, 0.7), pytest.param(40, 500, 0.95, marks=pytest.mark.long)]
+    ("times", "steps", "share"), [(1, 120, 0.7), pytest.param(10, 500, 0.95, marks=pytest.mark.slow)]
 )
 def test_verdict__agrees_with_a_linear_programme_where_that_is_certain(vehicles, body, n, times, steps, share):
     n *= times

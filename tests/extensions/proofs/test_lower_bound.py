@@ -112,7 +112,7 @@ def test_bounds__of_shipped_lists(name):
     assert lower_bound(state, horizon_s=horizon, time_step_s=0.1).harm == pytest.approx(decided, rel=1e-12)
 
 
-@pytest.mark.parametrize("rounds", [60, pytest.param(10_000, marks=pytest.mark.long)])
+@pytest.mark.parametrize("rounds", [60, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_bound__no_searched_commands_are_below_it_and_some_are_near(rounds):
     lists = [eb.load_scenario(name).sample(60, seed=9) for name in ("paper-random", "paper-delay-high")]
     state = eb.State.join([*lists, wide_worlds(300, 3, seed=41)])

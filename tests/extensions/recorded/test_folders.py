@@ -46,6 +46,17 @@ def test_folder__is_searched_below_and_what_is_no_recording_is_skipped(tmp_path:
     assert rows_of(scenario_from_data("mine", tmp_path / "Casale" / "part1.csv", "openacc")) == rows_of(made)[:1]
 
 
+def test_progress__counts_the_files_that_were_read(empty_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good(empty_folder, "a.csv")
+    line = ["scenario", "from-data", ".", "--format", "openacc", "--force", "--output", "mine.yaml"]
+    assert run_command(line) == 0 and "files: 1 of 1\n" in capsys.readouterr().err
+    good(empty_folder, "b.csv")
+    (empty_folder / "mine.csv").unlink()
+    seen: list[tuple[str, int, int]] = []
+    scenario_from_data("mine", empty_folder, "openacc", progress=lambda *report: seen.append(report))
+    assert seen == [("files", 1, 2), ("files", 2, 2)]
+
+
 def test_refused_files__are_all_listed_and_add_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -100,6 +100,8 @@ def drive(scenario: eb.Scenario, agent: str, **options: object) -> Callable[[], 
 
 
 PLANS = KEPT.replace(roles={"vehicle_2": "learner", "vehicle_3": "ppo"})
+NOT_SHIPPED = "measures limits: scenario '{}': the least harm of 3 of these 3 worlds is not known; {}"
+FIRST = "the first 10,000 worlds of seed 7 of this scenario without changes, where vehicle_2 learns; elsewhere compare"
 REFUSED: dict[str, Callable[[], object]] = {
     "agent 'best_harm:1.5': after the colon, give the number of profiles": drive(PAPER, "best_harm:1.5"),
     "agent 'best_harm:0': after the colon": drive(PAPER, "best_harm:0"),
@@ -107,7 +109,12 @@ REFUSED: dict[str, Callable[[], object]] = {
     "search: candidates = 0: must be a whole number": lambda: Searched(eb.make_agent("coast"), PAPER, candidates=0),
     "'full_brake+step+search': a search around a shield; write +search first": drive(PAPER, "full_brake+step+search"),
     "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": drive(PLANS, "full_brake+search"),
-    "no shipped table holds 3 worlds of 3; the measures limits need": drive(PAPER, "coast", seed=8, measures="limits"),
+    NOT_SHIPPED.format("paper-random", f"a shipped table holds {FIRST}"): drive(
+        PAPER, "coast", seed=8, measures="limits"
+    ),
+    NOT_SHIPPED.format(
+        "cooperation-3-pair", "shipped tables hold the first worlds of seed 7 of cooperation-2-b"
+    ): drive(eb.load_scenario("cooperation-3-pair"), "coast", measures="limits"),
 }
 
 

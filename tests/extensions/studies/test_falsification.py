@@ -25,7 +25,7 @@ def in_hole(worlds: eb.State) -> Bools:
 class Holed:
     """Brakes fully, but coasts in the hole."""
 
-    name, knows = "holed", "sensors"
+    name, knows = "holed", "own sensors"
 
     def begin(self, alert: eb.State, body: int) -> Bools:
         return in_hole(alert)
