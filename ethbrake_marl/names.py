@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from inspect import signature
 from typing import Any
@@ -53,6 +53,7 @@ class AgentSettings:
     policy: str | None = None  # path after the @
     scenario: Scenario | None = None  # in which the agent drives; None: not known
     harm_count: str = "first"  # what optimising agents minimise: harm of the first impact of each pair, or ``total``
+    options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
         """Return the scenario. Raises ``InvalidInput`` if it is not known."""
@@ -108,7 +109,8 @@ def register_shield(
 ) -> None:
     """Give a shield, or a search, a name that can stand after a ``+``. Entry points: ``ethbrake_marl.shields``.
 
-    ``make(team, argument, settings)`` returns the wrapped team; the rest is as in ``register_agent``.
+    ``make(team, argument, settings)`` returns the wrapped team; the rest is as in ``register_agent``. If it gives the
+    team a shield, the name is also a mode of ``eb.shield``, whose further keywords are ``settings.options``.
     """
     _add(WRAPPERS, name, make, about, knows, form)
 
@@ -145,10 +147,15 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
     driver = _make(core, settings)
     for wrapper in wrappers:
         settings = replace(settings, spec=f"{settings.spec}+{wrapper}")
-        team = team_of(driver, settings.needed_scenario())
-        entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
-        driver = _called(settings.spec, entry.make, team, argument, settings)._replace(name=settings.spec)
+        driver = wrapped(team_of(driver, settings.needed_scenario()), wrapper, settings)
     return driver
+
+
+def wrapped(team: Team, wrapper: str, settings: AgentSettings) -> Team:
+    """Return a team with the shield or search ``wrapper`` around it, such as ``episode:pairwise``."""
+    entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
+    around: Team = _called(settings.spec, entry.make, team, argument, settings)
+    return around._replace(name=settings.spec)
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
@@ -333,11 +340,20 @@ def open_game(
     observation: Any = None,
     reward_vector: Any = None,
 ) -> tuple[Scenario, Game]:
-    """Return a scenario and its game, in which roles that name agents are played by these (``worlds.game.game_of``)."""
+    """Return a scenario and its game, in which roles that name agents are played by these.
+
+    Args:
+        scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
+        learners: names of the vehicles that learn; None: the scenario's.
+        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        observation: features of all vehicles, or vehicle -> features; None: the scenario's.
+        reward_vector: components of a vector reward (``episode.terms``).
+
+    """
     loaded = load_scenario(scenario)
     if learners is not None:
         loaded = loaded.with_learners(learners)
-    return game_of(loaded, None, reward, observation, reward_vector, scripts_of(loaded))
+    return game_of(loaded, scripts_of(loaded), reward, observation, reward_vector)
 
 
 def check_learners(scenario: Scenario) -> None:

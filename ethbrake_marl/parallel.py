@@ -45,14 +45,15 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
             yield function(*arguments)
         return
 
+    from concurrent.futures.process import BrokenProcessPool
+
     with naming_extras():
         from joblib import Parallel, delayed, parallel_config
-        from joblib.externals.loky.process_executor import BrokenProcessPool
-        from joblib.parallel import DEFAULT_BACKEND, get_active_backend
+        from joblib.parallel import get_active_backend
     backend = get_active_backend()[0]
     streams = backend.supports_return_generator
-    local = type(backend).__name__.lower().startswith(DEFAULT_BACKEND)
-    with parallel_config(**({"backend": DEFAULT_BACKEND, "inner_max_num_threads": 1} if local else {})):
+    one_thread = {"backend": backend, "inner_max_num_threads": 1} if backend.supports_inner_max_num_threads else {}
+    with parallel_config(**one_thread):
         parallel = Parallel(jobs, batch_size=1, return_as="generator" if streams else "list")
     work = (delayed(_answer)(_pickled(call)) for call in calls)
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])

@@ -69,7 +69,7 @@ def play_by_hand() -> float:
     assert_type(scenario, eb.Scenario)
     assert_type(game, eb.Game)
     worlds: eb.State = scenario.sample(10, 7)
-    state = game.begin(worlds)
+    state = game.reset(worlds)
     harm = eb.price(game, state, np.full((10, 1, 1), -1.0), "total")
     held = eb.hold(state, state.wanted, [2], np.full((10, 3, 1), -2.0), 8.0, "first")
     after, step = game.step(state, np.zeros((10, 1)))

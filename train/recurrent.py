@@ -66,7 +66,7 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
     optimiser = torch.optim.Adam(network.parameters(), lr=RATE)
     for update in range(args.updates):
         optimiser.param_groups[0]["lr"] = RATE * (1 - update / args.updates)
-        state = game.start(n, args.seed, first=n * update)
+        state = game.reset(game.draw(n, args.seed, first=n * update))
         memory, chosen, gained = torch.zeros(n * len(learners), HIDDEN), [], []
         while not state.ended.all():
             running = torch.from_numpy(~state.ended)[:, None]

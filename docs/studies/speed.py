@@ -108,7 +108,7 @@ def measure(*, quick: bool = False) -> list[Speed]:
 def braking(n: int, share: float) -> Work:
     """Steps from the first decision until all worlds are at rest; Vehicle 2 brakes with a share of its capacity."""
     scenario, game = eb.open_game(SCENARIO)
-    return until_rest(game, game.begin(scenario.sample(n, SEED)), np.full((n, 1), -share))
+    return until_rest(game, game.reset(scenario.sample(n, SEED)), np.full((n, 1), -share))
 
 
 def until_rest(game: eb.Game, begun: eb.State, actions: Floats) -> Work:
@@ -129,7 +129,7 @@ def until_rest(game: eb.Game, begun: eb.State, actions: Floats) -> Work:
 def stepping(n: int, steps: int = 100) -> Work:
     """Steps of all worlds: motion, harm, rewards, ends of episodes, the learner's observation, and new episodes."""
     _, game = eb.open_game(SCENARIO)
-    state, actions = game.start(n, SEED, 0), np.full((n, 1), -SHARE)
+    state, actions = game.reset(game.draw(n, SEED, 0)), np.full((n, 1), -SHARE)
     first = n
 
     def work() -> int:
@@ -138,7 +138,7 @@ def stepping(n: int, steps: int = 100) -> Work:
             state, _ = game.step(state, actions, donate=True)
             rows = np.flatnonzero(state.ended)
             if len(rows):
-                state = state.put(rows, game.start(len(rows), SEED, first), donate=True)
+                state = state.put(rows, game.reset(game.draw(len(rows), SEED, first)), donate=True)
                 first += len(rows)
             game.observe(state, game.rules.learners)
         return steps * n

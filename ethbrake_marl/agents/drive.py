@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game, Script, Shield
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step, asked, begun
+from ethbrake_marl.episode.step import Step, asked, begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
@@ -118,13 +118,13 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     """
     game = team.game(game)
     if game.shield is None:
-        state, agents, actions = game.begin(alert), game.agents(team.drivers), np.zeros((alert.n, 0))
-        memories = {body: begun(agent, alert, body) for body, agent in agents.items()}
+        state, agents, actions = game.reset(alert), game.agents(team.drivers), np.zeros((alert.n, 0))
+        memories = {body: begin(agent, alert, body) for body, agent in agents.items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.
         game = game._replace(scripts={**game.scripts, **agents}, rules=game.rules._replace(learners=NOBODY))
     else:
-        state, actions = game.begin(alert), None
+        state, actions = game.reset(alert), None
     yield None, state
     while not state.ended.all():
         state, step = game.step(state, actions, donate=donate)

@@ -16,7 +16,7 @@ from ethbrake_marl.agents.drive import MODEL, NOBODY, STATE
 from ethbrake_marl.agents.pairwise import Choice, closed_form, pairwise
 from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Rules, begin, failure, step
+from ethbrake_marl.episode.step import Rules, failure, first_decision, step
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import BRAKING, Floats
@@ -190,7 +190,7 @@ class EV2XBMPairwise:
 
 def last_if_held(alert: State, rules: Rules) -> State:
     """Return the last state of the episodes in which all vehicles hold ``alert.wanted``, decision by decision."""
-    state = begin(alert, rules.learners, rules.time_step_s, rules.horizon_s)
+    state = first_decision(alert, rules.learners, rules.time_step_s, rules.horizon_s)
     rules, nothing = rules._replace(learners=NOBODY), np.zeros((alert.n, 0))
     while not state.ended.all():
         state, _ = step(rules, {}, state, nothing, donate=True)

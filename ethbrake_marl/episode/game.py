@@ -45,12 +45,13 @@ class Shield(Protocol):
 class Game(NamedTuple):
     """Worlds to draw, rules, scripts, what is observed and rewarded, and perhaps a shield.
 
+    ``draw`` returns worlds at the alert, ``reset`` their episodes at the first decision, ``step`` the next decision.
     Environments, evaluation, search and shields share one game and its one step.
 
     >>> import numpy as np
     >>> import ethbrake_marl as eb
     >>> scenario, game = eb.open_game("paper-random")
-    >>> state = game.begin(scenario.sample(2, seed=7))
+    >>> state = game.reset(scenario.sample(2, seed=7))
     >>> after, step = game.step(state, -np.ones((2, 1)))
     >>> state.time_s, after.time_s, step.reward.shape
     (array([0.5, 0.5]), array([0.6, 0.6]), (2, 3))
@@ -68,15 +69,14 @@ class Game(NamedTuple):
     )  # body -> script that looks at the state; all others hold their first command
     shield: Shield | None = None
 
-    def begin(self, alert: State) -> State:
+    def reset(self, alert: State) -> State:
         """Return the episodes of these worlds at their first decision. Scripts have decided once, at the alert."""
         wanted, memories = alert.wanted, dict(alert.memories)
         if self.scripts:
             wanted = wanted.copy()
             for body, script in self.scripts.items():
-                wanted[:, body], memories[body] = one_step.asked(
-                    script, alert, one_step.begun(script, alert, body), body
-                )
+                memory = one_step.begin(script, alert, body)
+                wanted[:, body], memories[body] = one_step.asked(script, alert, memory, body)
         state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:
@@ -84,10 +84,6 @@ class Game(NamedTuple):
         if self.shield is not None:
             memories["shield"] = self.shield.begin(self, alert, state)
         return state._replace(memories=memories)
-
-    def start(self, n: int, seed: int, first: int) -> State:
-        """Return worlds ``first`` to ``first + n - 1`` of the seed at their first decision."""
-        return self.begin(self.draw(n, seed, first))
 
     def step(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step of all worlds, and what the step did.
@@ -108,7 +104,7 @@ class Game(NamedTuple):
 
     def first_decision(self, alert: State) -> State:
         """Return the episodes at their first decision, before shaping and shield. Scripts have decided."""
-        return one_step.begin(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
+        return one_step.first_decision(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step, and what it did: ``step`` without shield and without terms of the reward."""

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import NUMBER, TIME, State, front_share
+from ethbrake_marl.episode.state import NUMBER, TIME, State, harm_so_far, split_world
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import BRAKING, COUNT, DRIVING, FIRST, FORCE, MASS, TOTAL, Floats, Ints
@@ -45,24 +45,17 @@ COLLIDED = NUMBERS.index("collided")
 
 @large
 def report(line, car, clock, wanted, bodies, borne, out):
-    """Write NUMBERS of the bodies to ``out`` [n, bodies, len(NUMBERS)]; ``borne`` [2, N + 1] is working memory."""
+    """Write NUMBERS of the bodies to ``out`` [n, bodies, len(NUMBERS)]; ``borne`` [2, N] is working memory."""
     for k in range(len(out)):
-        first, total, impacts = 0.0, 0.0, 0.0
-        borne[:] = 0.0
+        split_world(line[k, FIRST], car[k, MASS], borne[0])
+        split_world(line[k, TOTAL], car[k, MASS], borne[1])
+        first, total, impacts = harm_so_far(line[k], False), harm_so_far(line[k], True), 0.0
         for p in range(line.shape[2] - 1):
-            for row in range(2):
-                harm = line[k, TOTAL if row else FIRST, p]
-                front = front_share(harm, car[k, MASS, p], car[k, MASS, p + 1]) if p > 0 else 0.0
-                borne[row, p] += front
-                borne[row, p + 1] += harm - front if p > 0 else 0.0
-            first, total = first + line[k, FIRST, p], total + line[k, TOTAL, p]
             impacts += line[k, COUNT, p]
-        borne[0, 1] += line[k, FIRST, 0]  # Vehicle 1 bears the harm with the obstacle; added last
-        borne[1, 1] += line[k, TOTAL, 0]
         for o in range(len(bodies)):
             i = bodies[o]
             command, world = wanted[k, i], out[k, o]
-            world[0], world[1], world[2], world[3] = clock[k, TIME], line[k, FORCE, i], borne[0, i], borne[1, i]
+            world[0], world[1], world[2], world[3] = clock[k, TIME], line[k, FORCE, i], borne[0, i - 1], borne[1, i - 1]
             world[4], world[5], world[6], world[7] = first, total, 1.0 if impacts > 0.0 else 0.0, command
             capacity = car[k, BRAKING if command < 0.0 else DRIVING, i]
             world[8] = min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0
@@ -71,7 +64,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
 def numbers(state: State, bodies: Ints) -> Floats:
     """Return NUMBERS of the bodies in every world, [n, bodies, len(NUMBERS)]."""
     out = np.empty((state.n, len(bodies), len(NUMBERS)))
-    report(state.line, state.car, state.clock, state.wanted, bodies, np.empty((2, state.line.shape[2])), out)
+    report(state.line, state.car, state.clock, state.wanted, bodies, np.empty((2, state.vehicles)), out)
     return out
 
 

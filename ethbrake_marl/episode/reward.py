@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Rules, Step
+from ethbrake_marl.episode.step import SAFE_END, Rules, Step
 from ethbrake_marl.episode.terms import (
     BUILT_IN,
     TERMS,
@@ -250,7 +250,7 @@ class Rewarding(NamedTuple):
     def shared(self, step: Step) -> dict[str, Floats]:
         """Return the values of the terms that the compiled step knows, [n]."""
         harm = step.total_harm if self.params.harm_count == "total" else step.first_impact_harm
-        known = {"harm": -harm, "terminal": step.out[-1]}
+        known = {"harm": -harm, "terminal": step.out[SAFE_END]}
         return {name: value for name, value in known.items() if name in self.counted}
 
 

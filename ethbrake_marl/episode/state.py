@@ -254,16 +254,23 @@ def front_share(harm, front_mass, rear_mass):
     return harm - front_mass / (front_mass + rear_mass) * harm
 
 
+@kernel
+def split_world(pair_harm, mass, borne):
+    """Write the harm that each vehicle of one world bears to ``borne`` [N]; Vehicle 1 bears all with the obstacle.
+
+    ``pair_harm`` [N + 1] is the harm of each pair (m2/s2), ``mass`` [N + 1] the mass of each body (t).
+    """
+    rear = 0.0
+    for p in range(1, len(borne)):
+        front = front_share(pair_harm[p], mass[p], mass[p + 1])
+        borne[p - 1] = rear + front
+        rear = pair_harm[p] - front
+    borne[len(borne) - 1] = rear
+    borne[0] += pair_harm[0]
+
+
 @large
 def split_harm(pair_harm, mass, out):
-    """Write the harm that each vehicle bears to ``out`` [n, N]; Vehicle 1 bears all harm with the obstacle.
-
-    ``pair_harm`` [n, N + 1] is the harm of each pair (m2/s2), ``mass`` [n, N + 1] the mass of each body (t).
-    """
+    """Do the same for n worlds: ``pair_harm`` and ``mass`` [n, N + 1], ``out`` [n, N]."""
     for k in range(len(out)):
-        out[k] = 0.0
-        for p in range(1, out.shape[1]):
-            front = front_share(pair_harm[k, p], mass[k, p], mass[k, p + 1])
-            out[k, p - 1] += front
-            out[k, p] += pair_harm[k, p] - front
-        out[k, 0] += pair_harm[k, 0]
+        split_world(pair_harm[k], mass[k], out[k])

@@ -56,7 +56,7 @@ class Step(NamedTuple):
     >>> import numpy as np
     >>> import ethbrake_marl as eb
     >>> scenario, game = eb.open_game("paper-random", reward={"harm": 1.0, "risk": 0.05})
-    >>> _, step = game.step(game.begin(scenario.sample(2, seed=7)), np.zeros((2, 1)))
+    >>> _, step = game.step(game.reset(scenario.sample(2, seed=7)), np.zeros((2, 1)))
     >>> step.terminated, step.first_impact_harm, [*step.terms]
     (array([False, False]), array([0., 0.]), ['harm', 'risk'])
 
@@ -134,15 +134,15 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
 def step_worlds(
     line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, horizon_s, harm, terminal, total
 ):
-    """Advance every running episode by one step, in place; return the row of a world that failed, otherwise -1.
+    """Advance every running episode by one step, in place; return the row of a refused action and of a failed world.
 
-    For an action that is no number in [-1, 1] its row is returned, and nothing has moved.
+    -1: there is none. An action is refused if it is no number in [-1, 1]; then nothing has moved.
     """
     n, bodies = wanted.shape
     for k in range(n):
         for c in range(learners.shape[0]):
             if not -LARGEST_ACTION <= actions[k, c] <= LARGEST_ACTION:
-                return k
+                return k, -1
     failed = -1
     for k in range(n):
         for row in range(out.shape[0]):
@@ -168,7 +168,7 @@ def step_worlds(
         shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * out[TOTAL_HARM if total else HARM, k]
         for i in range(bodies - 1):
             reward[k, i] = shared
-    return failed
+    return -1, failed
 
 
 @large
@@ -207,7 +207,7 @@ def advanced(state: State, until_s: Floats) -> State:
     return state._replace(line=line, car=car, clock=clock, wanted=wanted)
 
 
-def begin(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
+def first_decision(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
     """Return episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
 
     Until then ``alert.wanted`` is commanded.
@@ -240,9 +240,11 @@ def step(
     for i, command_mps2 in commands.items():
         np.copyto(wanted[:, i], command_mps2, where=running)
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
-    failed = step_worlds(line, car, clock, wanted, actions, scratch_for(wanted.shape[1]), out, reward, *rules)
+    scratch = scratch_for(wanted.shape[1])
+    refused, failed = step_worlds(line, car, clock, wanted, actions, scratch, out, reward, *rules)
+    if refused >= 0:
+        _check_actions(rules, actions[refused])
     if failed >= 0:
-        _check_actions(rules, actions[failed])
         raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
 
@@ -266,7 +268,7 @@ def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
     return np.clip(actions, -1.0, 1.0)
 
 
-def begun(script: Any, alert: State, body: int) -> Any:
+def begin(script: Any, alert: State, body: int) -> Any:
     """Return the memory of a script for new episodes. Raises ``AgentFailed`` if the script raises something."""
     return _remembered(script, _called(script, "begin", alert, body), alert.n, body)
 

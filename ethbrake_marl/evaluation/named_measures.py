@@ -16,12 +16,12 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
-from ethbrake_marl.episode.reward import Rewarding
+from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
-from ethbrake_marl.episode.terms import TERMS, TermFunction
+from ethbrake_marl.episode.terms import TERMS, TermFunction, collision, jerk, risk
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
-from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Values, Watch
+from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Watch
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Part, Registry
 
@@ -90,7 +90,12 @@ MEASURES: Registry[Measure] = Registry(
     "measure", "measures", register_measure, {measure.name: measure for measure in DEFAULT}
 )
 
-_REWARDED = ("collision", "risk", "jerk")  # built-in terms of a step, with the constants of a usual reward
+# built-in terms of a step, with the constants of a usual reward
+_REWARDED: dict[str, TermFunction] = {
+    "collision": partial(collision, RewardParams()),
+    "risk": partial(risk, RewardParams()),
+    "jerk": jerk,
+}
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
@@ -130,7 +135,7 @@ def _called(name: str) -> list[Measure]:
     if name in MEASURES:
         return [MEASURES[each] for each in MEASURES.load(name)]
     if name in _REWARDED:
-        return [_summed(name, partial(_rewarded, name), "1")]
+        return [_summed(name, _REWARDED[name], "1")]
     if name in TERMS:
         term = TERMS[name].value
         return [_summed(name, _intervention if name == "intervention" else term, TERMS[name].unit)]
@@ -160,12 +165,6 @@ def _of_file(file: str, name: str) -> Measure:
 
 def _summed(name: str, term: TermFunction, unit: str) -> Measure:
     return Measure(name, None, f"Sum of the term {name} over all steps.", unit, watch=partial(SummedTerm, term))
-
-
-def _rewarded(name: str, before: State, step: Step, after: State) -> Values:
-    learners, times = np.zeros(0, np.int64), (step.time_step_s, 0.0)
-    rewarding, _ = Rewarding.of({"harm": 0.0, name: 1.0}, "total", after.vehicles, learners, times, None)
-    return rewarding.terms[0][2](before, step, after)
 
 
 def _intervention(before: State, step: Step, after: State) -> Values:

@@ -8,6 +8,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step, advance_worlds
 from ethbrake_marl.evaluation.measures import Given, Statistic
+from ethbrake_marl.evaluation.summary_row import SHOVED_FAR_M
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.layout import (
@@ -26,7 +27,6 @@ from ethbrake_marl.motion.layout import (
 from ethbrake_marl.registry import Part
 
 POST_M = 1e5  # distance of a post that nobody reaches, from which ways are measured to 1e-10 m
-FAR = 5.0  # m beyond which Vehicle 1 counts as shoved far
 ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, because times are rounded
 
 
@@ -66,7 +66,7 @@ class Shoved:
     def result(self, last: State) -> Given:
         """Return the metres, and whether they are more than 5."""
         metres = self.way_m - self.own_way_m
-        return {"": metres, "far": metres > FAR}
+        return {"": metres, "far": metres > SHOVED_FAR_M}
 
 
 def shoved(game: Game, alert: State) -> Shoved | None:

@@ -37,8 +37,8 @@ def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
     """
     loaded, game = open_game(scenario)
     drawn = loaded.draw(WORLDS, SEED)
-    worlds, begun = drawn.worlds, game.begin(drawn.worlds)
-    harm, refused, last = {}, {}, begun
+    worlds, first = drawn.worlds, game.reset(drawn.worlds)
+    harm, refused, last = {}, {}, first
     for what, spec in COMPARED.items():
         if loaded.learners and spec in AGENTS:
             try:
@@ -52,13 +52,13 @@ def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
             last = then if spec == "full_brake" else last
             harm[what] = {each: float(then.harm(each).mean()) for each in ("first", "total")}
     if not loaded.learners:
-        last = _to_the_end(game, begun)
+        last = _to_the_end(game, first)
     return Trial(
         drawn,
-        early=int(begun.collided.sum()),
+        early=int(first.collided.sum()),
         moving=int((last.speeds_mps != 0.0).any(axis=1).sum()),
         late=int((worlds.latency_s[:, 0] > 0.0).sum()),
-        known=_known(loaded, begun),
+        known=_known(loaded, first),
         harm=harm,
         refused=refused,
     )

@@ -36,7 +36,7 @@ class Face:
 
     def _begin(self, n: int, seed: int | None, options: Any) -> State:
         """Start episodes in n worlds."""
-        self.episode = self.stream.restart(n, seed, options)
+        self.episode = self.stream.reset(n, seed, options)
         self.renderer.began(self.episode)
         return self.episode
 

@@ -177,7 +177,7 @@ class EthBrakeVecEnv(Face, VecEnv):
             info["episode"] = {"r": gained, "l": steps, "t": 0.0}
             infos[row] = info
         self._return[rows], self._steps[rows] = 0.0, 0
-        new = self.stream.draw(len(ended))
+        new = self.stream.next_episodes(len(ended))
         self._first = self._first.put(ended, new, donate=True)  # type: ignore[union-attr]  # a reset has made it
         self.episode = state.put(ended, new, donate=True)
         return self.episode

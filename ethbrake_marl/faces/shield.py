@@ -5,40 +5,31 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from functools import partial
-from inspect import signature
 from typing import Any
 
-from ethbrake_marl.agents.drive import Agent, Team
+from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
-from ethbrake_marl.episode.game import Game, Shield
-from ethbrake_marl.errors import InvalidInput, unknown_name
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import make_renderer
-from ethbrake_marl.names import team_of, teams_of
+from ethbrake_marl.names import AgentSettings, team_of, teams_of, wrapped
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.registry import Registry
-from ethbrake_marl.shields.algorithm_1 import EpisodeShield
-from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.scenario import Scenario
 
-# (drivers, **options): body -> agent, perhaps empty; the options of the mode. One called ``scenario`` is the worlds'.
-MakeShield = Callable[..., Shield]
-Make = Callable[[Mapping[int, Agent] | None], Shield]
-
-
-def register_shield_mode(name: str, make: MakeShield) -> None:
-    """Register a mode of the shield. Entry points: ``ethbrake_marl.shield_modes``."""
-    MODES.add(name, make, lambda other: other is make)
-
-
-MODES: Registry[MakeShield] = Registry(
-    "shield mode", "shield_modes", register_shield_mode, {"step": StepShield, "episode": EpisodeShield}
-)
+NOBODY = Team("", {})  # proposes nothing
 
 
 def shield(
-    env: Any, policy: Any = None, mode: str = "step", *, scenario: AnyScenario | None = None, **options: Any
+    env: Any,
+    policy: Any = None,
+    mode: str = "step",
+    *,
+    scenario: AnyScenario | None = None,
+    harm_count: str = "first",
+    **options: Any,
 ) -> Any:
     """Return a shielded copy of an environment, of the same class, or a shielded team.
 
@@ -51,10 +42,11 @@ def shield(
         policy: proposes the actions that the caller leaves out (NaN, or no entry in a dictionary); the shield also
             plans with it. A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: without a proposal
             the shield's own plan is followed.
-        mode: ``step``, ``episode`` (the paper's Algorithm 1), or the mode of an extension.
+        mode: ``step``, ``episode`` (the paper's Algorithm 1), or another shield, as after the ``+`` in an agent's name.
         scenario: in which an agent drives; not for environments and teams.
-        options: of the mode: ``harm_count`` (``first`` or ``total``) of both, ``allowance`` (m2/s2) and ``cap`` (None
-            or ``baseline``) of ``step``, ``bound`` (``coupled`` or ``pairwise``) of ``episode``.
+        harm_count: harm that is bounded, of the ``first`` impact of each pair or ``total``.
+        options: of the mode: ``allowance`` (m2/s2) and ``cap`` (None or ``baseline``) of ``step``, ``bound``
+            (``coupled`` or ``pairwise``) of ``episode``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
@@ -63,8 +55,6 @@ def shield(
     True
 
     """
-    if mode not in MODES:
-        raise unknown_name("shield mode", mode, MODES)
     if isinstance(env, str):
         raise InvalidInput(f"shield: {env!r:.60}: is a name; pass make_agent({env!r:.60}), or add +{mode} to the name")
     is_agent = hasattr(env, "act")
@@ -73,33 +63,25 @@ def shield(
         raise InvalidInput(f"shield: {env!r:.80}: {right}")
     base = getattr(env, "unwrapped", None)
     worlds: Any = getattr(base, "scenario", None) if scenario is None else load_scenario(scenario)
-    make = maker(mode, options, worlds)
+    around = partial(guarded, mode=mode, scenario=worlds, harm_count=harm_count, options=options)
     if not is_agent and not isinstance(env, Team):
-        return shielded_environment(env, base, policy, make, options.get("harm_count", "first"))
+        return shielded_environment(env, base, policy, around, harm_count)
     team = team_of(env, worlds) if is_agent else env
     if policy is not None:
         raise InvalidInput(f"shield: {team.name!r} proposes by itself; leave out policy")
-    if team.shield is not None:
-        raise InvalidInput(f"shield: team {team.name!r} already has a shield")
-    return team._replace(shield=make(team.drivers), name=f"{team.name}+{mode}")
+    return around(team)
 
 
-def maker(mode: str, options: Mapping[str, Any], worlds: Any) -> Make:
-    """Return what makes the shield of a mode for its drivers. Raises ``InvalidInput`` for bad options."""
-    wanted = signature(MODES[mode])
-    if "scenario" in wanted.parameters:
-        if worlds is None:
-            raise InvalidInput(f"shield: mode {mode!r} needs a scenario, which a team has not; shield an environment")
-        options = {**options, "scenario": worlds}
-    try:
-        wanted.bind(None, **options)
-    except TypeError as error:
-        known = ", ".join([*wanted.parameters][1:])
-        raise InvalidInput(f"shield: mode {mode!r}: {error}; its options: {known}") from None
-    return partial(MODES[mode], **options)
+def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
+    """Return a team with a shield. ``scenario``: of the worlds, if it is known."""
+    settings = AgentSettings(f"{team.name}+{mode}", None, scenario, harm_count, options)
+    other = wrapped(team, str(mode), settings)
+    if other.shield is None:
+        raise InvalidInput(f"shield: mode {mode!r}: is no shield; write it in the name of an agent, AGENT+{mode}")
+    return other
 
 
-def shielded_environment(env: Any, base: Any, policy: Any, make: Make, harm_count: str) -> Any:
+def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
     """Return a copy of an environment with a shield. A policy that is a name minimises ``harm_count``."""
     if isinstance(env, type) or not isinstance(base, Face):
         raise InvalidInput(
@@ -114,12 +96,12 @@ def shielded_environment(env: Any, base: Any, policy: Any, make: Make, harm_coun
         raise InvalidInput("shield: this environment already has a shield")
     base._need_learner()
     if policy is None:
-        return playing(env, game._replace(shield=make(None)))
+        return playing(env, game._replace(shield=around(NOBODY).shield))
     policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
     team = teams_of({"policy": policy}, base.scenario, harm_count=harm_count)["policy"]
     if team.shield is not None:
         raise InvalidInput(f"shield: policy {policy!r:.60} has a shield of its own; pass it without one")
-    return playing(env, team._replace(shield=make(team.drivers)).game(game))
+    return playing(env, around(team).game(game))
 
 
 def playing(env: Any, game: Game) -> Any:

@@ -32,7 +32,7 @@ class Stream:
         self.next = 0  # number of the next world
         self.given: Drawn | None = None  # the worlds that the last reset asked for
 
-    def restart(self, n: int, seed: int | None, options: Any = None) -> State:
+    def reset(self, n: int, seed: int | None, options: Any = None) -> State:
         """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
 
         What raises changes nothing. Raises ``InvalidInput`` for a bad seed or option; warns of unknown options.
@@ -40,14 +40,14 @@ class Stream:
         first = self.next if seed is None else 0
         seed = chosen_seed(self.seed if seed is None else seed)
         given = self._asked_for(n, options)
-        begun = self.game.start(n, seed, first) if given is None else self.game.begin(given.worlds)
+        state = self.game.reset(self.game.draw(n, seed, first) if given is None else given.worlds)
         self.seed, self.next, self.given = seed, first + (n if given is None else 0), given
-        return begun
+        return state
 
-    def draw(self, n: int) -> State:
+    def next_episodes(self, n: int) -> State:
         """Return the next n worlds at their first decision, in memory of their own."""
         assert self.seed is not None
-        state = self.game.start(n, self.seed, self.next)
+        state = self.game.reset(self.game.draw(n, self.seed, self.next))
         self.next += n
         return state
 

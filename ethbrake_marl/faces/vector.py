@@ -91,7 +91,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
             last = self._columns(state, step, renewed, renewed)
             infos = {"final_obs": final, "_final_obs": renewed, "final_info": last, "_final_info": renewed.copy()}
         if renewed.any():
-            state = self.episode = state.put(renewed, self.stream.draw(int(renewed.sum())), donate=True)
+            state = self.episode = state.put(renewed, self.stream.next_episodes(int(renewed.sum())), donate=True)
         self.renderer.stepped(state)
         infos |= self._columns(state, step, every, ~renewed)
         return self._observe(state), self._rewards(step)[:, 0], step.terminated, step.truncated, infos

@@ -13,18 +13,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent, Team, propose, to_action
+from ethbrake_marl.agents.drive import MODEL, Agent, propose, to_action
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import begun
+from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.decision import check_harm_count, check_learners, checked_drivers, spread
 from ethbrake_marl.shields.fallbacks import held, rollout
+from ethbrake_marl.shields.named import NamedShield
 
 ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
 
@@ -69,7 +70,7 @@ class EpisodeShield:
         """Return the memory at the first decision ``state``, with the driver of each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
-        remembered = begun(game.agents({body: agent})[body], alert, body)
+        remembered = begin(game.agents({body: agent})[body], alert, body)
         known = alert._replace(wanted=state.wanted)
         choice = coupled(known, body, self.count, game.rules.horizon_s) if self.coupled else pairwise(known, body)
         backup = to_action(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
@@ -108,19 +109,8 @@ class EpisodeShield:
         }
 
 
-def make_episode(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team ``TEAM+episode[:pairwise]``. Raises ``InvalidInput`` for a team of several vehicles."""
-    if len(team.drivers) > 1:
-        raise InvalidInput(
-            f"agent {settings.spec!r}: +episode works for one learner, not for a team of {len(team.drivers)}; +step"
-            " guards several"
-        )
-    bound = "coupled" if argument is None else argument
-    return team._replace(shield=EpisodeShield(team.drivers, harm_count=settings.harm_count, bound=bound))
-
-
 EPISODE = Part(
-    make_episode,
+    NamedShield(EpisodeShield, "bound"),
     form="episode[:pairwise]",
     about="the paper's hybrid: the policy or E-V2X-BM drives the whole episode",
     knows=MODEL,

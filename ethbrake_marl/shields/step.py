@@ -37,16 +37,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent, Team, propose
+from ethbrake_marl.agents.drive import MODEL, Agent, propose
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import played
 from ethbrake_marl.episode.state import State, take
-from ethbrake_marl.episode.step import begun
+from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.decision import ShieldReason, check_harm_count, check_learners, checked_drivers, spread
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
+from ethbrake_marl.shields.named import NamedShield
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
 
@@ -111,7 +112,7 @@ class StepShield:
         if drivers:
             self.rests.append((POLICY_ROLLOUT, agents_drive))
 
-    # A subclass for worlds that may be in one of M states overrides the next two, and calls ``start`` with the states.
+    # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def seen(self, state: State, memory: Memory) -> State:
         """Return the states that the worlds may be in now, M rows for each world, the nominal one first."""
@@ -133,17 +134,17 @@ class StepShield:
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
         """Return the memory at the first decision ``state``."""
-        return self.start(game, alert, state, state, self.agents_at(game, alert))
+        return self.first_memory(game, alert, state, state, self.agents_at(game, alert))
 
     def agents_at(self, game: Game, alert: State) -> dict[int, Any]:
         """Return the memories of the shield's agents for new episodes, body -> memory."""
-        return {body: begun(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
+        return {body: begin(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
         """Return the constant actions from which the first plan is chosen, [n, T, L] each."""
         return first_plans(game, alert, state, self.count)
 
-    def start(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
+    def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
         """Return the memory at the first decision ``state``: the best constant actions, or the agents' own play."""
         rows, plans = np.arange(state.n), self.plans(game, alert, state, states)
         prices = np.stack([self.price(game, states, plan) for plan in plans])
@@ -299,9 +300,4 @@ def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, mo
     return rollout(game, shield.drivers, nominal, plans, shield.count, most), np.zeros(len(plans))
 
 
-def make_step(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team ``TEAM+step``."""
-    return team._replace(shield=StepShield(team.drivers, harm_count=settings.harm_count))
-
-
-STEP = Part(make_step, form="step", about="shield: every action is certified, or replaced", knows=MODEL)
+STEP = Part(NamedShield(StepShield), form="step", about="shield: every action is certified, or replaced", knows=MODEL)

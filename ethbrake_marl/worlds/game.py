@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +12,6 @@ from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.roles import LEARNER, deceleration_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
@@ -39,51 +36,36 @@ class Pool:
 
 
 def game_of(
-    scenario: AnyScenario,
-    learners: Iterable[str] | None = None,
+    scenario: Scenario,
+    scripts: Mapping[int, Script],
     reward: Reward = "harm",
     observation: Any = None,
     reward_vector: Any = None,
-    scripts: Mapping[int, Script] | None = None,
 ) -> tuple[Scenario, Game]:
-    """Return a scenario and its game.
+    """Return a scenario, with the observation, and its game. ``names.open_game`` also finds both by names.
 
     Args:
-        scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
-        learners: names of the vehicles that learn; None: the scenario's.
+        scenario: of the worlds.
+        scripts: body -> script, for each vehicle whose role is an agent that looks at the state.
         reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: features of all vehicles, or vehicle -> features; None: the scenario's.
         reward_vector: components of a vector reward (``episode.terms``).
-        scripts: body -> script, for vehicles whose role is neither ``learner``, ``full_brake`` nor ``coast``.
 
     """
-    loaded = load_scenario(scenario)
-    if learners is not None:
-        loaded = loaded.with_learners(learners)
     if observation is not None:
-        now = {name: view.names for name, view in zip(loaded.vehicle_names, views_of(loaded), strict=True)}
-        loaded = loaded.replace(observation={**now, **observation} if isinstance(observation, Mapping) else observation)
-    _check_roles(loaded, scripts or {})
-    bodies = np.array(loaded.learners, np.int64)
+        now = {name: view.names for name, view in zip(scenario.vehicle_names, views_of(scenario), strict=True)}
+        scenario = scenario.replace(
+            observation={**now, **observation} if isinstance(observation, Mapping) else observation
+        )
+    bodies = np.array(scenario.learners, np.int64)
     rewarding, rules = Rewarding.of(
-        reward, loaded.objective, loaded.vehicles, bodies, (loaded.time_step_s, loaded.horizon_s), reward_vector
+        reward, scenario.objective, scenario.vehicles, bodies, (scenario.time_step_s, scenario.horizon_s), reward_vector
     )
-    views = (View(), *views_of(loaded))
-    game = Game(Pool(loaded), loaded.name, rules, rewarding, views, bodies, scripts or {})
-    for extension in (loaded.members or (loaded,))[0].v2x.extensions:  # members of a mixture have the same
+    views = (View(), *views_of(scenario))
+    game = Game(Pool(scenario), scenario.name, rules, rewarding, views, bodies, scripts)
+    for extension in (scenario.members or (scenario,))[0].v2x.extensions:  # members of a mixture have the same
         game = extension.game(game)
-    return loaded, game
-
-
-def _check_roles(scenario: Scenario, scripts: Mapping[int, Script]) -> None:
-    """Raise ``InvalidInput`` for a vehicle whose role is an agent that nobody has given."""
-    for body, name in enumerate(scenario.vehicle_names, 1):
-        role = scenario.roles[name]
-        if body not in scripts and role not in (LEARNER, "full_brake", "coast") and deceleration_of(role) is None:
-            raise InvalidInput(
-                f"scenario {scenario.name!r}: roles.{name} = {role}: is an agent, which must be given as"
-                f" scripts={{{body}: ...}}; by themselves vehicles play {LEARNER}, full_brake, coast or constant:a"
-            )
+    return scenario, game
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import at_alert, begin
+from ethbrake_marl.episode.step import at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
 from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, FAR_M, GAP, LATENCY, Bools, Floats, Ints
@@ -178,7 +178,7 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
 def has_early_impact(scenario: Scenario, alert: State) -> Bools:
     """Return whether an impact happens no later than the first learner can act, [n]: nobody can prevent it."""
     deciders = np.array(scenario.learners, np.int64)
-    state = begin(alert, deciders, scenario.time_step_s, scenario.horizon_s)
+    state = first_decision(alert, deciders, scenario.time_step_s, scenario.horizon_s)
     return np.asarray(state.line[:, COUNT].any(axis=1))
 
 

@@ -16,11 +16,10 @@ from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 from ethbrake_marl.names import open_game, register_agent
 from ethbrake_marl.shields.step import StepShield
-from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 
-PAPER, GAME = game_of("paper-random")
-PAIR = game_of("cooperation-3-pair")
+PAPER, GAME = open_game("paper-random")
+PAIR = open_game("cooperation-3-pair")
 
 
 class Counting:
@@ -159,7 +158,7 @@ def test_commands_and_actions__are_each_others_inverse_and_clipped() -> None:
 
 
 def test_proposals__stand_in_the_order_of_the_drivers() -> None:
-    state = PAIR[1].start(3, 1, 0)
+    state = PAIR[1].reset(PAIR[1].draw(3, 1, 0))
     drivers = {2: Held("full_brake"), 3: Held("coast")}
     actions, after = propose(drivers, state, {body: agent.begin(state, body) for body, agent in drivers.items()})
     assert (actions == [[-1.0, 0.0]] * 3).all() and set(after) == {2, 3}

@@ -13,7 +13,7 @@ from ethbrake_marl.agents.drive import MODEL, STATE, Team, drive
 from ethbrake_marl.agents.e_v2x_bm import coupled, harms
 from ethbrake_marl.agents.pairwise import CANDIDATES, find_candidates, meet, pairwise, predicted_harm
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import at_alert, begin
+from ethbrake_marl.episode.step import at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.layout import BRAKING, LATENCY, SPEED, Floats
 from ethbrake_marl.names import make_agent, open_game
@@ -271,7 +271,7 @@ def test_choice__does_not_depend_on_the_batch_nor_on_coasting_before():
     best = coupled(worlds, 2)
     for k in (0, 17, 59):
         assert [column[0] for column in coupled(worlds.take([k]), 2)] == [column[k] for column in best]
-    later = begin(worlds, game.deciders, 0.1, 8.0)
+    later = first_decision(worlds, game.deciders, 0.1, 8.0)
     for choose in (coupled, pairwise):
         np.testing.assert_allclose(choose(later, 2).harm, choose(worlds, 2).harm, rtol=0.0, atol=1e-9)
 

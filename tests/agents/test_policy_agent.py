@@ -32,13 +32,13 @@ from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.motion.layout import BRAKING, DRIVING
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.step import StepShield
-from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 
-PAPER, GAME = game_of("paper-random")
-OBSTACLE = game_of("paper-random-obstacle")
+PAPER, GAME = open_game("paper-random")
+OBSTACLE = open_game("paper-random-obstacle")
 WORLDS = PAPER.sample(12, 7)
 PPO = load_shipped("ppo")
 OTHERS = ["own", "rear_1", "front_1"]  # as many features as the usual ones
@@ -52,7 +52,7 @@ def harms(agent: Agent, game: Any = GAME, worlds: Any = WORLDS) -> list[float]:
 
 def actions(agent: Agent) -> list[float]:
     """The first commands of Vehicle 2, as shares of its capacities."""
-    state = GAME.begin(WORLDS)
+    state = GAME.reset(WORLDS)
     command = agent.act(state, agent.begin(WORLDS, 2), 2)[0]
     return (command / np.where(command < 0.0, state.car[:, BRAKING, 2], state.car[:, DRIVING, 2])).tolist()
 
@@ -78,7 +78,7 @@ def rows(n: int = 2, **settings: Any) -> Any:
 
 
 def test_learned_agent__acts_in_fractions_of_the_vehicles_capacity() -> None:
-    state = GAME.begin(WORLDS)
+    state = GAME.reset(WORLDS)
     action = PPO(PPO.observation.observe(state, np.array([3]), 0.1)[:, 0])[:, 0].astype(float)
     command = LearnedAgent(PPO).act(state, None, 3)[0]
     braking, driving = state.car[:, BRAKING, 3], state.car[:, DRIVING, 3]
@@ -117,7 +117,7 @@ def test_learned_agent__is_for_policies_of_one_action() -> None:
 @pytest.mark.parametrize("shape", [(-1, 1), (-1,)])
 def test_function__drives_by_what_it_returns(shape: tuple[int, ...]) -> None:
     agent = policy_agent(lambda seen: (seen[:, 1] - 0.6).clip(-0.8, 0.4).reshape(shape))
-    seen = View().observe(GAME.begin(WORLDS), np.array([2]), 0.1)[:, 0, 1]
+    seen = View().observe(GAME.reset(WORLDS), np.array([2]), 0.1)[:, 0, 1]
     assert actions(agent) == pytest.approx((seen - 0.6).clip(-0.8, 0.4).tolist())
     assert (
         agent.name == "<lambda>" and policy_agent(brake).name == "brake" and policy_agent(brake, name="b").name == "b"
@@ -169,7 +169,7 @@ def no_steps(n: int) -> Any:
 
 
 def test_memory__belongs_to_each_world_and_to_nobody_else() -> None:
-    agent, state = policy_agent(ramp, initial_state=no_steps), GAME.begin(WORLDS)
+    agent, state = policy_agent(ramp, initial_state=no_steps), GAME.reset(WORLDS)
     memory = agent.begin(WORLDS, 2)
     for k in range(3):
         before = copy.deepcopy(memory)
@@ -249,7 +249,7 @@ def test_onnx__observes_what_its_metadata_name() -> None:
 
 @pytest.mark.parametrize("given", [brake, small_net()], ids=["function", "torch module"])
 def test_policy_that_says_nothing__is_asked_for_its_features_where_they_are_not_the_usual_ones(given: Any) -> None:
-    own = game_of("paper-random", observation=OTHERS)
+    own = open_game("paper-random", observation=OTHERS)
     for scenario, game in (OBSTACLE, own):
         with refused("nothing says which features the policy observes, and vehicle_2 of scenario 'paper-random"):
             harms(policy_agent(given), game, scenario.sample(3, 7))

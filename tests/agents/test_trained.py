@@ -6,9 +6,8 @@ from typing import Any
 
 from ethbrake_marl import policies
 from ethbrake_marl.agents.drive import drive
-from ethbrake_marl.names import make_agent
+from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
-from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 
 SHIPPED = Path(policies.__file__).parents[1] / "_policies" / "ppo"
@@ -28,6 +27,6 @@ def test_policy__drives_by_the_name_of_its_algorithm(tmp_path: Path) -> None:
 def test_team_of_a_run__has_a_policy_for_each_learner(tmp_path: Path) -> None:
     for vehicle in ("vehicle_2", "vehicle_3"):
         shutil.copytree(SHIPPED, tmp_path / "policy" / vehicle)
-    scenario, game = game_of("cooperation-3-pair")
+    scenario, game = open_game("cooperation-3-pair")
     team: Any = make_agent(f"team@{tmp_path}", scenario=scenario)
     assert list(team.drivers) == [2, 3] and drive(game, scenario.sample(2, 7), team).ended.all()

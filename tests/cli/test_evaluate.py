@@ -62,7 +62,7 @@ def test_a_team__goes_behind_the_step_shield_and_no_other(ethbrake: Command) -> 
     alone, shielded = told_json(ethbrake(*words, "pair.py:make,pair.py:make+step"))
     assert shielded["agent"] == "pair.py:make+step" and shielded["total_harm"] < alone["total_harm"]
     check_refused(
-        ethbrake(*words, "pair.py:make+episode"), "agent 'pair.py:make+episode': +episode works for one learner"
+        ethbrake(*words, "pair.py:make+episode"), "mode 'episode' needs the policy of exactly one learner, not of 2"
     )
     check_refused(
         ethbrake("evaluate", "--agents", "pair.py:make"),

@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
 
 PAIR = Scenario(
@@ -18,8 +18,8 @@ BEYOND = float(np.nextafter(np.float32(1), np.float32(2)))
 
 
 def stepped(*action: float) -> State:
-    _, game = game_of(PAIR)
-    return game.step(game.start(1, 0, 0), np.array([action]))[0]
+    _, game = open_game(PAIR)
+    return game.step(game.reset(game.draw(1, 0, 0)), np.array([action]))[0]
 
 
 @pytest.mark.parametrize(
@@ -47,6 +47,6 @@ def test_action__further_beyond_is_refused() -> None:
     "actions", [np.zeros((1, 1)), np.zeros(2), np.array([["a", "b"]]), np.zeros((1, 2), bool), None]
 )
 def test_actions__of_another_shape_or_kind_are_refused(actions: object) -> None:
-    _, game = game_of(PAIR)
+    _, game = open_game(PAIR)
     with pytest.raises(InvalidInput, match=r"must be an array of numbers with the shape \(1, 2\)"):
-        game.step(game.start(1, 0, 0), actions)  # type: ignore[arg-type]
+        game.step(game.reset(game.draw(1, 0, 0)), actions)  # type: ignore[arg-type]

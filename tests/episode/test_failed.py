@@ -12,7 +12,7 @@ from ethbrake_marl.episode.play import hold, price
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.layout import GAP, SPEED
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 
 N, PLANTED = 5, 3
 
@@ -26,11 +26,11 @@ def planted(state: State) -> State:
 
 @pytest.fixture
 def game() -> Game:
-    return game_of("paper-random")[1]
+    return open_game("paper-random")[1]
 
 
 def test_step__names_world_and_time_and_changes_nothing(game: Game) -> None:
-    state, _ = game.step(game.start(N, 5, 10), np.zeros((N, 1)))
+    state, _ = game.step(game.reset(game.draw(N, 5, 10)), np.zeros((N, 1)))
     state = planted(state)
     before = copy.deepcopy(state)
     with pytest.raises(
@@ -44,7 +44,7 @@ def test_step__names_world_and_time_and_changes_nothing(game: Game) -> None:
 
 
 def test_world_of_the_caller__is_named_by_its_row(game: Game) -> None:
-    state = planted(game.start(N, 5, 10))
+    state = planted(game.reset(game.draw(N, 5, 10)))
     state.clock[:, NUMBER] = -1.0
     with pytest.raises(PhysicsError, match=r"^world 3: a check of the physics failed between 0.5 s"):
         game.step(state, np.zeros((N, 1)))
@@ -52,11 +52,11 @@ def test_world_of_the_caller__is_named_by_its_row(game: Game) -> None:
 
 def test_first_decision__cannot_be_reached(game: Game) -> None:
     with pytest.raises(PhysicsError, match=r"^world 13: .* between 0 s and 0.5 s"):
-        game.begin(planted(game.draw(N, 5, 10)))
+        game.reset(planted(game.draw(N, 5, 10)))
 
 
 def test_price__is_infinite_there_and_nowhere_else(game: Game) -> None:
-    state = planted(game.start(N, 5, 10))
+    state = planted(game.reset(game.draw(N, 5, 10)))
     priced = price(game, state, np.zeros((N, 1, 1)), "first")
     held = hold(state, state.wanted, [2], np.zeros((N, 1, 1)), 8.0, "first")
     for harm in (priced, held[0, :, 0], held[1, :, 0]):

@@ -12,8 +12,9 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import game_of, views_of
+from ethbrake_marl.worlds.game import views_of
 from tests.episode.lines import later, state_of
 
 TWO_AHEAD = View(["own", "front_1", "front_2", "rear_1"])
@@ -172,8 +173,8 @@ def test_role_and_obstacle__are_observed_only_where_there_is_an_obstacle() -> No
     ("name", "size", "steps"), [("paper-random", 7 * 3 + 2 * 2 + 1, 1), ("cooperation-4-all", 28, 15)]
 )
 def test_full_state__has_every_vehicle_pair_time_and_obstacle(name: str, size: int, steps: int) -> None:
-    scenario, game = game_of(name)
-    state = game.begin(scenario.sample(5, 7))
+    scenario, game = open_game(name)
+    state = game.reset(scenario.sample(5, 7))
     for _ in range(steps):
         state, _ = game.step(state, np.full((5, len(game.rules.learners)), -0.5))
     obstacle = scenario.has_obstacle

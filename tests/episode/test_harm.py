@@ -14,7 +14,7 @@ from ethbrake_marl.episode.objectives import amounts, objectives_of, parse_objec
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 from tests.episode.lines import later, state_of
 
 EPS = np.finfo(float).eps
@@ -196,8 +196,8 @@ OBJECTIVES = ["total", "own", "social:30", "maximin", "mass-weighted", "weighted
 @pytest.mark.parametrize("count", ["first", "total"])
 @pytest.mark.parametrize("objective", [*OBJECTIVES, ["total", "own", "social:45"]], ids=str)
 def test_rewards__add_up_to_minus_the_objective_of_the_last_state(objective: Any, count: str) -> None:
-    scenario, game = game_of("paper-random", reward={"harm": 1.0, "objective": objective, "harm_count": count})
-    state, total = game.begin(scenario.sample(40, 4)), np.zeros((40, 3))
+    scenario, game = open_game("paper-random", reward={"harm": 1.0, "objective": objective, "harm_count": count})
+    state, total = game.reset(scenario.sample(40, 4)), np.zeros((40, 3))
     actions = np.random.default_rng(2).uniform(-1.0, 0.0, (40, 1))
     while not state.ended.all():
         state, step = game.step(state, actions)

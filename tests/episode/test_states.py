@@ -14,7 +14,7 @@ from ethbrake_marl.episode.play import descend, hold, price
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 
 N = 7
 REWARDS: dict[str, Any] = {
@@ -28,7 +28,7 @@ REWARDS: dict[str, Any] = {
 
 @pytest.fixture(params=REWARDS)
 def game(request: pytest.FixtureRequest) -> Game:
-    return game_of(request.param, reward=REWARDS[request.param])[1]
+    return open_game(request.param, reward=REWARDS[request.param])[1]
 
 
 def actions(game: Game, seed: int, n: int = N) -> np.ndarray:
@@ -39,7 +39,7 @@ def actions(game: Game, seed: int, n: int = N) -> np.ndarray:
 
 def middle(game: Game) -> State:
     """Return episodes in their middle; some may have ended."""
-    state = game.start(N, 3, 0)
+    state = game.reset(game.draw(N, 3, 0))
     for k in range(25):
         state, _ = game.step(state, actions(game, k))
     return state
@@ -89,7 +89,7 @@ def test_rows__go_on_alone_as_together(game: Game) -> None:
 @pytest.mark.parametrize("rows", [[1, 4], np.array([k in (2, 6) for k in range(N)]), slice(2, 5)])
 def test_put__replaces_these_rows_and_no_others(game: Game, rows: Any) -> None:
     state = middle(game)
-    before, new = bits(state), game.start(N, 3, 50).take(rows)
+    before, new = bits(state), game.reset(game.draw(N, 3, 50)).take(rows)
     placed = state.put(rows, new)
     others = np.setdiff1d(np.arange(N), np.arange(N)[rows])
     assert bits(placed.take(rows)) == bits(new) and bits(placed.take(others)) == bits(state.take(others))
@@ -128,8 +128,8 @@ def test_price__is_the_harm_that_happens_to_the_last_bit(game: Game, count: str)
 
 
 def test_hold__is_the_harm_of_constant_commands() -> None:
-    _, game = game_of("paper-random-obstacle")
-    state = game.start(N, 3, 0)
+    _, game = open_game("paper-random-obstacle")
+    state = game.reset(game.draw(N, 3, 0))
     tried = -state.car[:, BRAKING, [2]] * np.array([0.0, 0.5, 1.0])
     found = hold(state, state.wanted, [2], tried[:, :, np.newaxis], game.rules.horizon_s, "total")
     for c, share in enumerate((0.0, -0.5, -1.0)):
@@ -140,7 +140,7 @@ def test_hold__is_the_harm_of_constant_commands() -> None:
 
 
 def test_descend__returns_the_commands_whose_harm_it_tells() -> None:
-    scenario, game = game_of("cooperation-3-pair")
+    scenario, game = open_game("cooperation-3-pair")
     state, shares, learners = scenario.sample(50, 3), np.linspace(0.0, 1.0, 5), game.rules.learners.tolist()
     wanted, least = descend(state, learners, shares, 2, 8.0, "first")
     found = hold(state, wanted, learners, wanted[:, np.newaxis, learners], 8.0, "first")[0, :, 0]
@@ -170,13 +170,13 @@ class Eases(Counts):
 
 
 def test_script__commands_from_the_alert_on() -> None:
-    _, game = game_of("paper-random")
-    state = game._replace(scripts={1: Eases()}).start(2, 7, 0)
+    _, game = open_game("paper-random")
+    state = game._replace(scripts={1: Eases()}).reset(game.draw(2, 7, 0))
     assert (state.wanted[:, 1] == -3.0).all()
     assert state.speeds_mps[:, 0] == pytest.approx(game.draw(2, 7, 0).speeds_mps[:, 0] - 3.0 * state.time_s)
 
 
 def test_memory_of_a_script__cannot_be_changed_in_place_because_plays_share_it() -> None:
-    _, game = game_of("paper-random")
+    _, game = open_game("paper-random")
     with pytest.raises(AgentFailed, match="vehicle_3: act fails: ValueError: output array is read-only"):
-        game._replace(scripts={3: Counts()}).start(2, 7, 0)
+        game._replace(scripts={3: Counts()}).reset(game.draw(2, 7, 0))

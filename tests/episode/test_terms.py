@@ -16,8 +16,8 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import potential, register_term
 from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import game_of
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.contract.interfaces import CRASH, REST
 from tests.episode.lines import later, state_of, step_between
@@ -105,8 +105,8 @@ def test_risk__by_hand(
 def test_terminal__is_paid_once_at_a_safe_end(
     scenario: Scenario, action: float, when: int | None, truncated: int | None
 ) -> None:
-    _, game = game_of(scenario, reward={"harm": 0.0, "terminal": 3.0})
-    state = game.start(1, 0, 0)
+    _, game = open_game(scenario, reward={"harm": 0.0, "terminal": 3.0})
+    state = game.reset(game.draw(1, 0, 0))
     for k in range(11):
         state, step = game.step(state, np.full((1, 1), action))
         assert bool(step.truncated[0]) == (k == truncated)
@@ -116,8 +116,8 @@ def test_terminal__is_paid_once_at_a_safe_end(
 
 @pytest.mark.parametrize(("reward", "count"), [("harm", "first"), ("total-harm", "total")])
 def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, count: str) -> None:
-    _, game = game_of("paper-random-obstacle", reward=reward)
-    state, cost = game.start(20, 7, 0), np.zeros(20)
+    _, game = open_game("paper-random-obstacle", reward=reward)
+    state, cost = game.reset(game.draw(20, 7, 0)), np.zeros(20)
     while not state.ended.all():
         state, step = game.step(state, np.full((20, 1), -0.2))
         cost += arrays(game, state, step, 7, 2)["cost"]
@@ -137,8 +137,8 @@ def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, coun
 @pytest.mark.parametrize("discount", [1.0, 0.9])
 def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount: float) -> None:
     reward = {"harm": 0.0, "shaping": 1.0, "shaping_discount": discount}
-    scenario, game = game_of("paper-random", reward=reward)
-    state = game.begin(scenario.sample(50, 7))
+    scenario, game = open_game("paper-random", reward=reward)
+    state = game.reset(scenario.sample(50, 7))
     tried = state.car[:, BRAKING, [2]] * -np.linspace(0.0, 1.0, 9)
     least = hold(state, -state.car[:, BRAKING], [2], tried[:, :, np.newaxis], scenario.horizon_s, "first")[0].min(
         axis=1
@@ -153,7 +153,7 @@ def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount: f
 
 
 def test_potential__counts_only_what_is_still_to_come() -> None:
-    _, game = game_of("paper-random", reward={"harm": 1.0, "harm_count": "total"})
+    _, game = open_game("paper-random", reward={"harm": 1.0, "harm_count": "total"})
     state = later(state_of([0.5, 60.0], [10.0, 20.0, 5.0]), -16.0, 8.0)
     assert state.harm("total") > 0.0 and (state.line[:, SPEED, 1:] == 0.0).all()
     assert potential(game.rules, state) == 0.0
@@ -177,15 +177,15 @@ def test_components__of_a_step_by_hand() -> None:
 
 
 def test_components__of_vehicles_add_up_to_the_reward() -> None:
-    _, game = game_of("cooperation-4-all", reward="harm", reward_vector="vehicles")
-    state = game.start(30, 1, 0)
+    _, game = open_game("cooperation-4-all", reward="harm", reward_vector="vehicles")
+    state = game.reset(game.draw(30, 1, 0))
     while not state.ended.all():
         state, step = game.step(state, np.full((30, len(game.rules.learners)), -0.2))
         assert step.vector is not None and step.vector.shape == (30, 3, 3)
         assert step.vector.sum(axis=2) == near(step.reward, abs=1e-9)
     assert state.collided.any()
-    _, game = game_of("paper-random", reward="harm", reward_vector=["harm", "harm_2"])
-    _, step = game.step(game.start(3, 1, 0), np.zeros((3, 1)))
+    _, game = open_game("paper-random", reward="harm", reward_vector=["harm", "harm_2"])
+    _, step = game.step(game.reset(game.draw(3, 1, 0)), np.zeros((3, 1)))
     assert step.vector is not None and step.vector.shape == (3, 3, 2) and [*step.terms] == ["harm"]
 
 
@@ -194,8 +194,8 @@ def test_components__of_vehicles_add_up_to_the_reward() -> None:
 
 def rewards(reward: Any, scenario: Any = "paper-random", n: int = 40) -> tuple[np.ndarray, State]:
     """Return the sum of rewards of each vehicle, and the last state."""
-    loaded, game = game_of(scenario, reward=reward)
-    state, total = game.begin(loaded.sample(n, 4)), np.zeros((n, 3))
+    loaded, game = open_game(scenario, reward=reward)
+    state, total = game.reset(loaded.sample(n, 4)), np.zeros((n, 3))
     actions = np.random.default_rng(2).uniform(-1.0, 0.0, (n, 1))
     while not state.ended.all():
         state, step = game.step(state, actions)
@@ -222,9 +222,9 @@ def test_objective__changes_no_weight_and_no_other_term() -> None:
 def test_objective__without_a_weight_of_harm_has_no_effect_and_warns() -> None:
     own = load_scenario("cooperation-3-pair").replace(objective="own")
     with pytest.warns(WithoutEffect, match="the scenario's objective, own, has no effect"):
-        _, game = game_of(own, reward="paper")
+        _, game = open_game(own, reward="paper")
     assert game.rules.harm == 0.0 and "harm" not in game.rewarding.counted
-    game_of(own, reward={"harm": 1.0, "risk": 0.1})
+    open_game(own, reward={"harm": 1.0, "risk": 0.1})
 
 
 def test_named_rewards__are_those_of_the_page() -> None:

@@ -12,7 +12,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import Result, evaluate
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.named_measures import measures_called
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
 
 # Two vehicles at 20 m/s, 1 m apart, brake with 6 m/s2, the rear one from 0.5 s. By hand: at 0.5 s the gap is 0.25 m and
@@ -64,7 +64,7 @@ def evaluated(
     scenario: Any, n: int = 40, agents: Any = (FULL_BRAKE, GENTLE), measures: Any = (), **more: Any
 ) -> Result:
     """Return the result of agents of the only learner in the first worlds of seed 7."""
-    loaded, game = game_of(Scenario(**scenario) if isinstance(scenario, dict) else scenario)
+    loaded, game = open_game(Scenario(**scenario) if isinstance(scenario, dict) else scenario)
     (body,) = game.rules.learners.tolist()
     drawn = loaded.draw(n, 7)
     return evaluate(
@@ -79,5 +79,5 @@ def recorded(recordings: int, rows_of_each: int = 20) -> Scenario:
         gap_m, speed_mps = rng.uniform(4, 12), rng.uniform(14, 22)
         rows += [[gap_m + rng.uniform(0, 1), speed_mps, f"drive_{k}.csv: 1-2-3"] for _ in range(rows_of_each)]
     table = {"columns": ["gap_1_m", "speed_2_mps", "recording"], "rows": rows}
-    paper = game_of("paper-random")[0]
+    paper = open_game("paper-random")[0]
     return Scenario(**{**paper.declared(), "name": "recorded", "table": table})

@@ -26,11 +26,11 @@ from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, r
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.motion.layout import GAP
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import game_of
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, teams
 from tests.refused import refused
 
@@ -59,7 +59,7 @@ def test_measures__of_one_impact_by_hand() -> None:
 
 def test_shoving__is_where_vehicle_1_ends_minus_where_it_would() -> None:
     result = evaluated("paper-random-obstacle", 40, [COAST], ["vehicle_1_shoved_m"])
-    scenario, game = game_of("paper-random-obstacle")
+    scenario, game = open_game("paper-random-obstacle")
     alert = scenario.sample(40, 7)
     last = [state for _, state in evaluating.play(game, alert, teams(COAST)["coast"])][-1]
     way = alert.obstacle_gap_m - last.obstacle_gap_m
@@ -267,7 +267,7 @@ def test_result__is_the_same_in_chunks_of_any_size(monkeypatch: pytest.MonkeyPat
 
 
 def test_identity__changes_with_worlds_and_scenario_alone() -> None:
-    scenario, game = game_of("paper-random")
+    scenario, game = open_game("paper-random")
     about = evaluated("paper-random", 5, [FULL_BRAKE]).about
     assert evaluated("paper-random", 5, [GENTLE]).about == about
     assert {"python", "ethbrake-marl", "numba", "numpy"} <= about["versions"].keys() and len(
@@ -324,7 +324,7 @@ def test_door__refuses(message: str) -> None:
 
 
 def test_our_agents__are_sent_to_processes_and_report_what_they_predict(monkeypatch: pytest.MonkeyPatch) -> None:
-    scenario, game = game_of("paper-random")
+    scenario, game = open_game("paper-random")
     ppo = {2: LearnedAgent(load_shipped("ppo"), "ppo")}
     agents = {
         "e_v2x_bm": Team("e", {2: EV2XBM(game.rules)}), "ppo": Team("p", ppo),
@@ -352,7 +352,7 @@ def test_golden_rows() -> None:
 
 
 def test_result__says_who_knows_what_and_what_was_evaluated() -> None:
-    scenario, game = game_of("cooperation-2-blocked")
+    scenario, game = open_game("cooperation-2-blocked")
     agents = {**teams(FULL_BRAKE, Careless()), "both": Team("both", {2: FULL_BRAKE._replace(knows="true model")})}
     result = evaluate(scenario.draw(12, 7), agents, game)
     assert result.knows == {"full_brake": "own sensors", "careless": "not stated", "both": "true model"}
@@ -373,10 +373,10 @@ class Wild(Careless):
 
 
 def refusals() -> dict[str, Any]:
-    scenario, game = game_of("paper-random")
+    scenario, game = open_game("paper-random")
     drawn, mine = scenario.draw(3, 7), teams(FULL_BRAKE)
-    begun = game.begin(drawn.worlds)
-    pair = game_of(game_of("cooperation-2-five")[0])[0].draw(2, 7)
+    begun = game.reset(drawn.worlds)
+    pair = open_game(open_game("cooperation-2-five")[0])[0].draw(2, 7)
     local, wrong = Careless(), Team("x", {1: FULL_BRAKE})
     local.lock = threading.Lock()  # type: ignore[attr-defined]
     return {
@@ -399,7 +399,7 @@ def test_evaluation__that_is_refused(message: str) -> None:
 
 
 def test_failed_physics__raises_with_the_number_of_the_world() -> None:
-    scenario, game = game_of("paper-random")
+    scenario, game = open_game("paper-random")
     worlds = scenario.sample(4, 7, first=100)
     line = worlds.line.copy()
     line[2, GAP, 1] = np.nan
@@ -429,7 +429,7 @@ class Touching(Careless):
 
 def test_what_others_bring__cannot_change_what_happens() -> None:
     """Measures, watches and agents see the arrays of a running episode, and cannot write to them."""
-    scenario, game = game_of("paper-random")
+    scenario, game = open_game("paper-random")
     worlds = scenario.draw(3, 7)
     with refused("agent 'touching', vehicle_2: act fails: ValueError"):
         evaluate(worlds, teams(Touching()), game)

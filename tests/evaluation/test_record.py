@@ -9,14 +9,14 @@ import pytest
 
 from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless
 from tests.refused import refused
 
 
 def recorded(scenario: Any, agent: Any = FULL_BRAKE, number: int = 0, **more: Any) -> EpisodeRecord:
-    loaded, game = game_of(scenario)
+    loaded, game = open_game(scenario)
     (body,) = game.rules.learners.tolist()
     return record_episode(loaded.sample(1, 7, first=number), Team(agent.name, {body: agent}), game, **more)
 
@@ -39,7 +39,7 @@ def test_record__of_one_impact_by_hand() -> None:
 
 @pytest.mark.parametrize("scenario", ["paper-random", "paper-random-obstacle", "paper-random-buildup", "stress-wide"])
 def test_record__is_the_episode_of_an_evaluation_and_ends_with_it(scenario: str) -> None:
-    loaded, game = game_of(scenario)
+    loaded, game = open_game(scenario)
     for number in range(4):
         agent = FULL_BRAKE if scenario == "stress-wide" else GENTLE
         record, team = recorded(scenario, agent, number), Team("x", {2: agent})
@@ -63,12 +63,12 @@ def test_record__at_the_horizon_is_not_at_rest() -> None:
 
 
 def test_record__that_is_refused() -> None:
-    scenario, game = game_of("paper-random")
+    scenario, game = open_game("paper-random")
     worlds, team = scenario.sample(2, 7), Team("x", {2: Careless()})
     with refused("record_episode: world has 2 worlds; pass exactly 1"):
         record_episode(worlds, team, game)
     with refused("pass exactly 1 at the alert"):
-        record_episode(game.begin(worlds.take([0])), team, game)
+        record_episode(game.reset(worlds.take([0])), team, game)
     for bad in (0.0, -1.0, np.inf, np.nan, "1"):
         with refused("must be a finite number of seconds above 0"):
             record_episode(worlds.take([0]), team, game, bad)  # type: ignore[arg-type]

@@ -145,7 +145,7 @@ def test_interfaces__observe_and_pay_the_same_and_infos_tell_the_terms() -> None
 
 @pytest.mark.usefixtures("mine")
 def test_features__are_the_functions_scaled_and_clipped_and_unknown_where_nobody_is() -> None:
-    worlds = eb.open_game(PAPER)[1].begin(PAPER.sample(50, 3))
+    worlds = eb.open_game(PAPER)[1].reset(PAPER.sample(50, 3))
     view = eb.View(["rear_1.gap", "urgency", "own", "front_1.load"])
     seen = view.observe(worlds, np.array([2]), 0.1)[:, 0]
     assert seen[:, 1] == near(worlds.speeds_mps[:, 1] / (1.0 + worlds.gaps_m[:, 0]) / 10.0, rel=1e-6)
@@ -171,7 +171,7 @@ def test_features__are_the_functions_scaled_and_clipped_and_unknown_where_nobody
 def test_term__that_is_wrong_is_named_and_the_step_is_not_made(later: Any, message: str) -> None:
     eb.register_term("mine", described(lambda before, step, after: later(after)))
     scenario, game = eb.open_game(PAPER, reward={"harm": 1.0, "mine": 2.0})
-    state = game.begin(scenario.sample(3, 7))
+    state = game.reset(scenario.sample(3, 7))
     before = [array.tobytes() for array in state[:5]]
     with pytest.raises(eb.EthBrakeError, match=f"term 'mine': {message}"):
         game.step(state, np.zeros((3, 1)))
@@ -197,7 +197,7 @@ def test_preset__is_drawn_like_the_mapping_that_it_stands_for(tmp_path: Path) ->
 def test_objective__is_paid_by_hand_and_can_be_reported() -> None:
     scenario, game = eb.open_game(PAPER.replace(objective="front-first"))
     worlds = scenario.sample(6, 7)
-    state, paid = game.begin(worlds), np.zeros((6, 3))
+    state, paid = game.reset(worlds), np.zeros((6, 3))
     while not state.ended.all():
         state, step = game.step(state, np.zeros((6, 1)))
         paid += step.reward
@@ -223,7 +223,7 @@ def test_measure__of_each_vehicle_stands_in_columns_json_and_frame_and_changes_n
 def test_term__that_is_reported_is_what_it_would_pay_in_an_episode() -> None:
     scenario, game = eb.open_game(PAPER, reward={"harm": 0.0, "calm": 1.0})
     worlds = scenario.sample(6, 7)
-    state, paid = game.begin(worlds), np.zeros((6, 3))
+    state, paid = game.reset(worlds), np.zeros((6, 3))
     while not state.ended.all():
         state, step = game.step(state, -np.ones((6, 1)))
         paid += step.reward

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.motion.layout import PUSHED
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import game_of
 from tests.fixtures.scenarios import SHIPPED
 
 DIGESTS, NUMBERS = (Path(__file__).with_name(f"episodes.{end}") for end in ("json", "npz"))
@@ -34,8 +34,8 @@ REWARDS: dict[str, Any] = {
 
 def played(name: str, reward: Any = "harm") -> tuple[str, dict[str, np.ndarray]]:
     """Return the digest of ten episodes under random actions, and their last lines, rewards and observations."""
-    _, game = game_of(name, reward=reward)
-    state, rng, sha256 = game.begin(load_scenario(name).sample(N, 7)), np.random.default_rng(7), hashlib.sha256()
+    _, game = open_game(name, reward=reward)
+    state, rng, sha256 = game.reset(load_scenario(name).sample(N, 7)), np.random.default_rng(7), hashlib.sha256()
     sums = np.zeros((N, state.vehicles))
     while not state.ended.all():
         actions = rng.integers(-8, 9, (N, len(game.rules.learners))) / 8.0

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.step import StepShield
-from ethbrake_marl.worlds.game import game_of
 
 N = 300
 RECORDED = [  # scenario, count, who proposes, harm, bound, number of replaced proposals
@@ -31,11 +31,11 @@ RECORDED = [  # scenario, count, who proposes, harm, bound, number of replaced p
 def test_shield__is_not_worse_than_recorded(
     name: str, count: str, way: str, harm: float, bound: float, replaced: int
 ) -> None:
-    scenario, game = game_of(name)
+    scenario, game = open_game(name)
     learners, rng = game.rules.learners.tolist(), np.random.default_rng(0)
     drivers: Any = dict.fromkeys(learners, LearnedAgent(load_shipped("ppo"))) if way == "ppo" else None
     game = game._replace(shield=StepShield(drivers, harm_count=count))
-    state, shape = game.begin(scenario.sample(N, 7)), (N, len(learners))
+    state, shape = game.reset(scenario.sample(N, 7)), (N, len(learners))
     while not state.ended.all():
         drawn = rng.uniform(-1.0, 1.0, shape)
         actions = {"random": drawn, "drive": np.ones(shape), "brake": -np.ones(shape), "ppo": None}[way]

@@ -10,11 +10,11 @@ import torch
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.layers import squash
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 
 FIELDS: dict[str, Any] = {
@@ -164,8 +164,8 @@ def test_onnx__asks_for_the_same_acceleration(kind: str) -> None:
     if "policy.output.weight" in tensors and kind in ("clip", "tanh"):
         tensors["policy.output.weight"] *= np.float32(3.0)  # so that some actions reach the bounds
     policy = Policy.make(tensors, network=spec, observation=View(), **FIELDS)
-    scenario, game = game_of("paper-random")
-    state = game.begin(scenario.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5))
+    scenario, game = open_game("paper-random")
+    state = game.reset(scenario.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5))
     seen = View().observe(state, np.array([2]), 0.1)[:, 0]
     expected, _ = LearnedAgent(policy).act(state, None, 2)
     session = onnxruntime.InferenceSession(policy.to_onnx(), providers=["CPUExecutionProvider"])

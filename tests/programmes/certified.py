@@ -68,7 +68,7 @@ def between(given: Given) -> Told:
     nominal, rng, boxes = scenario.sample(given.boxes, given.seed), np.random.default_rng(given.seed), given.boxes
     shield = RobustShield(uncertainty=given.intervals)
     guarded, decisions = game._replace(shield=shield), 0
-    state = guarded.begin(nominal)
+    state = guarded.reset(nominal)
     applied = np.full((boxes, state.memories["shield"].plan.shape[1], 1), np.nan)
     while not state.ended.all():
         rows = np.flatnonzero(~state.ended)

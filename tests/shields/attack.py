@@ -176,7 +176,7 @@ def searched(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -
     loaded, game = open_game(scenario)
     guard, rng, L = StepShield(harm_count=count), np.random.default_rng(seed), len(game.rules.learners)
     game = game._replace(shield=guard)
-    state, decisions = game.begin(loaded.sample(worlds, seed)), 0
+    state, decisions = game.reset(loaded.sample(worlds, seed)), 0
     while not state.ended.all():
         best, dearest = np.ones((worlds, L)), np.full(worlds, -1.0)
         for _ in range(8):

@@ -61,7 +61,7 @@ def test_h_star_is_that_of_e_v2x_bm() -> None:
 def test_what_is_proposed_from_outside_has_no_effect() -> None:
     game, alert, team = hybrid(make_agent("full_brake"), n=10)
     game = game._replace(shield=team.shield)
-    state = game.begin(alert)
+    state = game.reset(alert)
     one, other = (game.step(state, np.full((10, 1), u))[0] for u in (1.0, -0.3))
     np.testing.assert_array_equal(one.line, other.line)
     infos = game.shield.infos(game, one)
@@ -75,7 +75,7 @@ def test_what_is_proposed_from_outside_has_no_effect() -> None:
 def test_a_proposal_within_the_rounding_of_float32_counts_as_applied() -> None:
     game, alert, team = hybrid(Held("coast"), n=10)
     game = game._replace(shield=team.shield)
-    state = game.begin(alert)
+    state = game.reset(alert)
     applied = game.step(state, None)[0].memories["shield"].applied
     again = game.step(state, applied.astype(np.float32))[0].memories["shield"]
     assert not again.intervened.any()
@@ -100,4 +100,4 @@ def test_bad_settings(drivers: Any, options: Any, text: str) -> None:
 def test_the_policy_of_another_vehicle() -> None:
     scenario, game = open_game("paper-random")
     with pytest.raises(InvalidInput, match="has agents for vehicle_3; must have one for each learner, vehicle_2"):
-        game._replace(shield=EpisodeShield({3: PPO})).begin(scenario.sample(1, 7))
+        game._replace(shield=EpisodeShield({3: PPO})).reset(scenario.sample(1, 7))

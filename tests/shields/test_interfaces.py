@@ -21,9 +21,10 @@ from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
-from ethbrake_marl.names import make_teams
+from ethbrake_marl.names import make_teams, register_shield
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.decision import ShieldReason
+from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.shields.attack import LINES, ONLY_ONE, PLAYS, TEAMS, WAYS, attack
 
@@ -170,6 +171,14 @@ def test_teams_and_names() -> None:
     assert [each.shield.count for each in teams.values()] == ["total", "total"]
 
 
+def test_a_shield_that_is_registered_for_names_is_a_mode() -> None:
+    register_shield("lax", lambda team, argument, settings: team._replace(shield=StepShield(**settings.options)))
+    register_shield("bare", lambda team, argument, settings: team)
+    assert shield(EthBrakeEnv(), mode="lax", allowance=3.0).game.shield.allowance == 3.0
+    with pytest.raises(InvalidInput, match="shield: mode 'bare': is no shield"):
+        shield(COAST, scenario="paper-random", mode="bare")
+
+
 def test_the_term_intervention() -> None:
     reward = {"harm": 1.0, "intervention": 0.5}
     env = shield(EthBrakeParallelEnv("cooperation-3-pair", reward=reward))
@@ -220,7 +229,10 @@ REFUSED: list[tuple[Callable[[], Any], type[Exception], str]] = [
     (lambda: shield(Team("t", {2: COAST}), scenario="paper-random"), InvalidInput, "leave out scenario"),
     (lambda: shield(EthBrakeEnv(), scenario="paper-random"), InvalidInput, "EthBrakeEnv.*: leave out scenario"),
     (lambda: shield(EthBrakeEnv(), "coast+step"), InvalidInput, "policy 'coast\\+step' has a shield of its own"),
-    (lambda: shield(EthBrakeEnv(), mode="stp"), UnknownName, "unknown shield mode 'stp'; did you mean 'step'"),
+    (lambda: shield(EthBrakeEnv(), mode="stp"), UnknownName, "unknown shield or search 'stp'; did you mean 'step'"),
+    (lambda: shield(EthBrakeEnv(), mode=None), UnknownName, "unknown shield or search 'None'"),  # type: ignore[arg-type]
+    (lambda: shield(EthBrakeEnv(), mode="step:3"), InvalidInput, "step takes no argument"),
+    (lambda: make_teams("coast+step+step", load_scenario("paper-random")), InvalidInput, "already has a shield"),
     (lambda: shield(EthBrakeEnv(), alowance=1), InvalidInput, "'alowance'; its options: harm_count, allowance, cap"),
     (lambda: shield(EthBrakeEnv(), "coast", "episode", allowance=1), InvalidInput, "'allowance'; its options"),
     (lambda: shield(EthBrakeEnv(), mode="episode"), InvalidInput, "needs the policy of exactly one learner"),

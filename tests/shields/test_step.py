@@ -29,14 +29,14 @@ def opened(name: str, n: int = 20, seed: int = 7, **options: Any) -> tuple[Game,
     """Return a shielded game of a line of ``attack.py``, and its first state."""
     scenario, game = open_game(LINES[name]())
     game = game._replace(shield=StepShield(**options))
-    return game, game.begin(scenario.sample(n, seed))
+    return game, game.reset(scenario.sample(n, seed))
 
 
 def at(gaps_m: list[float], speeds_mps: list[float]) -> tuple[Game, State]:
     """Return a shielded game of paper-random in one given world, and its first state."""
     scenario, game = open_game("paper-random")
     game = game._replace(shield=StepShield())
-    return game, game.begin(worlds_from_state(scenario, {"gaps_m": gaps_m, "speeds_mps": speeds_mps}))
+    return game, game.reset(worlds_from_state(scenario, {"gaps_m": gaps_m, "speeds_mps": speeds_mps}))
 
 
 def step(game: Game, state: State, *proposed: Any) -> State:
@@ -96,7 +96,7 @@ def test_ended_episodes_are_left_alone() -> None:
 def test_at_the_alert_the_bound_is_the_cheapest_first_plan() -> None:
     scenario, game = open_game(LINES["pair"]())
     alert = scenario.sample(10, 7)
-    state = game._replace(shield=StepShield()).begin(alert)
+    state = game._replace(shield=StepShield()).reset(alert)
     harms = [price(game, state, plan, "first") for plan in first_plans(game, alert, state, "first")]
     assert len(harms) == 4  # E-V2X-BM of each, the descent, full braking; one learner: E-V2X-BM alone
     _, alone = open_game("paper-random")
@@ -219,7 +219,7 @@ def test_its_agents_drive_on_after_a_proposal_from_outside() -> None:
     scenario, game = open_game("paper-random")
     guard = StepShield({2: LearnedAgent(load_shipped("ppo"))})
     game = game._replace(shield=guard)
-    state, seen, rng = game.begin(scenario.sample(60, 7)), set(), np.random.default_rng(2)
+    state, seen, rng = game.reset(scenario.sample(60, 7)), set(), np.random.default_rng(2)
     while not state.ended.all():
         state, _ = game.step(state, rng.uniform(-1.0, 1.0, (60, 1)))
         seen |= set(state.memories["shield"].reason.ravel().tolist())
@@ -243,7 +243,7 @@ class Wavering:
 def test_an_agent_that_remembers_is_asked_once_at_every_decision(outside: bool) -> None:
     scenario, game = open_game("paper-random")
     game = game._replace(shield=StepShield({2: Wavering()}))
-    state = game.begin(scenario.sample(4, 7))
+    state = game.reset(scenario.sample(4, 7))
     for k in range(5):
         state, _ = game.step(state, np.full((4, 1), -0.5) if outside else None)
         assert (state.memories["shield"].agents[0] == k + 1.0).all()
@@ -254,7 +254,7 @@ def test_an_agent_that_remembers_is_asked_once_at_every_decision(outside: bool) 
 def test_agents_propose_where_nobody_else_does() -> None:
     scenario, game = open_game(LINES["pair"]())
     game = game._replace(shield=StepShield(dict.fromkeys([3, 2], Held("full_brake"))))
-    state = game.begin(scenario.sample(2, 7))
+    state = game.reset(scenario.sample(2, 7))
     state, _ = game.step(state, np.array([[NAN, 0.25], [0.5, NAN]]))
     assert state.memories["shield"].proposed.tolist() == [[-1.0, 0.25], [0.5, -1.0]]
 
@@ -265,7 +265,7 @@ def test_agents_propose_where_nobody_else_does() -> None:
 def test_a_script_that_reacts_is_asked_in_every_play() -> None:
     """The harm of its first plan is not that of the same plan beside a script that holds its first command."""
     game, state = opened("follower", 40)
-    state = game._replace(shield=None).begin(LINES["follower"]().sample(40, 7))
+    state = game._replace(shield=None).reset(LINES["follower"]().sample(40, 7))
     plan = np.full((40, 90, 1), -1.0)
     deaf, _ = played(game._replace(scripts={}), state, plan, "first")
     heard, harm = played(game, state, plan, "first")
@@ -325,7 +325,7 @@ def test_agents_for_other_vehicles() -> None:
     scenario, game = open_game("paper-random")
     game = game._replace(shield=StepShield({1: Held("coast")}))
     with pytest.raises(InvalidInput, match="has agents for vehicle_1; must have one for each learner, vehicle_2"):
-        game.begin(scenario.sample(2, 7))
+        game.reset(scenario.sample(2, 7))
 
 
 def test_the_callers_array_stays_the_callers() -> None:

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents.drive import drive
-from ethbrake_marl.names import make_agent, team_of
+from ethbrake_marl.names import make_agent, open_game, team_of
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training import train as train_module
 from ethbrake_marl.training.recipe import algorithm_of
 from ethbrake_marl.training.train import make_environment, train
 from ethbrake_marl.training.training import Training
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 from tests.training.tiny import PAIR, TINY, UPDATE, begin, dying_after, go_on, kept, killed
 
@@ -31,7 +30,7 @@ def test_train__leaves_policies_that_drive_as_they_were_measured(scheme: Any, tm
     assert (result.status, result.updates, result.training.scheme) == ("finished", 2, scheme)
     separate = scheme == "independent"
     assert result.agent == f"team@{run}"
-    scenario, game = game_of(PAIR)
+    scenario, game = open_game(PAIR)
     last = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))
     least = min(each["first_impact_harm"] for each in result.evaluations)
     assert last.harm("first").mean() == pytest.approx(least, rel=1e-12)

@@ -24,7 +24,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.names import make_agent, team_of
+from ethbrake_marl.names import make_agent, open_game, team_of
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import train as train_module
@@ -35,7 +35,6 @@ from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import make_environment, train
 from ethbrake_marl.training.training import Training
 from ethbrake_marl.training.updates import TrainingDiverged, policies_of
-from ethbrake_marl.worlds.game import game_of
 from tests.refused import refused
 from tests.training.tiny import PAIR, TINY, TINY_SAC, TRAININGS, UPDATE, begin, dying_after, go_on, kept, killed
 
@@ -62,7 +61,7 @@ def test_train__leaves_a_folder_whose_policy_is_the_best_on_the_list(tmp_path: P
     assert policy.manifest.versions["physics"] == physics_digest()
     assert policy.manifest.learners == ("vehicle_2",) and policy.manifest.seeds == {"training": 0, "evaluation": 7}
 
-    scenario, game = game_of("paper-random")
+    scenario, game = open_game("paper-random")
     assert result.agent == f"policy@{run}"
     ended = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent), scenario))
     assert ended.harm("first").mean() == pytest.approx(min(harm), rel=1e-12)
@@ -113,7 +112,7 @@ def test_train__keeps_the_best_by_the_count_of_the_reward(count: str, best: int,
 def test_train__objectives_decide_where_they_are_not_the_harm_of_the_line(tmp_path: Path) -> None:
     recipe = TINY.replace(reward={"harm": 0.05, "objective": "own"}, total_steps=UPDATE)
     result = train(recipe, PAIR, tmp_path / "run", on_progress=None)
-    scenario, game = game_of(PAIR)
+    scenario, game = open_game(PAIR)
     last = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))
     assert result.metrics is not None
     own = [result.metrics[f"objective_{name}"] for name in result.policies]
@@ -360,7 +359,7 @@ REFUSED: dict[str, Any] = {
 @pytest.mark.parametrize("message", REFUSED)
 def test_train__is_refused(message: str, tmp_path: Path) -> None:
     recipe, settings, learners = REFUSED[message]
-    scenario = game_of(PAIR)[0]
+    scenario = open_game(PAIR)[0]
     scenario = scenario if learners is None else scenario.with_learners(learners)
     with refused(message):
         train(recipe, scenario, tmp_path / "run", **settings)

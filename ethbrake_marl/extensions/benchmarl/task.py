@@ -19,7 +19,7 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.faces.actions import action_space, checked_actions
-from ethbrake_marl.faces.shield import MODES
+from ethbrake_marl.faces.shield import NOBODY, guarded
 from ethbrake_marl.faces.spaces import FeatureBox
 from ethbrake_marl.faces.stream import Stream, chosen_seed
 from ethbrake_marl.names import open_game
@@ -76,7 +76,9 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
                 f"scenario {loaded.name!r}: its {len(self.learners)} learners have {len(views)} different observations;"
                 " must have one or more learners, which all observe the same features"
             )
-        self.game = game if shield is None else game._replace(shield=MODES[shield](None))
+        if shield is not None:
+            game = game._replace(shield=guarded(NOBODY, shield, loaded, "first", {}).shield)
+        self.game = game
         self.stream = Stream(loaded, self.game)
         self.stream.seed = chosen_seed(seed)
         rows = n, len(self.learners)
@@ -98,10 +100,10 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         """Start the next episode in all worlds, or in those where the mask ``_reset`` in ``tensordict`` is True."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
-            self.episode = self.stream.draw(self.batch_size[0])
+            self.episode = self.stream.next_episodes(self.batch_size[0])
         else:
             rows = np.flatnonzero(mask.numpy().reshape(-1))
-            self.episode = self.episode.put(rows, self.stream.draw(len(rows)), donate=True)
+            self.episode = self.episode.put(rows, self.stream.next_episodes(len(rows)), donate=True)
         return TensorDict(self._observe(), batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import ESTIMATED, Agent, Team
+from ethbrake_marl.agents.drive import ESTIMATED, Agent
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
@@ -32,6 +32,7 @@ from ethbrake_marl.extensions.certified.robust import Members, MembersShield, ap
 from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield, Memory as EpisodeMemory
+from ethbrake_marl.shields.named import NamedShield
 from ethbrake_marl.shields.step import Memory, part
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -64,7 +65,7 @@ class EstimatedShield(MembersShield):
         """Return the memory at the first decision ``state``."""
         lines, possible, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
         median = lines.take(np.arange(0, lines.n, self.lines.alert.n))
-        memory = self.start(game, median, median, lines, self.agents_at(game, alert))
+        memory = self.first_memory(game, median, median, lines, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(lines, state.n), possible))
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
@@ -187,21 +188,6 @@ def lines_of_learner(scenario: Scenario, corners: bool) -> Lines:
     return Lines.of(scenario, scenario.learners[0], corners=corners)
 
 
-def with_lines(team: Team, argument: str | None, settings: Any, corners: bool) -> Team:
-    """Return the team ``TEAM+step:estimated``, or ``TEAM+robust:estimated`` with corners."""
-    if argument is not None:
-        raise InvalidInput(f"agent {settings.spec!r}: nothing but estimated can follow the colon")
-    scenario, count = settings.needed_scenario(), settings.harm_count
-    return team._replace(shield=EstimatedShield(team.drivers, scenario=scenario, harm_count=count, corners=corners))
-
-
-def make_episode(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team ``TEAM+episode:estimated`` or ``TEAM+episode:pairwise:estimated``."""
-    scenario, count = settings.needed_scenario(), settings.harm_count
-    shield = EstimatedEpisodeShield(team.drivers, scenario=scenario, harm_count=count, bound=argument or "coupled")
-    return team._replace(shield=shield)
-
-
 def make_e_v2x_bm(argument: str | None, settings: Any) -> EstimatedEV2XBM:
     """Return the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``."""
     if argument not in (None, "pairwise"):
@@ -213,14 +199,16 @@ def _entry(make: Any, form: str, about: str) -> Part:
     return Part(make, form=form, about=about, knows=ESTIMATED)
 
 
-STEP = _entry(
-    partial(with_lines, corners=False), "step:estimated", "certified in the median line that its vehicle estimates"
-)
+STEP = _entry(NamedShield(EstimatedShield), "step:estimated", "certified in the median line that its vehicle estimates")
 CORNERS = _entry(
-    partial(with_lines, corners=True), "robust:estimated", "also in the corners of the ranges of what was not received"
+    NamedShield(partial(EstimatedShield, corners=True)),
+    "robust:estimated",
+    "also in the corners of the ranges of what was not received",
 )
 EPISODE = _entry(
-    make_episode, "episode[:pairwise]:estimated", "the paper's hybrid in the line that its vehicle estimates"
+    NamedShield(EstimatedEpisodeShield, "bound"),
+    "episode[:pairwise]:estimated",
+    "the paper's hybrid in the line that its vehicle estimates",
 )
 E_V2X_BM = _entry(
     make_e_v2x_bm, "e_v2x_bm[:pairwise]:estimated", "computed from received information and the scenario's ranges"

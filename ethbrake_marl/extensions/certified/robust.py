@@ -13,15 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent, Team
+from ethbrake_marl.agents.drive import MODEL, Agent
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.state import State, mapped, take
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.uncertainty import EXAMPLE, parse_uncertainty
+from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.motion.layout import BRAKING, COUNT, GAP, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import held
+from ethbrake_marl.shields.named import NamedShield
 from ethbrake_marl.shields.step import Memory, StepShield
 
 SHARES = np.linspace(0.0, -1.0, 101)  # constant actions that are tried at the alert for the worst member
@@ -81,7 +82,7 @@ class RobustShield(MembersShield):
 
     Args:
         drivers: body -> agent, as for ``StepShield``.
-        uncertainty: intervals around the nominal quantities, such as ``gaps_m=0.5,mass_t=10%``.
+        uncertainty: intervals around the nominal quantities, which it needs, such as ``gaps_m=0.5,mass_t=10%``.
         harm_count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
 
@@ -93,7 +94,7 @@ class RobustShield(MembersShield):
         self,
         drivers: Mapping[int, Agent] | None = None,
         *,
-        uncertainty: str,
+        uncertainty: str | None = None,
         harm_count: str = "first",
         allowance: float = 0.0,
     ) -> None:
@@ -108,7 +109,7 @@ class RobustShield(MembersShield):
                 f"uncertainty: {self.uncertainty}: the first decision may be as late as {states.time_s.max():g} s; must"
                 f" be before the horizon, {game.rules.horizon_s:g} s"
             )
-        memory = self.start(game, alert, state, states, self.agents_at(game, alert))
+        memory = self.first_memory(game, alert, state, states, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
@@ -121,7 +122,7 @@ class RobustShield(MembersShield):
 
 def opened(game: Game, alerts: State) -> State:
     """Return worlds at their first decision."""
-    return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).begin(alerts)
+    return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).reset(alerts)
 
 
 def apart(states: State, n: int) -> State:
@@ -148,16 +149,8 @@ def may_be_in(state: State, members: State) -> Bools:
     return inside | struck
 
 
-def make_robust(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team ``TEAM+robust:INTERVALS``."""
-    if argument is None:
-        example = EXAMPLE.replace(",", ":")
-        raise InvalidInput(f"agent {settings.spec!r}: needs intervals, for instance {settings.spec}:{example}")
-    return team._replace(shield=RobustShield(team.drivers, uncertainty=argument, harm_count=settings.harm_count))
-
-
 ROBUST = Part(
-    make_robust,
+    NamedShield(RobustShield, "uncertainty"),
     form="robust:INTERVALS",
     about="as +step for uncertain quantities, in the corners of their intervals, such as +robust:gaps_m=0.5:mass_t=10%",
     knows=MODEL,

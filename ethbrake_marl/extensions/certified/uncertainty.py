@@ -140,7 +140,7 @@ def placed(alert: State, sides: list[Side], shares: Floats) -> State:
     return alert._replace(line=line, car=car, know=know, wanted=wanted)
 
 
-def parse_uncertainty(text: str) -> Uncertainty:
+def parse_uncertainty(text: object) -> Uncertainty:
     """Return the uncertainty of entries ``quantity=half-width``, separated by commas or colons, as in ``EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of the nominal value. ``.vehicle_2`` or ``.pair_1``

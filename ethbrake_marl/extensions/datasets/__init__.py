@@ -108,7 +108,7 @@ def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator
 
     The learners take ``actions``; if an episode needs more of them, they repeat the last one.
     """
-    state, learners = game.begin(alert), game.rules.learners.tolist()
+    state, learners = game.reset(alert), game.rules.learners.tolist()
     while not state.ended.all():
         rows, seen = ~state.ended, game.observe(state, game.rules.learners)
         t = int(state.steps.max())

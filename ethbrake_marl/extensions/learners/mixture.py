@@ -187,7 +187,7 @@ class MixtureModel(VineModel):
     def explore(self, acts: list[Act]) -> Explored:
         """Let the earlier experts drive the first worlds of the training."""
         worlds = self.rows.scenario.sample(self.plan.worlds, self.recipe.seed, channel="training")
-        start = self.game.begin(worlds)
+        start = self.game.reset(worlds)
         gained, harm = np.full(start.n, -np.inf), np.full(start.n, np.inf)
         for act in acts:
             its_gain, its_harm = self.drive_from(start, act, self.recipe.reward.harm_count)

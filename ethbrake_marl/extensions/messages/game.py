@@ -28,7 +28,7 @@ from ethbrake_marl.extensions.messages.links import (
     PIECES,
     Memory,
     after_step,
-    begun,
+    begin,
 )
 from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
@@ -61,7 +61,7 @@ class GameWithMessages(Game):
         state = super().first_decision(alert)
         if not state.memories[NAME].is_periodic:
             return state
-        return _remembering(state, begun(alert, state.time_s, self.rules.time_step_s))
+        return _remembering(state, begin(alert, state.time_s, self.rules.time_step_s))
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state after one step, and what the step did. The memory of ``state`` is not reused."""

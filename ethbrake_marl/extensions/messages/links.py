@@ -115,7 +115,7 @@ def present(state: State) -> Floats:
     return sample
 
 
-def begun(alert: State, start_s: Floats, time_step_s: float) -> Memory:
+def begin(alert: State, start_s: Floats, time_step_s: float) -> Memory:
     """Return the memory at the first decision, ``start_s`` [n]: with what has been received since the alert.
 
     ``alert.wanted`` is commanded until then.

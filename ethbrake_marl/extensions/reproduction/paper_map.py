@@ -28,7 +28,7 @@ import math
 import numpy as np
 
 from ethbrake_marl.episode.state import FIRST_DECISION, STEPS, TIME, State
-from ethbrake_marl.episode.step import begin
+from ethbrake_marl.episode.step import first_decision
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.layout import (
@@ -107,7 +107,7 @@ def advance_sampled(alert: State, until_s: float, step_s: float = 0.1) -> State:
         raise InvalidInput(f"advance_sampled: until_s = {until_s:g}: must be finite and at least {start.max():g} s")
     obstacle = alert.line[:, GAP, 0] < FAR_M
     builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2))
-    state = begin(alert, np.array([2]), step_s, until_s)
+    state = first_decision(alert, np.array([2]), step_s, until_s)
     for wrong, what in (
         (obstacle, "an obstacle"),
         (builds, "brakes that build up"),

@@ -138,7 +138,7 @@ def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
             )
     others, wanted = [each for each in scenario.learners if each != body], alert.wanted.copy()
     wanted[:, others] = -alert.car[:, BRAKING][:, others]
-    return game_of(scenario, [scenario.vehicle_names[body - 1]])[1], alert._replace(wanted=wanted)
+    return game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {})[1], alert._replace(wanted=wanted)
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:

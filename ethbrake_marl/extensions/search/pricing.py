@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
 from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State, harm_so_far
-from ethbrake_marl.episode.step import advance, begin
+from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED
@@ -282,7 +282,7 @@ def problem_of(
     wanted[:, chosen] = 0.0
     dt, horizon = game.rules.time_step_s, game.rules.horizon_s
     decide = chosen if deciders is None else np.array(deciders, np.int64)
-    state = begin(alert._replace(wanted=wanted, memories={}), decide, dt, horizon)
+    state = first_decision(alert._replace(wanted=wanted, memories={}), decide, dt, horizon)
     shares = np.zeros((alert.n, 2, wanted.shape[1]))
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST]]]
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack([*times, np.full((alert.n, 1), horizon)]))

@@ -28,7 +28,7 @@ def lines_at(scenario: eb.Scenario, n: int = 20, steps: int = 0, action: float =
     """The median lines of Vehicle 2, the true state, and the lines, after some steps."""
     loaded, game = eb.open_game(scenario)
     lines, alert = Lines.of(loaded, 2, corners=False), loaded.sample(n, 7)
-    state = game.begin(alert)
+    state = game.reset(alert)
     median = lines.heard(state, opened(game, lines.at_alert(alert, state)))[0]
     for _ in range(steps):
         state = game.step(state, np.full((n, 1), action))[0]
@@ -150,7 +150,7 @@ def test_true_corners__do_at_most_the_first_bound_to_the_bit(name: str, count: s
 def test_news_remove_corners__and_the_bound_falls() -> None:
     loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
     game = game._replace(shield=EstimatedShield(scenario=loaded, corners=True))
-    state, fell = game.begin(loaded.sample(12, 7)), 0
+    state, fell = game.reset(loaded.sample(12, 7)), 0
     for _ in range(12):
         before, heard = state.memories["shield"], state.know[:, 2, 3] <= state.time_s
         state, _ = game.step(state, np.full((12, 1), np.nan))
@@ -166,7 +166,7 @@ def test_news__never_make_the_shield_drop_a_better_plan() -> None:
     loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
     shield = EstimatedShield(scenario=loaded, corners=True)
     game = game._replace(shield=shield)
-    state = game.begin(loaded.sample(6, 7))
+    state = game.reset(loaded.sample(6, 7))
     bound, plan = state.memories["shield"].price, state.memories["shield"].plan
     shield.plans = lambda game, median, *states: [np.ones((median.n, *plan.shape[1:]))]  # type: ignore[method-assign]
     for _ in range(8):
@@ -197,7 +197,7 @@ def test_where_everything_is_known__the_bound_is_that_of_step_mode(corners: bool
     loaded, game = eb.open_game(BASE)
     alert = loaded.sample(20, 7)
     found = attacked(game, alert, EstimatedShield(scenario=loaded, corners=corners), "first", "random", 0)
-    plain = game._replace(shield=eb.shield(eb.make_agent("coast"), scenario=BASE).shield).begin(alert)
+    plain = game._replace(shield=eb.shield(eb.make_agent("coast"), scenario=BASE).shield).reset(alert)
     assert found.above == 0 and found.trusted.all() and (found.first <= found.first.max()).all()
     np.testing.assert_allclose(np.minimum(found.first, plain.memories["shield"].first + 0.01), found.first)
 
@@ -287,14 +287,14 @@ def test_a_role_is_the_same_agent_as_a_driver() -> None:
 
 
 def test_the_environment_says_that_the_bound_is_of_the_estimate() -> None:
-    env = eb.shield(eb.parallel_env("cooperation-2-blocked"), mode="estimated", corners=True)
+    env = eb.shield(eb.parallel_env("cooperation-2-blocked"), mode="robust:estimated")
     info = env.reset(seed=7)[1]["vehicle_2"]
     bound = info["shield_bound_harm"]
     while env.agents:
         info = env.step({"vehicle_2": [0.0]})[4]["vehicle_2"]
     assert np.isfinite(bound) and isinstance(info["shield_trusted"], bool)
-    team = eb.shield(eb.make_agent("coast"), mode="estimated", scenario="cooperation-2-blocked")
-    assert team.name == "coast+estimated" and team.shield.lines.alert.n == 1
+    team = eb.shield(eb.make_agent("coast"), mode="step:estimated", scenario="cooperation-2-blocked")
+    assert team.name == "coast+step:estimated" and team.shield.lines.alert.n == 1
 
 
 def test_latencies_that_are_over__are_not_waited_for_again() -> None:
@@ -316,7 +316,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "has 2 learners; an estimated shield needs exactly one": lambda: eb.make_agent(
         "coast+step:estimated", scenario="cooperation-3-pair"
     ),
-    "nothing but estimated can follow the colon": lambda: eb.make_agent("coast+step:gaps_m=1:estimated", scenario=BASE),
+    "'gaps_m=1' cannot follow the colon": lambda: eb.make_agent("coast+step:gaps_m=1:estimated", scenario=BASE),
     "must be e_v2x_bm:estimated or e_v2x_bm:pairwise:estimated": lambda: eb.make_agent(
         "e_v2x_bm:coupled:estimated", scenario=BASE
     ),

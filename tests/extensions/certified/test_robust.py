@@ -125,7 +125,7 @@ STOPS = STANDING.replace(speeds_mps=[0, 10])  # 10 m to stop
 
 def first(scenario: eb.Scenario, **options: Any) -> Any:
     loaded, game = eb.open_game(scenario)
-    return game._replace(shield=RobustShield(**options)).begin(loaded.sample(1, 7)).memories["shield"]
+    return game._replace(shield=RobustShield(**options)).reset(loaded.sample(1, 7)).memories["shield"]
 
 
 def test_bound_at_the_alert__by_hand() -> None:
@@ -146,7 +146,7 @@ def test_bound_at_the_alert__by_hand() -> None:
 def test_coasting_is_let_through__as_long_as_the_worst_corner_can_still_stop(intervals: str, steps: int) -> None:
     loaded, game = eb.open_game(STOPS)
     game = game._replace(shield=RobustShield(uncertainty=intervals))
-    state, coasts = game.begin(loaded.sample(1, 7)), 0
+    state, coasts = game.reset(loaded.sample(1, 7)), 0
     while not state.ended.all():
         state, _ = game.step(state, np.zeros((1, 1)))
         coasts += int(not state.memories["shield"].intervened[0, 1])
@@ -166,7 +166,7 @@ def test_what_is_seen__outside_the_range_of_the_members_is_not_trusted(gap: floa
 def test_a_shield_takes_rows_and_does_not_change_the_state() -> None:
     loaded, game = eb.open_game("paper-random")
     game = game._replace(shield=RobustShield(uncertainty="gaps_m=0.5"))
-    state, proposed = game.begin(loaded.sample(6, 7)), np.linspace(-1.0, 1.0, 6)[:, np.newaxis]
+    state, proposed = game.reset(loaded.sample(6, 7)), np.linspace(-1.0, 1.0, 6)[:, np.newaxis]
     before, rows = state.memories["shield"].members.states.line.copy(), np.array([4, 1])
     whole, part = game.step(state, proposed)[0].take(rows), game.step(state.take(rows), proposed[rows])[0]
     np.testing.assert_array_equal(whole.line, part.line)
@@ -185,7 +185,7 @@ def test_the_first_plan__is_the_best_constant_action_of_the_worst_corner_where_i
     )  # fmt: skip
     memory = first(scenario, uncertainty="gaps_m=3")
     _, game = eb.open_game(scenario)
-    state = game.begin(members("gaps_m=3", scenario.sample(1, 7)))
+    state = game.reset(members("gaps_m=3", scenario.sample(1, 7)))
     tried = [eb.price(game, state, np.full((5, 1, 1), -a), "first").max() for a in np.linspace(0.0, 1.0, 41)]
     assert memory.price[0] <= min(tried) + 1e-9
     alone = eb.price(game, state, np.repeat(memory.plan, 5, axis=0), "first")
@@ -234,8 +234,11 @@ def test_uncertainty__as_a_text_is_refused(text: str) -> None:
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "ppo+robust': needs intervals, for instance ppo+robust:braking": lambda: eb.make_agent(
+    "uncertainty = None: must be a text, for instance 'braking_capacity": lambda: eb.make_agent(
         "ppo+robust", scenario=PAPER
+    ),
+    "shield 'ppo+robust:gaps_m=1': 'gaps_m=1' cannot follow the colon": lambda: eb.shield(
+        eb.Team("ppo", {}), mode="robust:gaps_m=1", uncertainty="mass_t=1"
     ),
     "uncertainty = 0.1: must be a text": lambda: RobustShield(uncertainty=0.1),
     "the first decision may be as late as 1000.5 s": lambda: first(PAPER, uncertainty="latency_s.vehicle_2=1000"),
@@ -262,8 +265,3 @@ def test_capacity__is_that_on_the_road() -> None:
     assert members("braking_capacity_mps2.vehicle_2=10%", wet).car[:, BRAKING, 2] == pytest.approx(
         3.924 * np.array([1.0, 0.9, 1.1])
     )
-
-
-def test_mode__says_which_option_it_needs() -> None:
-    with refused("shield: mode 'robust': missing a required argument: 'uncertainty'"):
-        eb.shield(eb.parallel_env("paper-random"), mode="robust")

@@ -23,7 +23,7 @@ def act(seen: np.ndarray) -> np.ndarray:
 
 def begun(n: int, learners: list[str], **settings: Any) -> tuple[eb.Game, State]:
     scenario, game = eb.open_game("paper-random", learners=learners, **settings)
-    return game, game.begin(scenario.sample(n, 3))
+    return game, game.reset(scenario.sample(n, 3))
 
 
 def test_play_on__is_the_episode_and_its_discounted_reward() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
 
 LINE = Scenario(
@@ -17,8 +17,8 @@ LINE = Scenario(
 
 def played(v2x: Any, observation: Any = None, n: int = 1, scenario: Scenario = LINE) -> tuple[Game, State]:
     """The game of a line with this channel, and its first n worlds at the first decision."""
-    _, game = game_of(scenario.replace(v2x=v2x), observation=observation)
-    return game, game.start(n, 7, 0)
+    _, game = open_game(scenario.replace(v2x=v2x), observation=observation)
+    return game, game.reset(game.draw(n, 7, 0))
 
 
 def seen_by(game: Game, state: State, body: int) -> dict[str, float]:

@@ -14,6 +14,7 @@ from ethbrake_marl.extensions.messages.game import GameWithMessages
 from ethbrake_marl.extensions.messages.links import NAME
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import game_of
 from tests.extensions.messages.line import LINE, played, stepped
@@ -39,8 +40,8 @@ class Follower:
 
 def test_script__acts_on_what_its_vehicle_believes() -> None:
     script = Follower()
-    _, game = game_of(LINE.replace(v2x=PERIODIC), scripts={3: script})
-    state = game.start(1, 7, 0)
+    _, game = game_of(LINE.replace(v2x=PERIODIC), {3: script})
+    state = game.reset(game.draw(1, 7, 0))
     for _ in range(8):
         expected = believed(state, 3)
         state = stepped(game, state, -1.0)
@@ -51,8 +52,8 @@ def test_script__acts_on_what_its_vehicle_believes() -> None:
 
 @pytest.mark.parametrize("v2x", [PERIODIC, {**PERIODIC, "tells": ["place"]}], ids=["usual", "place"])
 def test_price__is_the_harm_of_the_plan_to_the_bit(v2x: dict[str, Any]) -> None:
-    _, game = game_of(PAPER.replace(v2x=v2x), scripts={3: Follower()})
-    state, rng = game.start(40, 3, 0), np.random.default_rng(1)
+    _, game = game_of(PAPER.replace(v2x=v2x), {3: Follower()})
+    state, rng = game.reset(game.draw(40, 3, 0)), np.random.default_rng(1)
     for _ in range(3):
         state, _ = game.step(state, np.full((40, 1), -0.4))
     plans = rng.uniform(-1.0, 1.0, (40, 5, 1))
@@ -68,12 +69,12 @@ def test_script__that_needs_a_missing_piece_is_refused() -> None:
         def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
             return -state.car[:, 0, body - 1], memory
 
-    _, game = game_of(LINE.replace(v2x={"tells": {"vehicle_2": ["place"]}}), scripts={3: Heavy()})
+    _, game = game_of(LINE.replace(v2x={"tells": {"vehicle_2": ["place"]}}), {3: Heavy()})
     with refused("script of vehicle_3: messages of vehicle_2 do not contain its speed (key v2x.tells), but place,"):
-        game.start(1, 7, 0)
-    _, game = game_of(LINE.replace(v2x={"tells": {}} | PERIODIC | {"tells": ["place", "mass"]}), scripts={3: Heavy()})
+        game.reset(game.draw(1, 7, 0))
+    _, game = game_of(LINE.replace(v2x={"tells": {}} | PERIODIC | {"tells": ["place", "mass"]}), {3: Heavy()})
     with refused("script of vehicle_3: messages of vehicle_1 do not contain its speed"):
-        game.start(1, 7, 0)
+        game.reset(game.draw(1, 7, 0))
 
 
 def test_require_pieces__of_who_looks_ahead() -> None:
@@ -85,8 +86,8 @@ def test_require_pieces__of_who_looks_ahead() -> None:
     require_pieces(state, [2], "idm", ["place", "speed"])  # its own messages are not needed
     with refused("pair: messages of vehicle_2 do not contain its place"):
         require_pieces(state, [2, 3], "pair", ["place"])
-    _, plain = game_of(LINE)
-    require_pieces(plain.start(1, 7, 0), [2], "e_v2x_bm")
+    _, plain = open_game(LINE)
+    require_pieces(plain.reset(plain.draw(1, 7, 0)), [2], "e_v2x_bm")
 
 
 def test_feature_of_another_package__is_unknown_where_it_needs_a_missing_piece() -> None:
@@ -111,8 +112,8 @@ def test_infos__tell_when_news_counts_and_how_old_it_is() -> None:
     assert [infos["vehicle_2"][name] for name in names] == pytest.approx([0.5, 0.5, 0.5, 0.2, 0.0, 0.2])
     *_, infos = env.step({"vehicle_2": np.array([-1.0], np.float32)})
     assert infos["vehicle_2"]["age_s_vehicle_1"] == pytest.approx(0.2)
-    _, game = game_of(LINE.replace(v2x={"tells": ["place"]}))
-    assert set(game.own_infos(game.start(1, 7, 0))) == set(names[:3])
+    _, game = open_game(LINE.replace(v2x={"tells": ["place"]}))
+    assert set(game.own_infos(game.reset(game.draw(1, 7, 0)))) == set(names[:3])
 
 
 def test_usual_contents__written_out_change_no_bit_of_an_observation() -> None:

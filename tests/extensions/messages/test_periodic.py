@@ -127,7 +127,7 @@ def test_losses__have_the_share_and_the_bursts_of_the_channel(p: float, r: float
 def test_world__hears_alone_what_it_hears_in_a_batch_and_after_a_put() -> None:
     paper = load_scenario("cooperation-4-all").replace(early_impacts="keep")
     game, whole = played({"preset": "congested", **PERIODIC}, n=9, scenario=paper)
-    alone, mixed = game.start(1, 7, 4), game.start(9, 3, 0)
+    alone, mixed = game.reset(game.draw(1, 7, 4)), game.reset(game.draw(9, 3, 0))
     mixed = mixed.put([2], whole.take([4])).put([5], whole.take([4]))
     for _ in range(12):
         whole, alone, mixed = stepped(game, whole, -0.3), stepped(game, alone, -0.3), stepped(game, mixed, -0.3)

@@ -195,7 +195,7 @@ def test_verdict__agrees_with_a_linear_programme_where_that_is_certain(vehicles,
 def test_later_states__give_the_same_verdict_and_a_witness_from_there():
     scenario, game = eb.open_game("paper-random")
     state = scenario.sample(500, 3)
-    first = game.begin(state)
+    first = game.reset(state)
     at_alert, from_there = avoidability(state), avoidability(first)
     assert first.time_s[0] == 0.5 and np.array_equal(at_alert.reason, from_there.reason)
     assert np.abs(at_alert.margin_m - from_there.margin_m).max() < 1e-11

@@ -130,7 +130,7 @@ def test_decisions__leave_less_room_and_no_plan_is_below():
     any_time, decided, often = (lower_bound(state, time_step_s=step).harm for step in (None, 0.1, 1e-3))
     assert np.all(any_time <= decided) and decided.mean() > 1.02 * any_time.mean()
     assert often.mean() < 1.01 * any_time.mean()
-    begun, least = game.begin(state), np.full(100, np.inf)
+    begun, least = game.reset(state), np.full(100, np.inf)
     for early, late, switch in product((-1, -0.5, 0, 0.5, 1), (-1, -0.5, 0, 1), range(0, 40, 4)):
         plan = np.where(np.arange(75) < switch, float(early), float(late))
         least = np.minimum(least, eb.price(game, begun, np.tile(plan[:, np.newaxis], (100, 1, 1)), "first"))

@@ -49,7 +49,7 @@ def test_bound__of_the_shield_holds_where_it_is_tightest() -> None:
     worlds, measured, _ = measure.falsify(256, 1)
     assert measured.score.max() <= 0.0 and worlds.n > 3 and measured.harm.max() > 0.0
     listed = SCENARIO.sample(200, 3)
-    promised = measure.teams[0].game(measure.game).begin(listed).memories["shield"].price  # at the alert
+    promised = measure.teams[0].game(measure.game).reset(listed).memories["shield"].price  # at the alert
     everywhere = measure(listed)
     assert (everywhere.reference == promised).all() and (everywhere.harm < promised).any()
 
@@ -82,7 +82,7 @@ def test_cube__rejects_what_the_scenario_rejects() -> None:
     worlds = cube.worlds(np.random.default_rng(1).random((300, len(cube.places))))
     accepted = cube.accepts(worlds)
     assert 0.1 < accepted.mean() < 0.95
-    early = eb.open_game(cube.scenario)[1].begin(worlds).collided
+    early = eb.open_game(cube.scenario)[1].reset(worlds).collided
     assert np.array_equal(accepted, ~early)
 
 
