@@ -17,7 +17,7 @@ from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
-from ethbrake_marl.episode.terms import TERMS, TermFunction
+from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
 from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Values, Watch
 from ethbrake_marl.files.python_file import load_from_file
@@ -77,7 +77,7 @@ MEASURES: Registry[Measure] = Registry(
     "measure", "measures", register_measure, {measure.name: measure for measure in DEFAULT}
 )
 
-_REWARDED = ("collision", "risk", "jerk")  # built-in terms of a step, with the constants of a usual reward
+_REWARDED = ("collision", "risk", "jerk", "push", "drove")  # built-in terms, with the usual constants
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
@@ -99,7 +99,7 @@ def _called(name: str) -> list[Measure]:
     if name in MEASURES:
         return [MEASURES[each] for each in MEASURES.load(name)]
     if name in _REWARDED:
-        return [_summed(name, partial(_rewarded, name), "1")]
+        return [_summed(name, partial(_rewarded, name), BUILT_IN[name][0])]
     if name in TERMS:
         return [_summed(name, TERMS[name].value, TERMS[name].unit)]
     file, _, own = str(name).rpartition(":")

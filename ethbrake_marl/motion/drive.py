@@ -13,7 +13,6 @@ from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
 from ethbrake_marl.motion.forces import acts, force_now, force_range, plan_force, settle
 from ethbrake_marl.motion.impact import pool, resolve_impacts
-from ethbrake_marl.motion.push import push
 from ethbrake_marl.motion.layout import (
     ACCELERATION,
     ACTIVE,
@@ -53,6 +52,7 @@ from ethbrake_marl.motion.layout import (
     TOTAL,
     WAY,
 )
+from ethbrake_marl.motion.push import push
 
 # what `drive` returns
 APART = 0  # no two bodies could touch

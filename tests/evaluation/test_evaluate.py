@@ -38,7 +38,7 @@ from tests.refused import refused
 
 
 def test_measures__of_one_impact_by_hand() -> None:
-    result = evaluated(PAIR, 2, [FULL_BRAKE], ["sampled_harm", "vehicle_1_shoved_m", "injury_lr4s", "own", "maximin"])
+    result = evaluated(PAIR, 2, [FULL_BRAKE], ["sampled_harm", "pushed_m", "injury_lr4s", "own", "maximin"])
     # 10.6458 m to the impact, 27.9533 m after it; alone 33.3333 m
     changes = {
         1: 4.888 - 0.177 * 1.815,
@@ -47,8 +47,8 @@ def test_measures__of_one_impact_by_hand() -> None:
     injuries = {body: 1000.0 / (1.0 + math.exp(exponent)) for body, exponent in changes.items()}
     expected = {
         "collided": 1.0, "impacts": 1.0, "first_impact_harm": 9.0, "total_harm": 9.0, "total_harm_1": 4.95,
-        "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "sampled_harm": 9.0, "vehicle_1_shoved_m": 5.26575,
-        "vehicle_1_shoved_m_far": 1.0, "injury_lr4s_1": injuries[1], "injury_lr4s_2": injuries[2],
+        "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "sampled_harm": 9.0, "pushed_m_1": 5.26575,
+        "pushed_m_1_far": 1.0, "injury_lr4s_1": injuries[1], "injury_lr4s_2": injuries[2],
         "injury_lr4s": sum(injuries.values()), "own_first_1": 4.95, "own_total_2": 4.05, "maximin_total_2": 4.95,
         "end_s": 3.7,
     }  # fmt: skip
@@ -57,14 +57,14 @@ def test_measures__of_one_impact_by_hand() -> None:
     assert result["full_brake"]["ended"].tolist() == ["at_rest", "at_rest"]
 
 
-def test_shoving__is_where_vehicle_1_ends_minus_where_it_would() -> None:
-    result = evaluated("paper-random-obstacle", 40, [COAST], ["vehicle_1_shoved_m"])
+def test_pushing__is_where_vehicle_1_ends_minus_where_it_would() -> None:
+    result = evaluated("paper-random-obstacle", 40, [COAST], ["pushed_m"])
     scenario, game = game_of("paper-random-obstacle")
     alert = scenario.sample(40, 7)
     last = [state for _, state in evaluating.play(game, alert, teams(COAST)["coast"])][-1]
     way = alert.obstacle_gap_m - last.obstacle_gap_m
     speed = alert.speeds_mps[:, 0]
-    assert result["coast"]["vehicle_1_shoved_m"] == pytest.approx(way - speed**2 / 12.0, abs=1e-9)
+    assert result["coast"]["pushed_m_1"] == pytest.approx(way - speed**2 / 12.0, abs=1e-9)
 
 
 def test_sums_of_terms__are_what_is_rewarded() -> None:
@@ -186,14 +186,15 @@ def test_agents_and_measures_of_a_python_file__run_in_every_process(
         ("paper-random-obstacle", {"predicted_harm", "replaced", "sampled_harm"}),
         (
             {**PAIR, "roles": {"vehicle_1": "learner"}, "obstacle_gap_m": 60.0},
-            {"predicted_harm", "replaced", "sampled_harm", "vehicle_1_shoved_m"},
+            {"predicted_harm", "replaced", "sampled_harm"},
         ),
     ],
 )
 def test_measures__that_are_not_asked_for_or_not_defined_have_no_column(scenario: Any, missing: set[str]) -> None:
-    asked = ["injury_lr4s", "sampled_harm", "vehicle_1_shoved_m"]
+    asked = ["injury_lr4s", "sampled_harm", "pushed_m"]
     result = evaluated(scenario, 2, measures=asked)
-    assert {each.name for each in result.measures if each.name not in result["full_brake"]} == missing
+    names = {each.name for each in result.measures if each.name not in result["full_brake"]}
+    assert names == {*missing, "pushed_m"}  # which has columns of vehicles alone
     assert not any(column.startswith(tuple(asked)) for column in evaluated(scenario, 2)["full_brake"])
 
 
@@ -225,7 +226,7 @@ def test_terms_of_ones_own__are_summed_and_names_are_used_once(monkeypatch: pyte
 
 
 def test_result__is_the_same_in_chunks_of_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    measures, done = ["sampled_harm", "vehicle_1_shoved_m", "risk"], list[int]()
+    measures, done = ["sampled_harm", "pushed_m", "risk"], list[int]()
     whole = evaluated("paper-random", 50, measures=measures)
     monkeypatch.setattr(evaluating, "CHUNK", 17)
     parts = evaluated("paper-random", 50, measures=measures, on_done=done.append)
