@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step, driven_again
+from ethbrake_marl.episode.step import TRUNCATED, Step, driven_again
 from ethbrake_marl.motion.layout import COUNT, LATENCY, NEXT_TIME, PUSHED, Floats
 
 
@@ -21,7 +21,7 @@ def drove(before: State, step: Step, after: State) -> Floats:
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
     """Return the term still_moving, [n]: -1 for an end at the horizon with a vehicle in motion."""
-    return 0.0 - step.truncated
+    return 0.0 - step.out[TRUNCATED]
 
 
 def first_impact_s(before: State, after: State) -> Floats:

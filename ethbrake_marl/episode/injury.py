@@ -10,7 +10,7 @@ import numpy as np
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import driven_again
 from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
-from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Bools, Floats
+from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats
 
 
 class Curve(NamedTuple):
@@ -76,7 +76,7 @@ def speed_changes(before: State, after: State) -> Floats:
     [n, 2, N] m/s. No decision lies between the states. A push by a vehicle in contact is no impact.
     """
     out = np.zeros((after.n, 2, after.vehicles))
-    struck: Bools = (after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1)
+    struck = np.asarray((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
     for k, scratch in driven_again(before, after, struck):
         out[k] = scratch[[FRONT_CHANGE, REAR_CHANGE], 1:]
     return out

@@ -310,7 +310,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
                 break
             parting = accelerate(line, car, scratch, ahead, builds)
             passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
-            push(line, car, scratch, passed, ahead)
+            push(line, car, scratch, passed, ahead, builds)
             if not move(line, scratch, passed, ahead, builds):
                 break
             for i in range(ahead, bodies):

@@ -136,7 +136,7 @@ def test_data_frame(result: Result) -> None:
 def test_measures_without_a_heading__have_a_table_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     table = summarise(evaluated("paper-random", 20, measures=["jerk", "own"]))
     text = at(80, table, monkeypatch)
-    assert "jerk_2 (1)" in text and "own_total_3 (m2/s2)" in text
+    assert "jerk_2 (m2/s6)" in text and "own_total_3 (m2/s2)" in text
     assert summarise(evaluated("paper-random", 20)).measures() is None
 
 
