@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from ethbrake_marl.episode.conduct import drove, push, still_moving
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import SAFE_END, Rules, Step
@@ -32,6 +33,7 @@ from ethbrake_marl.motion.layout import Floats, Ints
 
 HarmCount = Literal["first", "total"]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Omitted = Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)]  # in files only if it is not 0
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -49,13 +51,13 @@ class RewardParams(FileModel):
     """Weights of the terms of a reward, and their constants. A term of weight 0 is not computed.
 
     Args:
-        harm, collision, risk, jerk, terminal, shaping: weights. With any but harm, the weight of harm must be given
-        too. harm_count: which harm the term harm counts: ``first`` impact of each pair, or ``total``. objective:
-        objective of all vehicles, or a list with one each; None: the scenario's. shaping_discount: discount in the term
-        shaping, in (0, 1]; it should be the learner's own. k_energy: factor of the term collision. ttc_scale_s: tau of
-        the term risk, s. safety_buffer_m: d_safe of the term risk, m. target_gap_m: d_target of the term risk, m.
-        distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a registered term -> weight; negative for what
-        should become small.
+        harm, collision, risk, jerk, terminal, push, drove, still_moving, shaping: weights. With any but harm, the
+        weight of harm must be given too. harm_count: which harm the term harm counts: ``first`` impact of each pair, or
+        ``total``. objective: objective of all vehicles, or a list with one each; None: the scenario's.
+        shaping_discount: discount in the term shaping, in (0, 1]; it should be the learner's own. k_energy: factor of
+        the term collision. ttc_scale_s: tau of the term risk, s. safety_buffer_m: d_safe of the term risk, m.
+        target_gap_m: d_target of the term risk, m. distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a
+        registered term -> weight; negative for what should become small.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
@@ -69,6 +71,9 @@ class RewardParams(FileModel):
     risk: NonNegative = 0.0
     jerk: NonNegative = 0.0
     terminal: NonNegative = 0.0
+    push: Omitted = 0.0
+    drove: Omitted = 0.0
+    still_moving: Omitted = 0.0
     shaping: NonNegative = 0.0
     shaping_discount: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     k_energy: NonNegative = 1.0
@@ -212,6 +217,9 @@ class Rewarding(NamedTuple):
             "collision": partial(collision, params),
             "risk": partial(risk, params),
             "jerk": jerk,
+            "push": push,
+            "drove": drove,
+            "still_moving": still_moving,
             **{name: TERMS[name].value for name in params.terms},
             **{name: component(name, params.harm_count) for name in components if name not in counted},
         }

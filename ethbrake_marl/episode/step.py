@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -187,6 +187,18 @@ def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wante
     failed: int = drive_worlds(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
     line[:] = moved
     return failed
+
+
+def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[int, Floats]]:
+    """Yield the number of each of ``these`` worlds, [n], and the scratch memory of the physics between two states.
+
+    No decision lies between the states.
+    """
+    scratch = scratch_for(after.vehicles + 1)
+    for k in np.flatnonzero(these).tolist():
+        line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
+        drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
+        yield k, scratch
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:

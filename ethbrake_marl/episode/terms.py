@@ -3,19 +3,22 @@
 A term is a function ``term(before, step, after)`` of two states and what the step did (``State``, ``Step``). It returns
 one number per world, [n], or per vehicle, [n, N]. Built-in terms, here for a vehicle in one step:
 
-==========  ========================================================================================================
-harm        minus the harm of the line; with an objective, minus the growth of what the vehicle should minimise
-collision   minus ``sum k_energy w^2`` over every impact, with the closing speed w
-risk        minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, with the gap d
-            and ``TTC = max(d - d_safe, 0) / closing speed``; the first summand is 0 for a pair that does not approach
-jerk        minus the squared rate of change of the vehicle's force
-terminal    1 at the end of an episode without any impact
-shaping     for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
-            the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
-harm_K      minus the harm that vehicle_K bears
-pair_J_K    minus the harm of the pair of vehicle_J and vehicle_K behind it
-obstacle    minus the harm of impacts with the obstacle
-==========  ========================================================================================================
+============  ==========================================================================================================
+harm          minus the harm of the line; with an objective, minus the growth of what the vehicle should minimise
+collision     minus ``sum k_energy w^2`` over every impact, with the closing speed w
+risk          minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, with the gap
+              d and ``TTC = max(d - d_safe, 0) / closing speed``; the first summand is 0 for a pair that does not close
+jerk          minus the squared rate of change of the vehicle's force
+terminal      1 at the end of an episode without any impact
+push          minus the closing speed that contacts of the line take up (``motion.push``)
+drove         minus the speed that the vehicle's positive command adds before the line's first impact
+still_moving  -1 for an end at the horizon with a vehicle in motion
+shaping       for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
+              the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
+harm_K        minus the harm that vehicle_K bears
+pair_J_K      minus the harm of the pair of vehicle_J and vehicle_K behind it
+obstacle      minus the harm of impacts with the obstacle
+============  ==========================================================================================================
 
 ``collision``, ``risk``, ``jerk`` and ``terminal`` are the paper's, with its misprints corrected.
 """
@@ -89,6 +92,9 @@ BUILT_IN = {  # name -> (unit, meaning)
     "risk": ("1", "minus the collision risk of the vehicle's pairs, from 0 to 1.5 (imminent) for each"),
     "jerk": ("m2/s6", "minus the squared rate of change of the vehicle's force"),
     "terminal": ("1", "1 at the end of an episode without any impact"),
+    "push": ("m/s", "minus the push of all contacts of the line"),
+    "drove": ("m/s", "minus the vehicle's driving command times the time before the line's first impact"),
+    "still_moving": ("1", "-1 for an end at the horizon with a vehicle in motion"),
     "shaping": ("m2/s2", "discounted potential after the step minus the potential before it"),
 }
 

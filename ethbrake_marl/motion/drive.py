@@ -13,7 +13,6 @@ from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
 from ethbrake_marl.motion.forces import acts, force_now, force_range, plan_force, settle
 from ethbrake_marl.motion.impact import pool, resolve_impacts
-from ethbrake_marl.motion.push import push
 from ethbrake_marl.motion.layout import (
     ACCELERATION,
     ACTIVE,
@@ -53,6 +52,7 @@ from ethbrake_marl.motion.layout import (
     TOTAL,
     WAY,
 )
+from ethbrake_marl.motion.push import push
 
 # what `drive` returns
 APART = 0  # no two bodies could touch
@@ -310,7 +310,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
                 break
             parting = accelerate(line, car, scratch, ahead, builds)
             passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
-            push(line, car, scratch, passed, ahead)
+            push(line, car, scratch, passed, ahead, builds)
             if not move(line, scratch, passed, ahead, builds):
                 break
             for i in range(ahead, bodies):

@@ -18,19 +18,7 @@ import math
 
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.impact import SAME_MPS2
-from ethbrake_marl.motion.layout import (
-    ACCELERATION,
-    HIGH,
-    HIGH_JERK,
-    JERK,
-    JOINED,
-    LOW,
-    LOW_JERK,
-    MASS,
-    PART,
-    PART_RATE,
-    PUSHED,
-)
+from ethbrake_marl.motion.layout import ACCELERATION, HIGH, JERK, JOINED, LOW, LOW_JERK, MASS, PART, PART_RATE, PUSHED
 
 
 @kernel
@@ -56,13 +44,28 @@ def integral_of_largest(value, rate, count, duration):
 
 
 @kernel
-def gain_alone(car, scratch, body, last, toward, side, side_jerk, held, duration):
-    """Return the speed (m/s) that ``body`` would gain if only the bodies from it to ``last`` were there.
+def alone(car, scratch, body, last, toward, side, held):
+    """Return the acceleration (m/s2) of ``body`` if only the bodies from it to ``last`` were there.
 
     ``toward`` is 1 for the bodies behind a contact, where the largest mean counts, and -1 for those in front, where the
-    smallest does. ``side`` and ``side_jerk`` are the rows of their own accelerations and rates. ``held``: the line
-    does not speed up or slow down, so the brakes may hold any part of it.
+    smallest does. ``side`` is the row of their own accelerations. ``held``: the line does not speed up or slow down, so
+    the brakes may hold any part of it.
     """
+    most = toward * scratch[side, body]
+    mass = car[MASS, body]
+    force = mass * most
+    for i in range(body + toward, last + toward, toward):
+        if car[MASS, i] == math.inf:
+            break
+        mass += car[MASS, i]
+        force += toward * car[MASS, i] * scratch[side, i]
+        most = max(most, force / mass)
+    return toward * (max(most, 0.0) if held else most)
+
+
+@large
+def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
+    """Return the speed (m/s) that ``alone`` gives ``body``, where brakes build up; ``side_jerk``: row of the rates."""
     count, mass, force, rate = 0, 0.0, 0.0, 0.0
     for i in range(body, last + toward, toward):
         if car[MASS, i] == math.inf:
@@ -78,8 +81,8 @@ def gain_alone(car, scratch, body, last, toward, side, side_jerk, held, duration
     return toward * integral_of_largest(scratch[PART], scratch[PART_RATE], count, duration)
 
 
-@large
-def push(line, car, scratch, duration, ahead):
+@kernel
+def push(line, car, scratch, duration, ahead, builds):
     """Add what the contacts take up in ``duration`` (s), in which no event happens, to the row PUSHED of ``line``."""
     pairs, head = line.shape[1] - 1, ahead
     for p in range(ahead, pairs):
@@ -89,12 +92,15 @@ def push(line, car, scratch, duration, ahead):
         tail = p + 1
         while scratch[JOINED, tail] == 1.0:
             tail += 1
-        value, jerk = scratch[ACCELERATION, p], scratch[JERK, p]
+        value, jerk = scratch[ACCELERATION, p], scratch[JERK, p] if builds else 0.0
         held = value == 0.0 and jerk == 0.0
         forward = value > 0.0 or (value == 0.0 and jerk > 0.0)
-        behind, behind_jerk = (LOW, LOW_JERK) if held or forward else (HIGH, HIGH_JERK)
-        front, front_jerk = (LOW, LOW_JERK) if forward else (HIGH, HIGH_JERK)
-        taken = gain_alone(car, scratch, p + 1, tail, 1, behind, behind_jerk, held, duration)
-        taken -= gain_alone(car, scratch, p, head, -1, front, front_jerk, held, duration)
+        behind, front = LOW if held or forward else HIGH, LOW if forward else HIGH
+        if builds:
+            taken = gain(car, scratch, p + 1, tail, 1, behind, behind + LOW_JERK - LOW, held, duration)
+            taken -= gain(car, scratch, p, head, -1, front, front + LOW_JERK - LOW, held, duration)
+        else:
+            taken = alone(car, scratch, p + 1, tail, 1, behind, held) - alone(car, scratch, p, head, -1, front, held)
+            taken *= duration
         if taken > SAME_MPS2 * duration:  # less is rounding
             line[PUSHED, p] += taken

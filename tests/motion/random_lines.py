@@ -104,12 +104,15 @@ def pushes_off(runs: Runs, close: float) -> tuple[Floats, np.ndarray]:
     of the step: they are extrapolated from two lengths. Small steps miss the last of many impacts.
     """
     end, steps = played(runs), stepped(runs, 1e-4)
-    far = ~(push_differences(end, steps) <= close)
-    finer = stepped(runs.take(far), 1e-5)
-    steps[far, at.PUSHED] = (10.0 * finer[:, at.PUSHED] - steps[far, at.PUSHED]) / 9.0
-    same = (end[:, at.COUNT] == steps[:, at.COUNT]).all(axis=1)
-    same[far] &= (end[far, at.COUNT] == finer[:, at.COUNT]).all(axis=1)
-    return push_differences(end, steps), same
+    off, same = push_differences(end, steps), (end[:, at.COUNT] == steps[:, at.COUNT]).all(axis=1)
+    for step_s in (1e-5, 1e-6):
+        far = same & ~(off <= close)
+        finer = stepped(runs.take(far), step_s)
+        zero = steps[far]
+        zero[:, at.PUSHED] = (10.0 * finer[:, at.PUSHED] - zero[:, at.PUSHED]) / 9.0
+        off[far], same[far] = push_differences(end[far], zero), (end[far, at.COUNT] == finer[:, at.COUNT]).all(axis=1)
+        steps[far] = finer
+    return off, same
 
 
 def largest(one: Floats, other: Floats, rows: list[int]) -> Floats:

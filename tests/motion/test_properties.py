@@ -8,7 +8,16 @@ from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.motion.layout import Floats
-from tests.motion.random_lines import Runs, differences, exactly, played, push_differences, pushes_off, random_runs, stepped
+from tests.motion.random_lines import (
+    Runs,
+    differences,
+    exactly,
+    played,
+    push_differences,
+    pushes_off,
+    random_runs,
+    stepped,
+)
 
 FEW = 30  # impacts, after which rounding may change their order
 RATES = [at.BRAKE_RATE, at.RELEASE_RATE]

@@ -14,7 +14,16 @@ import numpy as np
 
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.motion.layout import Floats
-from tests.motion.random_lines import Runs, differences, exactly, played, push_differences, pushes_off, random_runs, stepped
+from tests.motion.random_lines import (
+    Runs,
+    differences,
+    exactly,
+    played,
+    push_differences,
+    pushes_off,
+    random_runs,
+    stepped,
+)
 from tests.programmes import Cases, Given, Told
 
 OPTIONS = {
@@ -22,7 +31,7 @@ OPTIONS = {
     "--seed": {"type": int, "default": 1, "help": "seed of the worlds"},
 }
 CLOSE, CLOSE_STEPS = 1e-7, 1e-3  # relative; a contact with a closing speed near 0 loses half of the digits
-CLOSE_PUSHES, PUSHES = 1e-6, 200  # relative; number of worlds of a kind whose pushes are compared by finer steps
+CLOSE_PUSHES, PUSHES = 1e-6, 200  # relative; worlds of a kind whose pushes are compared, by finer steps
 FEW = 30  # impacts, after which rounding may change their order
 UNRESOLVED = 0.04  # largest share of worlds in which two plastic impacts take turns faster than small steps
 

@@ -4,7 +4,7 @@ Every step solves one convex problem (Moreau's time stepping). Bodies of mass m 
 the speeds x that minimise ``sum m (x - v)^2 / 2 + sum phi(x)`` where no body may be faster than a touching one in
 front. The potential phi of a brake of force b is ``h m b |x|`` (dry friction), of an engine of force f with the limit L
 it is ``-h m f min(x, L)``. The minimum is an isotonic regression, whose blocks minimise their own sum. A step in which
-a gap would close, or a speed reaches or leaves 0 or its limit, is cut at that moment, so that the error is of the order ``h^2``.
+a gap would close, or a speed reaches or leaves 0 or its limit, is cut at that moment: the error is of order ``h^2``.
 """
 
 from __future__ import annotations
@@ -255,7 +255,7 @@ class Outcome(NamedTuple):
     gaps: Any
     speeds: Any
     forces: Any
-    book: Any  # [5, N] hit, first harm, total harm, count, push (m/s) of the pair of each vehicle and what is ahead of it
+    book: Any  # [5, N] hit, first harm, total harm, count, push (m/s) of each vehicle and what is ahead of it
     finished: bool
 
 
