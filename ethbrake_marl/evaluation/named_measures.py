@@ -24,6 +24,7 @@ from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
 from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Watch
 from ethbrake_marl.files.python_file import load_from_file
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part, Registry
 
 
@@ -170,7 +171,7 @@ def _summed(name: str, term: TermFunction, unit: str) -> Measure:
     return Measure(name, None, f"Sum of the term {name} over all steps.", unit, watch=partial(SummedTerm, term))
 
 
-def _intervention(before: State, step: Step, after: State) -> Values:
+def _intervention(before: State, step: Step, after: State) -> Floats:
     """Return the term, which is 0 for a team without a shield, so that a table can compare both. Rewards refuse it."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)

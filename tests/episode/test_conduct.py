@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.episode.conduct import driving_s, first_impact_s
 from ethbrake_marl.episode.reward import RewardParams
-from ethbrake_marl.worlds.game import game_of
+from ethbrake_marl.names import open_game
 from tests.contract.interfaces import CRASH, REST
 from tests.episode.lines import later, state_of
 from tests.episode.test_terms import paid
@@ -52,7 +52,7 @@ def test_push__is_the_push_of_the_step_of_all_pairs() -> None:
 
 @pytest.mark.parametrize(("scenario", "action", "ends"), [(CRASH, 0.0, [-1.0]), (REST, -1.0, [])])
 def test_still_moving__is_paid_once_at_the_horizon(scenario: Any, action: float, ends: list[float]) -> None:
-    _, game = game_of(scenario, reward={"harm": 0.0, "still_moving": 2.0})
+    _, game = open_game(scenario, reward={"harm": 0.0, "still_moving": 2.0})
     state, values = game.start(1, 0, 0), list[float]()
     for _ in range(11):
         state, step = game.step(state, np.full((1, 1), action))

@@ -100,7 +100,7 @@ def test_driving__before_the_first_impact_by_hand(command: float, hard: bool) ->
 
 def test_conduct__is_measured_in_every_line() -> None:
     for name in ("cooperation-4-all", "paper-random-obstacle", "cooperation-2-five"):
-        scenario, game = game_of(name)
+        scenario, game = open_game(name)
         alert, learners = scenario.sample(20, 7), game.rules.learners.tolist()
         team = Team("coast", {body: COAST for body in learners})
         asked = measures_called("pushed_mps,pushed_m,drove_towards,still_moving,drove")
@@ -118,7 +118,7 @@ def test_conduct__is_measured_in_every_line() -> None:
 
 
 def test_pushed_m__of_any_vehicle_is_where_it_ends_minus_where_it_would() -> None:
-    scenario, game = game_of("paper-random")
+    scenario, game = open_game("paper-random")
     alert = scenario.sample(30, 7)
     result = evaluated("paper-random", 30, [COAST], ["pushed_m"])["coast"]
     last = [state for _, state in evaluating.play(game, alert, teams(COAST)["coast"])][-1]
@@ -267,7 +267,7 @@ def test_measures_of_two_files_with_one_name__stand_side_by_side_and_one_after_t
 
 def test_measures__with_one_statistic_are_refused() -> None:
     two = [Measure(name, lambda game, alert, last: last.collided, "", "", (Statistic("hit"),)) for name in ("a", "b")]
-    scenario, game = game_of(PAIR)
+    scenario, game = open_game(PAIR)
     with refused("measures 'a' and 'b': both have the statistic 'hit'; give one of them another key"):
         evaluate(scenario.draw(2, 7), teams(FULL_BRAKE), game, two)
 
