@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from ethbrake_marl.episode.conduct import drove, push, still_moving
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import SAFE_END, Rules, Step
@@ -31,7 +32,7 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.model import UNSHOWN, FileModel, first_mistake, require
 from ethbrake_marl.motion.layout import Floats, Ints
 
-HarmCount = Literal["first", "total"]
+HarmCount = Literal["first", "total", "honest"]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Omitted = Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)]  # in files only if it is not 0
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
@@ -144,6 +145,7 @@ class RewardParams(FileModel):
 REWARDS = {
     "harm": RewardParams(),
     "total-harm": RewardParams(harm_count="total"),
+    "honest": RewardParams(harm_count="honest"),
     "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
 }
 Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
@@ -208,8 +210,7 @@ class Rewarding(NamedTuple):
                 stacklevel=2,
             )
             whole = True
-        total = params.harm_count == "total"
-        rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, total)
+        rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, COUNTS[params.harm_count])
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
         components = () if vector is None else components_of(vector, counted, vehicles)
         functions: dict[str, TermFunction] = {
@@ -257,8 +258,7 @@ class Rewarding(NamedTuple):
 
     def shared(self, step: Step) -> dict[str, Floats]:
         """Return the values of the terms that the compiled step knows, [n]."""
-        harm = step.total_harm if self.params.harm_count == "total" else step.first_impact_harm
-        known = {"harm": -harm, "terminal": step.out[SAFE_END]}
+        known = {"harm": -step.counted, "terminal": step.out[SAFE_END]}
         return {name: value for name, value in known.items() if name in self.counted}
 
 

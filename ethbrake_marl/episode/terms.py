@@ -31,6 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import ROWS, pair_amounts
 from ethbrake_marl.episode.functions import called, check_finite, described
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.play import descend
@@ -38,7 +39,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
-from ethbrake_marl.motion.layout import FIRST, TOTAL, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Registry
 
 TermFunction = Callable[[State, Step, State], Floats]
@@ -132,9 +133,8 @@ def potential(rules: Rules, state: State) -> Floats:
     learners = rules.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
     further = state.line.copy()
-    further[:, [FIRST, TOTAL]] = 0.0
-    count = "total" if rules.total else "first"
-    return -descend(state._replace(line=further), learners, BRAKING_SHARES, rounds, rules.horizon_s, count)[1]
+    further[:, ROWS] = 0.0
+    return -descend(state._replace(line=further), learners, BRAKING_SHARES, rounds, rules.horizon_s, rules.count)[1]
 
 
 class Shaping(NamedTuple):
@@ -162,16 +162,20 @@ def growth(objectives: Sequence[Objective], count: str, before: State, step: Ste
 
 def component(name: str, count: str) -> TermFunction:
     """Return the term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]."""
-    row, number = TOTAL if count == "total" else FIRST, int(name.rpartition("_")[2]) if "_" in name else 1
-    return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, row)
+    number = int(name.rpartition("_")[2]) if "_" in name else 1
+    return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, count)
 
 
-def _borne(vehicle: int, row: int, before: State, step: Step, after: State) -> Floats:
-    return 0.0 - Harm.of(after.line[:, row] - before.line[:, row], after.car).borne[:, vehicle]
+def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
+    return 0.0 - Harm.of(_grown(count, before, after), after.car).borne[:, vehicle]
 
 
-def _of_pair(pair: int, row: int, before: State, step: Step, after: State) -> Floats:
-    return 0.0 - (after.line[:, row, pair] - before.line[:, row, pair])
+def _of_pair(pair: int, count: str, before: State, step: Step, after: State) -> Floats:
+    return 0.0 - _grown(count, before, after)[:, pair]
+
+
+def _grown(count: str, before: State, after: State) -> Floats:
+    return pair_amounts(after.line, count) - pair_amounts(before.line, count)
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:
