@@ -21,7 +21,7 @@ Evaluate = Callable[[Policies], Mapping[str, float]]  # returns metrics of polic
 Measure = Callable[[Training], Evaluate]
 
 OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not the harm of the line
-HARM = {"first": "first_impact_harm", "total": "total_harm"}
+HARM = {"first": "first_impact_harm", "total": "total_harm", "honest": "honest_cost"}
 AT_ONCE = 2_500  # worlds that are simulated together, to limit memory
 
 
