@@ -18,18 +18,7 @@ import math
 
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.impact import SAME_MPS2
-from ethbrake_marl.motion.layout import (
-    ACCELERATION,
-    HIGH,
-    JERK,
-    JOINED,
-    LOW,
-    LOW_JERK,
-    MASS,
-    PART,
-    PART_RATE,
-    PUSHED,
-)
+from ethbrake_marl.motion.layout import ACCELERATION, HIGH, JERK, JOINED, LOW, LOW_JERK, MASS, PART, PART_RATE, PUSHED
 
 
 @kernel

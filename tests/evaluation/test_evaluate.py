@@ -107,7 +107,9 @@ def test_conduct__is_measured_in_every_line() -> None:
         columns = evaluate(alert, {"coast": team}, game, asked)["coast"]
         each = [f"pushed_mps_{i}" for i in range(1, alert.vehicles)] + ["pushed_mps_obstacle"]
         assert np.sum([columns[key] for key in each], axis=0) == pytest.approx(columns["pushed_mps"])
-        assert all((columns[key] >= 0.0).all() for key in each) and (name != "paper-random-obstacle" or columns["pushed_mps"].any())
+        assert all((columns[key] >= 0.0).all() for key in each) and (
+            name != "paper-random-obstacle" or columns["pushed_mps"].any()
+        )
         assert not columns["drove_towards"].any() and columns["still_moving"].tolist() == [
             each == "horizon" for each in columns["ended"]
         ]
