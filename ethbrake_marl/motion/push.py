@@ -51,12 +51,10 @@ def alone(car, scratch, body, last, toward, side, held):
     smallest does. ``side`` is the row of their own accelerations. ``held``: the line does not speed up or slow down, so
     the brakes may hold any part of it.
     """
-    most = toward * scratch[side, body]
-    mass = car[MASS, body]
+    most, mass, i = toward * scratch[side, body], car[MASS, body], body
     force = mass * most
-    for i in range(body + toward, last + toward, toward):
-        if car[MASS, i] == math.inf:
-            break
+    while i != last and car[MASS, i + toward] < math.inf:  # a range with a variable step divides
+        i += toward
         mass += car[MASS, i]
         force += toward * car[MASS, i] * scratch[side, i]
         most = max(most, force / mass)

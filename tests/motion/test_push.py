@@ -13,6 +13,9 @@ CASES: dict[str, tuple[Any, Any, float, list[float]]] = {
     "a coasting rear leans on a braking front": (  # -8 and 0: 8 m/s2 for 1 s, whatever the masses
         lines([0.0], [10.0, 10.0], mass_t=[1.0, 3.0]), [-8.0, 0.0], 1.0, [0.0, 8.0],
     ),
+    "somebody who drives far behind pushes nobody": (
+        lines([0.0, 90.0], [10.0] * 3), [-8.0, 0.0, 3.0], 1.0, [0.0, 8.0, 0.0],
+    ),
     "a rear drives against a braking front": (  # 3 + 6 = 9 m/s2 for 2 s
         lines([0.0], [20.0, 20.0]), [-6.0, 3.0], 2.0, [0.0, 18.0],
     ),
