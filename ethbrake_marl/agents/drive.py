@@ -24,6 +24,7 @@ KNOWLEDGE = (SENSORS, MESSAGES, ESTIMATED, STATE, MODEL)
 UNSTATED = "not stated"
 
 NOBODY = np.zeros(0, np.int64)
+CHUNK = 2_500  # worlds of a list that are driven together, to limit memory
 
 
 class Agent(Script, Protocol):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.drive import KNOWLEDGE, MODEL, UNSTATED, Team, check_knows, play
+from ethbrake_marl.agents.drive import CHUNK, KNOWLEDGE, MODEL, UNSTATED, Team, check_knows, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
@@ -24,8 +24,6 @@ from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
 from ethbrake_marl.worlds.sampling import Drawn
-
-CHUNK = 2_500  # worlds that are driven together, to limit memory
 
 Columns = dict[str, Values]
 

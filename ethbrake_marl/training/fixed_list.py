@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team, drive
+from ethbrake_marl.agents.drive import CHUNK, Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
@@ -22,7 +22,6 @@ Measure = Callable[[Training], Evaluate]
 
 OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not the harm of the line
 HARM = {"first": "first_impact_harm", "total": "total_harm", "honest": "honest_cost"}
-AT_ONCE = 2_500  # worlds that are simulated together, to limit memory
 
 
 def measure_on_list(training: Training) -> Evaluate:
@@ -34,7 +33,7 @@ def measure_on_list(training: Training) -> Evaluate:
     """
     plan, (scenario, game) = training.recipe.evaluation, open_game(training.scenario)
     worlds = scenario.sample(plan.worlds, plan.seed)
-    parts = [worlds.take(slice(first, first + AT_ONCE)) for first in range(0, plan.worlds, AT_ONCE)]
+    parts = [worlds.take(slice(first, first + CHUNK)) for first in range(0, plan.worlds, CHUNK)]
 
     def measure(policies: Policies) -> dict[str, float]:
         drivers = {1 + scenario.vehicle_names.index(name): LearnedAgent(each) for name, each in policies.items()}

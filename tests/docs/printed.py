@@ -39,7 +39,7 @@ _TESTS = tuple(
 
 TABLES: dict[str, tuple[str, ...]] = {
     "| who drives Vehicle 2 | knows | collisions": _TESTS,
-    "| who drives Vehicle 2 | collisions | first-impact harm": (
+    "| who drives Vehicle 2 | collisions | first-impact harm | total harm | share": (
         "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,idm,universal,best_harm --json",
     ),
     "| agent | what it does | knows": (

@@ -31,6 +31,7 @@ COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefi
 APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
 INSTALLATION = ("test_imports.py",)  # start many processes
 OF_ALL = ("extensions/test_pages.py", "extensions/test_printed.py")  # what all extensions print together
+BY_NAME = {"extensions.learners": {"extensions.forecasts"}}  # uses beside imports: its recipes observe forecasts
 RUN = "runs/core"
 COMMANDS = {
     "trains PPO on paper-random": ("train", "--steps", "20000", "--output", RUN),
@@ -71,7 +72,7 @@ def passes_without(gone: set[str], folder: Path) -> Told:
 
 def users_of(extension: str) -> set[str]:
     """Return an extension and all extensions that need it, directly or indirectly."""
-    uses, gone = arrows(), {f"extensions.{extension}"}
+    uses, gone = {each: used | BY_NAME.get(each, set()) for each, used in arrows().items()}, {f"extensions.{extension}"}
     while more := {each for each, used in uses.items() if each.startswith("extensions.") and used & gone} - gone:
         gone |= more
     return {each.removeprefix("extensions.") for each in gone}

@@ -142,6 +142,7 @@ def test_agent__that_is_made_for_another_time_step_is_refused() -> None:
 
 
 def test_agent__whose_messages_lack_a_piece_is_refused_unless_it_sees_the_vehicle_ahead() -> None:
+    pytest.importorskip("ethbrake_marl.extensions.messages")  # whose key is `tells`
     blind = {"tells": ["place", "speed"], "senses": "none"}
     with refused("agent 'aeb': messages of vehicle_1 do not contain its acceleration (key v2x.tells)"):
         eb.evaluate(TWO.replace(v2x=blind), "aeb", episodes=2)
