@@ -52,7 +52,7 @@ class Rules(NamedTuple):
     horizon_s: float
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
-    count: Floats = COUNTS["first"]  # what counts in the reward (``episode.counts``)
+    counting: Floats = COUNTS["first"]  # weights of what counts in the reward (``episode.counts``)
 
 
 class Step(NamedTuple):

@@ -134,7 +134,7 @@ def potential(rules: Rules, state: State) -> Floats:
     rounds = 1 if len(learners) == 1 else 2
     further = state.line.copy()
     further[:, ROWS] = 0.0
-    return -descend(state._replace(line=further), learners, BRAKING_SHARES, rounds, rules.horizon_s, rules.count)[1]
+    return -descend(state._replace(line=further), learners, BRAKING_SHARES, rounds, rules.horizon_s, rules.counting)[1]
 
 
 class Shaping(NamedTuple):

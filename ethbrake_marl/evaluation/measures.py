@@ -187,7 +187,7 @@ DEFAULT = (
     Measure(
         "honest_cost", partial(harm, "honest"),
         "Total harm, and a price for pushes, for driving before the first impact and for motion at the horizon"
-        " (``episode.counts``).", "m2/s2", (Statistic("honest_cost", "mean", "Honest cost", "Honest\ncost"),),
+        " (``episode.counts``).", "m2/s2", (Statistic("honest_cost"),),
     ),
     _built_in(impacts, "1"),
     _built_in(hardest_impact_mps, "m/s"),

@@ -53,7 +53,7 @@ def test_push__is_the_push_of_the_step_of_all_pairs() -> None:
 @pytest.mark.parametrize(("scenario", "action", "ends"), [(CRASH, 0.0, [-1.0]), (REST, -1.0, [])])
 def test_still_moving__is_paid_once_at_the_horizon(scenario: Any, action: float, ends: list[float]) -> None:
     _, game = open_game(scenario, reward={"harm": 0.0, "still_moving": 2.0})
-    state, values = game.start(1, 0, 0), list[float]()
+    state, values = game.reset(game.draw(1, 0, 0)), list[float]()
     for _ in range(11):
         state, step = game.step(state, np.full((1, 1), action))
         assert step.reward[0].tolist() == [2.0 * step.terms["still_moving"][0]] * 2
