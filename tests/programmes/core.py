@@ -31,7 +31,10 @@ COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefi
 APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
 INSTALLATION = ("test_imports.py",)  # start many processes
 OF_ALL = ("extensions/test_pages.py", "extensions/test_printed.py")  # what all extensions print together
-BY_NAME = {"extensions.learners": {"extensions.forecasts"}}  # uses beside imports: its recipes observe forecasts
+BY_NAME = {  # uses beside imports: recipes that observe forecasts; the policy `universal`, which a search starts with
+    "extensions.learners": {"extensions.forecasts"},
+    "extensions.search": {"extensions.forecasts"},
+}
 RUN = "runs/core"
 COMMANDS = {
     "trains PPO on paper-random": ("train", "--steps", "20000", "--output", RUN),

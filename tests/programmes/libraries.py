@@ -225,7 +225,7 @@ def tell(k: int) -> None:
         ready = hasattr(policy, "begin") or isinstance(policy, eb.Team)
         agent = policy if ready else eb.policy_agent(policy, clip=True)
         result = drive(scenario.sample(EPISODES, SEED), {"full_brake": eb.make_agent("full_brake"), "theirs": agent})
-        theirs, full = (float(result.outcome(name).first_impact_harm.mean()) for name in ("theirs", "full_brake"))
+        theirs, full = (float(result[name]["first_impact_harm"].mean()) for name in ("theirs", "full_brake"))
         harm, braking = f"{theirs:.2f}", f"{full:.2f}"
         if way.library == "Stable-Baselines3":
             difference = evaluated_by_itself(names["model"], agent)
@@ -271,7 +271,7 @@ def evaluated_by_itself(model: Any, agent: Any) -> float:
 
     scenario = eb.load_scenario(SCENARIO)
     sample = scenario.sample(OWN_EPISODES, SEED, channel="training")  # the worlds of ``env.reset(seed=SEED)``
-    ours = eb.evaluate(sample, {"theirs": agent}, scenario=scenario).outcome("theirs").first_impact_harm
+    ours = eb.evaluate(sample, {"theirs": agent}, scenario=scenario)["theirs"]["first_impact_harm"]
     worlds = make_vec_env("EthBrake-v1", seed=SEED, env_kwargs={"actions": getattr(model.action_space, "n", None)})
     returns, _ = evaluate_policy(model, worlds, OWN_EPISODES, deterministic=True, return_episode_rewards=True)
     return float(np.abs(ours + returns).max())

@@ -135,6 +135,7 @@ def test_obstacle__is_known_with_the_place_of_vehicle_1() -> None:
 
 
 def test_forecast__ends_before_a_vehicle_of_which_a_piece_is_missing() -> None:
+    pytest.importorskip("ethbrake_marl.extensions.forecasts")  # whose feature is `contact`
     game, state = played({"tells": {"vehicle_1": [*PIECES[:5]]}}, ["contact"])  # no mass
     seen = seen_by(game, state, 2)
     assert seen["contact.brake_front_time"] == 0.0 and seen["contact.brake_rear_time"] > 0.0

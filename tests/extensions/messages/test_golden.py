@@ -33,6 +33,7 @@ DIGESTS = {
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("base", ["cooperation-2-paper", "cooperation-4-all"])
 def test_observations__keep_their_bits(base: str, channel: str) -> None:
+    pytest.importorskip("ethbrake_marl.extensions.forecasts")  # whose feature is `contact`
     scenario, rng = load_scenario(base).replace(early_impacts="keep"), np.random.default_rng(5)
     game, state = played(CHANNELS[channel], SEEN, n=60, scenario=scenario)
     digest = hashlib.sha256()

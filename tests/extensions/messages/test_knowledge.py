@@ -71,6 +71,7 @@ def altered(state: State, observer: int, rng: np.random.Generator) -> State:
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("base", ["cooperation-4-all", "paper-random-buildup"])
 def test_what_has_not_been_received__changes_no_bit(base: str, channel: str) -> None:
+    pytest.importorskip("ethbrake_marl.extensions.forecasts")  # whose feature is `contact`
     scenario, rng = load_scenario(base).replace(early_impacts="keep"), np.random.default_rng(2)
     game, state = played(CHANNELS[channel], SEEN, n=30, scenario=scenario)
     changed = 0

@@ -53,6 +53,7 @@ def test_film__plays_in_real_time_and_ends_with_the_longest(ending: str, tmp_pat
 
 
 def test_watch__makes_the_picture_of_the_readme(ethbrake: Command, empty_folder: Path) -> None:
+    pytest.importorskip("ethbrake_marl.extensions.forecasts")  # which `universal` observes
     answer = ethbrake("watch", "--agents", "full_brake,universal", "--output", "now.png")
     assert (answer.status, answer.out, answer.err) == (0, "", "pictures: now.png\n")
     now, then = (Image.open(file).convert("RGB") for file in ("now.png", DOCS / "figures" / "emergency.png"))
