@@ -27,7 +27,12 @@ COUNTS = {  # name -> weight of each row
     "total": np.array([0.0, 1.0, 0.0, 0.0, 0.0]),
     "honest": np.array([0.0, 1.0, 10.0, 10.0, 1.0]),
 }
+RULES = {"honest": "honest", "paper": "first"}  # short name -> count
 Count = str | Floats  # the name of a count, or weights of its own, [5]
+
+HARM = {"first": "first_impact_harm", "total": "total_harm"}  # counts of harm alone -> column of an evaluation
+COLUMN = {**HARM, "honest": "honest_cost"}  # count -> column
+IN_WORDS = {"first": "first-impact harm", "total": "total harm", "honest": "honest cost"}
 
 
 def weights_of(count: Count) -> Floats:
@@ -39,6 +44,12 @@ def check_count(what: str, count: object) -> None:
     """Raise ``InvalidInput`` unless this is the name of a count."""
     if count not in COUNTS:
         raise InvalidInput(f"{what} = {count!r}: must be 'first', 'total' or 'honest'")
+
+
+def check_harm(what: str, count: object) -> None:
+    """Raise ``InvalidInput`` unless this is the name of a count of harm alone."""
+    if count not in HARM:
+        raise InvalidInput(f"{what} = {count!r}: must be 'first' or 'total'")
 
 
 def other_count(count: Count) -> str:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
+from ethbrake_marl.episode.counts import HARM, IN_WORDS
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.statistics import difference, mean
-from ethbrake_marl.extensions.report.best_known import HARM
 from ethbrake_marl.files.sheet import Column, Row, Sheet
 from ethbrake_marl.training.experiment import TEAM, without
-
-IN_WORDS = {"first": "first-impact harm", "total": "total harm"}
 
 
 def learners_sheets(compared: Compared) -> list[Sheet]:

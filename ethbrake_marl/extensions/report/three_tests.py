@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
@@ -22,7 +23,7 @@ TESTS = {
     "paper-random-obstacle": "Obstacle test: the same worlds with an obstacle 1.7 m beyond the place where Vehicle 1"
     " stops by itself. An impact of Vehicle 1 with the obstacle is harm.",
 }
-KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the short table
+KEPT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the short table, if they are shown
 
 
 def is_as_shipped(scenario: Scenario) -> bool:

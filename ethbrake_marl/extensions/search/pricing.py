@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode import counts
-from ethbrake_marl.episode.counts import amount_so_far, pair_amount, weights_of
+from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, weights_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
 from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State
@@ -45,7 +44,6 @@ from ethbrake_marl.motion.layout import (
 UInt64s = NDArray[np.uint64]
 
 MOST_PHASES = 12  # of a profile that a search returns
-COUNTS = ("first", "total")
 
 # what a search minimises
 WHOLE = 0.0  # harm of the line
@@ -206,7 +204,7 @@ class Problem(NamedTuple):
     def values(self, profiles: Profiles) -> dict[str, Floats]:
         """Return what the search minimises if the vehicles follow ``profiles``: count of harm -> [n] m2/s2."""
         last = self.follow(profiles)
-        return {count: self.value(last, count) for count in counts.COUNTS}
+        return {count: self.value(last, count) for count in COUNTS}
 
     def minimising(self, weights: Floats, *, largest: bool = False) -> Problem:
         """Return the problem that minimises the sum of the vehicles' harm times ``weights`` [n, N], or the largest."""
@@ -255,14 +253,15 @@ def problem_of(
         game: rules of the episodes.
         alert: worlds at the alert.
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
-        count: harm of the ``first`` impact of each pair, or ``total``.
+        count: what is minimised (``episode.counts``).
         objective: what the controlled vehicles minimise, as under a scenario's key ``objective``.
         deciders: the first decision is at their shortest latency; None: ``bodies``.
 
-    Raises ``InvalidInput`` for vehicles that do not exist, an objective that is no weighted harm, and a script that
-    looks at the state, whose commands are not known at the alert.
+    Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is no weighted harm, and
+    a script that looks at the state, whose commands are not known at the alert.
 
     """
+    check_count("count", count)
     chosen = np.array(game.rules.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
         raise InvalidInput(f"vehicles {chosen.tolist()}: must be one or more of 1 to {alert.vehicles}, each once")
