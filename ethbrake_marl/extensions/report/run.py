@@ -157,7 +157,7 @@ def page_of(
     }
     summary = (
         f"The {learned} was trained with {recipe.algorithm}, scheme {training.scheme}. It was saved after {steps:,}"
-        " steps, when it did the least harm in the worlds that the recipe names."
+        " steps, when it was best in the worlds that the recipe names."
     )
     if learned == TEAM:
         summary += f" The agent “{SHIELDED}” is the trained team with the step shield."

@@ -127,6 +127,17 @@ def test_brief__has_both_harms_of_each_test() -> None:
     assert "1.7 m beyond the place where Vehicle 1 stops by itself" in sheet.note and "30 worlds." in sheet.note
 
 
+def test_brief__of_the_honest_cost_has_it_in_each_test() -> None:
+    main, other = (compared_by(f"paper-random{end}", "full_brake,coast", 30, "honest") for end in ("", "-obstacle"))
+    sheet = brief(main, {"paper-random-obstacle": other})
+    names = ["collision_rate", "first_impact_harm", "total_harm", "honest_cost", "pushed_mps"]
+    assert [column.name for column in sheet.columns[1:-1]] == names
+    assert sheet.columns[-1].heading == "Obstacle:\nhonest"
+    assert [row[-1] for row in sheet.rows] == [
+        f"{own['honest_cost'].mean():.2f}" for own in other.result.columns.values()
+    ]
+
+
 def test_paper_rows__are_consistent_and_shown_as_printed() -> None:
     for paper in (*RANDOM_TEST, *HYBRID_TEST):
         assert paper.collision_rate == pytest.approx(paper.collisions / paper.episodes, abs=5e-5)
