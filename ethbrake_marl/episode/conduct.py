@@ -6,7 +6,7 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import TRUNCATED, Step, driven_again
-from ethbrake_marl.motion.layout import COUNT, LATENCY, NEXT_TIME, PUSHED, Floats
+from ethbrake_marl.motion.layout import COUNT, DROVE, NEXT_TIME, PUSHED, Floats
 
 
 def push(before: State, step: Step, after: State) -> Floats:
@@ -16,7 +16,7 @@ def push(before: State, step: Step, after: State) -> Floats:
 
 def drove(before: State, step: Step, after: State) -> Floats:
     """Return the term drove, [n, N]: minus what a positive command adds to the speed before the first impact (m/s)."""
-    return 0.0 - driving_s(before, after) * np.maximum(after.commands_mps2, 0.0)
+    return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
 
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
@@ -38,6 +38,5 @@ def first_impact_s(before: State, after: State) -> Floats:
 
 def driving_s(before: State, after: State) -> Floats:
     """Return how long a positive command is in force before the line's first impact, [n, N] s."""
-    start = np.maximum(before.time_s[:, np.newaxis], before.car[:, LATENCY, 1:])
-    time = np.maximum(first_impact_s(before, after)[:, np.newaxis] - start, 0.0)
-    return np.where(after.commands_mps2 > 0.0, time, 0.0)
+    asked_mps, commands = after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1], after.commands_mps2
+    return asked_mps / np.where(commands > 0.0, commands, 1.0)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, weights_of
 from ethbrake_marl.episode.state import ENDED, STEPS, State
-from ethbrake_marl.episode.step import advance, command, note_motion, stands
+from ethbrake_marl.episode.step import advance, command, note_motion
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
 from ethbrake_marl.motion.layout import BRAKING, LINE_ROWS, Floats, scratch_for
@@ -55,8 +55,7 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, mem
             for b in range(len(bodies)):
                 commands[bodies[b]] = tried[k, j, b]
             failed = drive(here, car[k], commands, scratch, time[k], until) == FAILED
-            if not stands(here, commands):
-                note_motion(here)
+            note_motion(here)
             out[0, k, j] = math.inf if failed else amount_so_far(here, count)
             out[1, k, j] = math.inf if failed else amount_so_far(here, other)
 
@@ -97,7 +96,8 @@ def price(game: Game, state: State, plans: Floats, count: Count, most: Any = mat
 def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float, count: Count) -> Floats:
     """Return the harm of both counts, first the one asked for, [2, n, C] m2/s2, if ``bodies`` hold commands until then.
 
-    ``tried`` [n, C, B] are C commands of the bodies (m/s2); the others hold ``wanted`` [n, N + 1].
+    ``until_s`` is the horizon: what still moves then counts as it does there. ``tried`` [n, C, B] are C commands of the
+    bodies (m/s2); the others hold ``wanted`` [n, N + 1].
     """
     out, counts = np.empty((2, *tried.shape[:2])), (weights_of(count), weights_of(other_count(count)))
     hold_worlds(

@@ -125,7 +125,7 @@ def stands(line, wanted):
 
 @kernel
 def note_motion(line):
-    """Note in the row MOVING that the horizon has come and vehicles still move."""
+    """Note in the row MOVING, at the horizon, how fast vehicles still move."""
     for i in range(1, line.shape[1]):
         line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
 
@@ -144,7 +144,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     clock[TIME] = until
     at_rest = met != FAILED and stands(line, wanted)
     clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
-    if over and not at_rest:
+    if over:
         note_motion(line)
     return met, at_rest
 

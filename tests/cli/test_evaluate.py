@@ -28,7 +28,8 @@ def test_rules__are_short_for_a_count_and_the_honest_ones_show_cost_and_push(eth
         assert told_json(ethbrake(*arguments, "--json", "--set", f"rules={rules}")) == long
         shown = ethbrake(*arguments, "--set", f"rules={rules}").out
         assert (rules == "honest") == ("Honest Push" in shown) and "First-impact        Total" in shown
-    group = ethbrake(*"evaluate --scenario benchmark --episodes 2 --agents coast --set rules=honest".split())
+    line = "evaluate --scenario benchmark --episodes 2 --agents coast --set rules=honest"
+    group = ethbrake(*line.split())
     assert "Honest" in group.out and "paper-random-obstacle" in group.out
 
 

@@ -112,7 +112,7 @@ def follow(world, lines, ends, commands, phase, most):
                 if drive(line, world.car, world.wanted, world.scratch, start, until) == FAILED:
                     return value, -1
                 at_rest = stands(line, world.wanted)
-                if step >= clock[LAST] and not at_rest:
+                if step >= clock[LAST]:
                     note_motion(line)
             value = value_of(world, line)
         if value >= most or at_rest:

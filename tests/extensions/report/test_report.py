@@ -63,9 +63,8 @@ def test_first_sentence__of_the_honest_cost() -> None:
 
 def test_page__of_the_honest_cost_shows_it_beside_both_harms() -> None:
     page = Page(Report("Mine", compared_by("paper-random", "full_brake,e_v2x_bm", 60, "honest"), "Short.", {}).html)
-    assert (
-        "Honest cost of each agent" in page.text and "First-impact harm Total harm Honest cost Push (m/s)" in page.text
-    )
+    assert "Honest cost of each agent" in page.text
+    assert "First-impact harm Total harm Honest cost Push (m/s)" in page.text
 
 
 def test_first_sentence__flatters_nobody(compared: Compared) -> None:

@@ -133,9 +133,8 @@ def test_brief__of_the_honest_cost_has_it_in_each_test() -> None:
     names = ["collision_rate", "first_impact_harm", "total_harm", "honest_cost", "pushed_mps"]
     assert [column.name for column in sheet.columns[1:-1]] == names
     assert sheet.columns[-1].heading == "Obstacle:\nhonest"
-    assert [row[-1] for row in sheet.rows] == [
-        f"{own['honest_cost'].mean():.2f}" for own in other.result.columns.values()
-    ]
+    means = [f"{own['honest_cost'].mean():.2f}" for own in other.result.columns.values()]
+    assert [row[-1] for row in sheet.rows] == means
 
 
 def test_paper_rows__are_consistent_and_shown_as_printed() -> None:
