@@ -53,7 +53,7 @@ class AgentSettings:
     spec: str  # as the user has written it
     policy: str | None = None  # path after the @
     scenario: Scenario | None = None  # in which the agent drives; None: not known
-    harm_count: str = "first"  # what optimising agents minimise: harm of the first impact of each pair, or ``total``
+    harm_count: str = "first"  # what optimising agents minimise (``episode.counts``)
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:

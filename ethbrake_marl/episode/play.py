@@ -43,7 +43,7 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, ho
 
 @large
 def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, memory, out):
-    """Write both counts of harm to ``out`` [2, n, C], if ``bodies`` hold the commands ``tried`` [n, C, B]."""
+    """Write the harm in two counts to ``out`` [2, n, C], if ``bodies`` hold the commands ``tried`` [n, C, B]."""
     scratch, here, commands = memory
     for k in range(tried.shape[0]):
         for i in range(len(commands)):
@@ -94,7 +94,7 @@ def price(game: Game, state: State, plans: Floats, count: Count, most: Any = mat
 
 
 def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float, count: Count) -> Floats:
-    """Return the harm of both counts, first the one asked for, [2, n, C] m2/s2, if ``bodies`` hold commands until then.
+    """Return the harm in this count, and in the one that decides ties, [2, n, C] m2/s2, if ``bodies`` hold commands.
 
     ``until_s`` is the horizon: what still moves then counts as it does there. ``tried`` [n, C, B] are C commands of the
     bodies (m/s2); the others hold ``wanted`` [n, N + 1].

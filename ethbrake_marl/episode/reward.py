@@ -53,8 +53,8 @@ class RewardParams(FileModel):
 
     Args:
         harm, collision, risk, jerk, terminal, push, drove, still_moving, shaping: weights. With any but harm, the
-        weight of harm must be given too. harm_count: which harm the term harm counts: ``first`` impact of each pair, or
-        ``total``. objective: objective of all vehicles, or a list with one each; None: the scenario's.
+        weight of harm must be given too. harm_count: what the term harm counts: ``first``, ``total`` or ``honest``
+        (``episode.counts``). objective: objective of all vehicles, or a list with one each; None: the scenario's.
         shaping_discount: discount in the term shaping, in (0, 1]; it should be the learner's own. k_energy: factor of
         the term collision. ttc_scale_s: tau of the term risk, s. safety_buffer_m: d_safe of the term risk, m.
         target_gap_m: d_target of the term risk, m. distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a

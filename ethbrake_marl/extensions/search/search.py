@@ -35,7 +35,7 @@ PROFILES = np.zeros(DRAWING, np.int64)  # random profiles and changes are those 
 def search_profiles(
     problem: Problem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1
 ) -> tuple[Profiles, dict[str, Floats]]:
-    """Search each world for the best profile; return it, and its values in both counts of harm, [n] m2/s2.
+    """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
 
     It has at most ``MOST_PHASES`` phases and is at least as good as every given one.
 
