@@ -27,22 +27,6 @@ SCENARIOS = ["paper-random", "paper-random-obstacle", "paper-random-buildup", "c
 # ---------------------------------------------------------------- by hand
 
 
-def test_drove__is_the_speed_asked_for_after_the_latency_and_before_the_first_impact() -> None:
-    # Vehicle 2 drives at 2 m/s2 from 0.5 s on and closes 1 m in 1 s: 2 m/s until the impact at 1.5 s
-    start = state_of([1.0, 90.0], [10.0, 10.0, 0.0], latency_s=[0.0, 0.5, 0.0])
-    state = later(start, [0.0, 2.0, 1.0], 1.0)
-    assert state.line[0, DROVE].tolist() == near([0.0, 1.0, 1.0, 0.0])  # of the pair ahead of each vehicle
-    state = later(state, [0.0, 2.0, 1.0], 4.0)
-    assert state.line[0, DROVE].tolist() == near([0.0, 2.0, 1.5, 0.0])
-    assert later(state, [3.0, 2.0, 1.0], 5.0).line[0, DROVE].tolist() == state.line[0, DROVE].tolist()
-    assert not later(start, [0.0, -2.0, 0.0], 0.9).line[:, DROVE].any()
-
-
-def test_drove__ends_with_an_impact_with_the_obstacle() -> None:
-    ahead = state_of([9.0], [10.0, 10.0], obstacle_gap_m=5.0)
-    assert later(ahead, [0.0, 4.0], 1.0).line[0, DROVE].tolist() == near([0.0, 2.0, 0.0])
-
-
 def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_horizon() -> None:
     # Coasting, Vehicle 2 hits with 6 m/s at 1 s: 18.5 m/s in common. Vehicle 1 of 1 t brakes with 6 m/s2 against the
     # 3 t behind it for 0.3 s: a push of 1.8 m/s, and 18.5 - 0.3 x 1.5 = 18.05 m/s of both at the horizon.
