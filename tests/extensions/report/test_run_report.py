@@ -88,6 +88,10 @@ def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> 
         mine = [compared.result[each]["first_impact_harm"] for each in (f"all but {name}", "trained team")]
         assert less.value == pytest.approx((mine[0] - mine[1]).mean())
     assert [row[0] for row in added.rows] == ["vehicle_2", "vehicle_3"]
+    *_, cost, more = learners_sheets(compared._replace(harm_count="honest"))
+    means = [compared.result["full_brake"][f"honest_cost{ending}"].mean() for ending in ("_1", "_2", "_3", "")]
+    assert [cell.value for cell in cost.rows[0][1:]] == pytest.approx(means)
+    assert more.headings[-1] == "More honest cost without it"
 
 
 # ---- its parts
