@@ -7,8 +7,9 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search.best_harm import best_harm, joined, search_list, starting_profiles
 from ethbrake_marl.extensions.search.extremes import KEPT
+from ethbrake_marl.extensions.search.kernels import try_all
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
-from ethbrake_marl.extensions.search.search import compact, refine, search_profiles
+from ethbrake_marl.extensions.search.search import compact, prepared, refine, search_profiles, seeded
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
@@ -96,6 +97,18 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
     table.save(tmp_path / "honest.npz")
     again = BestHarmTable.load(tmp_path / "honest.npz")
     assert again.stored(problem, "honest")[0].tolist() == table.harm["honest"].tolist() and [*again.harm] == ["honest"]
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
+    problem, values = PROBLEM.counting("honest"), np.empty(1)
+    coasting, random = problem.coasting(), seeded(problem.identity, 0)
+    last = problem.follow(coasting)
+    assert (last.harm("honest") > last.harm("total") + 100.0).any()
+    for k, cost in enumerate(last.harm("honest")):
+        world, room = prepared(problem, k, random, 1, stepwise)
+        try_all(world, room, coasting.ends[[k]], coasting.commands_mps2[[k]], values)
+        assert values[0] == pytest.approx(cost, rel=1e-6)
 
 
 def test_extremes__are_better_than_constants() -> None:
