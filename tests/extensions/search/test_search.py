@@ -11,6 +11,7 @@ from ethbrake_marl.extensions.search.kernels import try_all
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
 from ethbrake_marl.extensions.search.search import compact, prepared, refine, search_profiles, seeded
 from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.motion.layout import MOVING
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
 
@@ -102,12 +103,12 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
 @pytest.mark.parametrize("stepwise", [False, True])
 def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
     problem, values = PROBLEM.counting("honest"), np.empty(1)
-    coasting, random = problem.coasting(), seeded(problem.identity, 0)
-    last = problem.follow(coasting)
-    assert (last.harm("honest") > last.harm("total") + 100.0).any()
+    driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), seeded(problem.identity, 0)
+    last = problem.follow(driving)
+    assert last.line[:, MOVING].any(axis=1).all()
     for k, cost in enumerate(last.harm("honest")):
-        world, room = prepared(problem, k, random, 1, stepwise)
-        try_all(world, room, coasting.ends[[k]], coasting.commands_mps2[[k]], values)
+        world, room = prepared(problem, k, random, driving.ends.shape[1], stepwise)
+        try_all(world, room, driving.ends[[k]], driving.commands_mps2[[k]], values)
         assert values[0] == pytest.approx(cost, rel=1e-6)
 
 
