@@ -21,6 +21,7 @@ from inspect import signature
 from typing import Any
 
 from ethbrake_marl.agents.drive import UNSTATED, Agent, Team, check_agent, check_knows
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, UnknownName, describe_error
 from ethbrake_marl.files.python_file import load_from_file
@@ -52,7 +53,7 @@ class AgentSettings:
     spec: str  # as the user has written it
     policy: str | None = None  # path after the @
     scenario: Scenario | None = None  # in which the agent drives; None: not known
-    harm_count: str = "first"  # what optimising agents minimise: harm of the first impact of each pair, or ``total``
+    harm_count: str = "first"  # what optimising agents minimise (``episode.counts``)
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
@@ -139,8 +140,7 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
     'constant:3.5'
 
     """
-    if harm_count not in ("first", "total"):
-        raise InvalidInput(f"harm_count = {harm_count!r}: must be 'first' or 'total'")
+    check_count("harm_count", harm_count)
     loaded = None if scenario is None else load_scenario(scenario)
     core, wrappers = _split(spec)
     settings = AgentSettings(core, None, loaded, harm_count)

@@ -41,7 +41,7 @@ class Progress:
         """Harm in the last evaluation as text, such as ``total harm 24.19``; empty if there was no evaluation yet."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
-        words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm"}
+        words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm", "honest_cost": "honest cost"}
         parts = [f"{words[key]} {value:.2f}" for key, value in self.metrics.items() if key in words]
         return ", ".join(parts[:1])
 

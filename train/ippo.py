@@ -36,7 +36,7 @@ class Settings:
     steps: int = 1_500_000  # decisions of all learners together
     seed: int = 0
     output: Path = Path("runs/ippo")  # a new folder
-    harm_count: str = "first"  # which impacts the reward counts: the "first" of each pair, or "total"
+    harm_count: str = "first"  # what the reward counts: "first" impacts, "total" harm or "honest" cost
     copies: int = 64  # parallel copies of the environment
     rollout: int = 64  # time steps of each copy between two updates
     epochs: int = 4
@@ -100,7 +100,7 @@ class Copies:
         numbers = range(settings.seed * settings.copies, (settings.seed + 1) * settings.copies)
         self.envs = [eb.parallel_env(settings.scenario, agents="learners", reward=reward) for _ in numbers]
         self.seen = [env.reset(seed=k)[0] for k, env in zip(numbers, self.envs, strict=True)]
-        self.harm = "world_total_harm" if settings.harm_count == "total" else "world_first_impact_harm"
+        self.harm = "world_first_impact_harm" if settings.harm_count == "first" else "world_total_harm"
 
     @torch.no_grad()
     def collect(self, learners: dict[str, Learner], settings: Settings) -> tuple[dict[str, Rollout], list[float]]:

@@ -18,12 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
 from ethbrake_marl.extensions.search.best_harm import search_list
-from ethbrake_marl.extensions.search.pricing import COUNTS, problem_of
+from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import BestHarmTable, shipped_tables
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
@@ -42,7 +43,7 @@ def main(words: list[str]) -> None:
     add("--scenario", default="paper-random")
     add("--episodes", type=int, default=10_000, help="worlds of the list")
     add("--seed", type=int, default=7, help="seed of the list")
-    add("--harm-count", choices=COUNTS, help="harm to minimise; default: both")
+    add("--harm-count", choices=[*COUNTS], help="count to minimise; default: both harms")
     add("--vehicles", metavar="A,B,...", help="vehicles to control together; default: the learners")
     add("--budget", type=int, default=100_000, help="candidate profiles per world and count")
     add("--search-seed", type=int, default=0)
@@ -78,7 +79,7 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r} has no learner; give vehicles to control: --vehicles vehicle_2")
     alert = scenario.sample(given.episodes, seed=given.seed)
-    counts = COUNTS if given.harm_count is None else (given.harm_count,)
+    counts = tuple(HARM) if given.harm_count is None else (given.harm_count,)
     known = None if given.start is None else BestHarmTable.load(given.start)
     teams = [make_teams(given.agents, scenario, harm_count=count) if given.agents else {} for count in counts]
     table = search_list(

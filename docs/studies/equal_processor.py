@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.extensions.report.curves import Curve, curves_figure
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Estimate
-from ethbrake_marl.training.fixed_list import HARM
 from ethbrake_marl.training.job import Job
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.run import RunFolder

@@ -28,7 +28,7 @@ MEASURES = {  # heading -> measure, factor, digits
     "first-impact harm": ("first_impact_harm", 1.0, 2),
     "total harm": ("total_harm", 1.0, 2),
     "sampled harm": ("sampled_harm", 1.0, 1),
-    "Vehicle 1 shoved (m)": ("vehicle_1_shoved_m", 1.0, 1),
+    "Vehicle 1 pushed (m)": ("pushed_m_1", 1.0, 1),
     "moving at 8 s (%)": ("moving", 100.0, 1),
 }
 
@@ -52,7 +52,7 @@ def measure(block: str, model: PPO) -> dict[str, float]:
     """Return the measures of the policy on worlds that no training uses."""
     agents = {block: eb.policy_agent(model, clip=True)}
     scenario = BLOCKS[block.partition("-")[0]][0]
-    asked = "vehicle_1_shoved_m,sampled_harm"
+    asked = "pushed_m,sampled_harm"
     columns = eb.evaluate(scenario, agents, episodes=WORLDS, measures=asked)[block]
     values = {name: float(columns[name].mean()) for name, _, _ in MEASURES.values() if name in columns}
     return values | {"moving": float((columns["ended"] == "horizon").mean())}

@@ -33,7 +33,7 @@ TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
     """Return the constant deceleration of vehicle ``body`` that does the least harm, in every world, and this harm.
 
-    All others hold ``alert.wanted``. ``count``: harm of the ``first`` impact of each pair, or ``total``. If the choice
+    All others hold ``alert.wanted``. ``count``: what is minimised (``episode.counts``). If the choice
     of the closed form does no harm, it is the result. If several do equally little, the least harm of the other count
     decides, then the middle one. As a function of the deceleration the harm has kinks and jumps: it is not proven that
     no deceleration between two samples does less.
@@ -52,12 +52,12 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
 
 
 def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
-    """Return the harm of both counts, first the one asked for, [2, n, C], for decelerations ``tried`` [n, C]."""
+    """Return the harm in this count, and in the one that decides ties, [2, n, C]; ``tried``: decelerations [n, C]."""
     return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
 
 
 def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
-    """Return the best decelerations and their harms under both counts, [n, 3].
+    """Return the best decelerations and their harms under this count and the one that decides ties, [n, 3].
 
     All decelerations of a world are split into equal parts, then again and again the parts that may hold a better one.
     A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
@@ -144,7 +144,7 @@ class EV2XBM:
     Args:
         rules: of the episodes.
         agents: body -> role of the vehicles that agents drive, whose commands are not known at the alert.
-        count: harm that is minimised, of the ``first`` impact of each pair or ``total``.
+        count: what is minimised: ``first``, ``total`` or ``honest`` (``episode.counts``).
 
     """
 

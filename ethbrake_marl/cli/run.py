@@ -46,6 +46,7 @@ def run_command(
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         # torch takes seconds to load, here and in the other commands that learn
         from ethbrake_marl.cli.settings import read_settings
+        from ethbrake_marl.episode.counts import IN_WORDS
         from ethbrake_marl.names import check_learners
         from ethbrake_marl.training.experiment import HYBRID, POLICY, SHIELDED, run_experiment
         from ethbrake_marl.training.recipe import load_recipe
@@ -73,13 +74,12 @@ def run_command(
         )
         trained = experiment.trained
         own = trained.training.objective
-        count = "total" if plan.reward.harm_count == "total" else "first-impact"
-        single = experiment.learned == POLICY
+        single, harm = experiment.learned == POLICY, IN_WORDS[plan.reward.harm_count]
         headline = (
             f"Trained by recipe {plan.name}, seed {trained.training.recipe.seed}: {trained.steps:,} decisions in"
             f" {trained.wall_s:.0f} s ({trained.status}). {HYBRID if single else SHIELDED}: the"
             f" {experiment.learned}{'' if single else f' (scheme {trained.training.scheme})'} with a shield. All agents"
-            f" minimise {count} harm{f', except that the {experiment.learned} minimises {own}' if own else ''}.\n"
+            f" minimise {harm}{f', except that the {experiment.learned} minimises {own}' if own else ''}.\n"
         )
         out.result(experiment.compared.table.to_json(), Text(headline), *tables)
         out.note(where)

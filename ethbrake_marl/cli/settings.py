@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from ethbrake_marl.episode.counts import RULES
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override
+from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -47,8 +49,14 @@ def read_settings(
     """
     known = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
     known["command"] = {*of_command}
+    known["command"] |= {"rules"} if recipe_keys or "harm_count" in of_command else set()
     found: dict[str, list[Override]] = {owner: [] for owner in known}
-    for override in Override.parse(texts or ()):
+    given = Override.parse(texts or ())
+    for override in given:
+        if override.key == "rules" and "rules" in known["command"]:
+            owner = "recipe" if recipe_keys else "command"
+            found[owner].append(_counted(override, given, owner))
+            continue
         named = override.top in ("scenario", "recipe") and len(override.path) > 1
         if named and override.top == "recipe" and not recipe_keys:
             raise InvalidInput(f"--set {override.key}: this command uses no recipe; remove this setting")
@@ -64,3 +72,17 @@ def read_settings(
         found[owners[0]].append(inside)
     command = {each.top: each.value for each in found["command"]}
     return Settings(tuple(texts or ()), found["scenario"], found["recipe"], command)
+
+
+def _counted(rules: Override, given: Sequence[Override], owner: str) -> Override:
+    """Return the setting of a count for which ``rules=NAME`` is short: that of the reward in a recipe."""
+    name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
+    if not isinstance(name, str) or name not in RULES:
+        raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(RULES)}")
+    for other in given:
+        inside = other.path[1:] if owner == other.top == "recipe" else other.path
+        if inside and inside == path[: len(inside)]:
+            raise InvalidInput(
+                f"--set rules: sets {'.'.join(path)}, which --set {other.key} sets, too; leave one of them out"
+            )
+    return Override(rules.text, path, RULES[name])

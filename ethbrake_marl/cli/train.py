@@ -141,6 +141,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     from ethbrake_marl.agents.drive import Team, drive
     from ethbrake_marl.agents.scripts import Held
     from ethbrake_marl.cli.settings import read_settings
+    from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
     from ethbrake_marl.files.plain import read_object
     from ethbrake_marl.names import open_game
     from ethbrake_marl.training.fixed_list import OBJECTIVE, metrics_of
@@ -155,6 +156,8 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
         Column("Total harm", "total_harm"),
         Column("Collisions", "collision_rate", digits=1, scale=100.0, unit=" %"),
     ]
+    if (count := plan.reward.harm_count) not in HARM:
+        columns.append(Column(IN_WORDS[count].capitalize(), COLUMN[count]))
     measured = {"full_brake": metrics_of(training, drive(game, worlds, brake))}
     measured[result.agent] = dict(result.metrics or {})
     if OBJECTIVE in measured["full_brake"]:
@@ -167,7 +170,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     table = Sheet("", columns, rows, note)
     settings = read_object(result.directory / "config.json").get("settings", ())
     own = [each for each in settings if read_settings([each], [*type(plan).model_fields]).scenario]
-    own += ["harm_count=total"] if plan.reward.harm_count == "total" else []
+    own += [] if count == "first" else [f"harm_count={count}"]
     words = ["--scenario", scenario or loaded.name, "--agents", f"full_brake,{result.agent}"]
     command = shlex.join(["ethbrake", "evaluate", *words, *(word for each in own for word in ("--set", each))])
     out.result(

@@ -23,8 +23,9 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import COUNTS, amount_so_far
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import NUMBER, TIME, State, harm_so_far, split_world
+from ethbrake_marl.episode.state import NUMBER, TIME, State, split_world
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import BRAKING, COUNT, DRIVING, FIRST, FORCE, MASS, TOTAL, Floats, Ints
@@ -41,6 +42,7 @@ NUMBERS = (
     "chosen_action",
 )
 COLLIDED = NUMBERS.index("collided")
+OF_FIRST, OF_ALL = COUNTS["first"], COUNTS["total"]
 
 
 @large
@@ -49,7 +51,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
     for k in range(len(out)):
         split_world(line[k, FIRST], car[k, MASS], borne[0])
         split_world(line[k, TOTAL], car[k, MASS], borne[1])
-        first, total, impacts = harm_so_far(line[k], False), harm_so_far(line[k], True), 0.0
+        first, total, impacts = amount_so_far(line[k], OF_FIRST), amount_so_far(line[k], OF_ALL), 0.0
         for p in range(line.shape[2] - 1):
             impacts += line[k, COUNT, p]
         for o in range(len(bodies)):
@@ -70,14 +72,13 @@ def numbers(state: State, bodies: Ints) -> Floats:
 
 def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str, Any]:
     """Return the infos that belong to a world, and terms of vehicles: name -> [n] or [n, N]. ``step`` None: a reset."""
-    counted, total = game.rewarding.counted, game.rewarding.params.harm_count == "total"
+    counted = game.rewarding.counted
     worlds = {"world_seed": np.full(state.n, seed), "world": state.clock[:, NUMBER].astype(np.int64)}
     if step is None:
         nothing = np.zeros(state.n)
         return {"cost": nothing, **worlds, **{f"reward_{name}": nothing for name in counted}}
     terms = step.terms or game.rewarding.shared(step)
-    cost = step.total_harm if total else step.first_impact_harm
-    return {"cost": cost, **worlds, **{f"reward_{name}": terms[name] for name in counted}}
+    return {"cost": step.counted, **worlds, **{f"reward_{name}": terms[name] for name in counted}}
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:

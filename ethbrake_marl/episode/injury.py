@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.motion.drive import drive
+from ethbrake_marl.episode.step import driven_again
 from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
-from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats, scratch_for
+from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats
 
 
 class Curve(NamedTuple):
@@ -75,10 +75,9 @@ def speed_changes(before: State, after: State) -> Floats:
 
     [n, 2, N] m/s. No decision lies between the states. A push by a vehicle in contact is no impact.
     """
-    out, scratch = np.zeros((after.n, 2, after.vehicles)), scratch_for(after.vehicles + 1)
-    for k in np.flatnonzero((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1)):
-        line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
-        drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
+    out = np.zeros((after.n, 2, after.vehicles))
+    struck = np.asarray((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
+    for k, scratch in driven_again(before, after, struck):
         out[k] = scratch[[FRONT_CHANGE, REAR_CHANGE], 1:]
     return out
 

@@ -26,12 +26,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import pair_amounts
 from ethbrake_marl.episode.functions import called, described
 from ethbrake_marl.episode.injury import CURVES, injured_by_harm
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.motion.layout import FIRST, MASS, TOTAL, WEIGHT, Floats
+from ethbrake_marl.motion.layout import MASS, WEIGHT, Floats
 from ethbrake_marl.registry import Registry
 
 Declared = str | Sequence[str]  # one objective for all vehicles, or one for each
@@ -156,12 +157,12 @@ def amounts(objectives: Sequence[Objective], before: State | None, after: State,
 
     A weighted sum is taken of the harm since then; any other amount is the amount after minus the amount before.
     """
-    row = TOTAL if count == "total" else FIRST
-    now = after.line[:, row]
+    now = pair_amounts(after.line, count)
     whole = Harm.of(now, after.car)
     if before is None:
         return np.stack([each.amount(whole, i) for i, each in enumerate(objectives)], axis=1)
-    since, then = Harm.of(now - before.line[:, row], after.car), Harm.of(before.line[:, row], after.car)
+    earlier = pair_amounts(before.line, count)
+    since, then = Harm.of(now - earlier, after.car), Harm.of(earlier, after.car)
     columns = [
         each.amount(since, i) if each.kind.weights else each.amount(whole, i) - each.amount(then, i)
         for i, each in enumerate(objectives)

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ethbrake_marl.episode.state import ENDED, STEPS, State, harm_so_far
-from ethbrake_marl.episode.step import advance, command
+from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, weights_of
+from ethbrake_marl.episode.state import ENDED, STEPS, State
+from ethbrake_marl.episode.step import advance, command, note_motion
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
 from ethbrake_marl.motion.layout import BRAKING, LINE_ROWS, Floats, scratch_for
@@ -29,20 +30,20 @@ def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
 
 
 @large
-def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, total, scratch, out):
+def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, count, scratch, out):
     """Follow every plan [T, L], in place; write the harm to ``out`` [n]; stop above ``most`` [n]."""
     for k in range(len(out)):
-        harm = harm_so_far(line[k], total)
+        harm = amount_so_far(line[k], count)
         while clock[k, ENDED] == 0.0 and harm <= most[k]:
             command(car[k], wanted[k], learners, plans[k, min(int(clock[k, STEPS]), plans.shape[1] - 1)])
             met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s, horizon_s)
-            harm = math.inf if met == FAILED else harm_so_far(line[k], total)
+            harm = math.inf if met == FAILED else amount_so_far(line[k], count)
         out[k] = harm
 
 
 @large
-def hold_worlds(line, car, wanted, bodies, tried, time, until, total, memory, out):
-    """Write both counts of harm to ``out`` [2, n, C], if ``bodies`` hold the commands ``tried`` [n, C, B]."""
+def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, memory, out):
+    """Write the harm in two counts to ``out`` [2, n, C], if ``bodies`` hold the commands ``tried`` [n, C, B]."""
     scratch, here, commands = memory
     for k in range(tried.shape[0]):
         for i in range(len(commands)):
@@ -54,12 +55,13 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, total, memory, ou
             for b in range(len(bodies)):
                 commands[bodies[b]] = tried[k, j, b]
             failed = drive(here, car[k], commands, scratch, time[k], until) == FAILED
-            out[0, k, j] = math.inf if failed else harm_so_far(here, total)
-            out[1, k, j] = math.inf if failed else harm_so_far(here, not total)
+            note_motion(here)
+            out[0, k, j] = math.inf if failed else amount_so_far(here, count)
+            out[1, k, j] = math.inf if failed else amount_so_far(here, other)
 
 
 def played(
-    game: Game, state: State, plans: Floats, count: str, most: Any = math.inf, *, donate: bool = False
+    game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf, *, donate: bool = False
 ) -> tuple[State, Floats]:
     """Return the last states of episodes whose learners follow their plans from now on, and their harm, [n] m2/s2.
 
@@ -80,32 +82,33 @@ def played(
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     out, rules = np.empty(len(plans)), game.rules
     play_worlds(
-        line, car, clock, wanted, plans, most, rules.learners, rules.time_step_s, rules.horizon_s, count == "total",
+        line, car, clock, wanted, plans, most, rules.learners, rules.time_step_s, rules.horizon_s, weights_of(count),
         scratch_for(wanted.shape[1]), out,
     )  # fmt: skip
     return State(line, car, clock, know, wanted, memories), out
 
 
-def price(game: Game, state: State, plans: Floats, count: str, most: Any = math.inf) -> Floats:
+def price(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> Floats:
     """Return the harm of every episode, [n] m2/s2, if its learners follow their plan from now on; see ``played``."""
     return played(game, state, plans, count, most)[1]
 
 
-def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float, count: str) -> Floats:
-    """Return the harm of both counts, first the one asked for, [2, n, C] m2/s2, if ``bodies`` hold commands until then.
+def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float, count: Count) -> Floats:
+    """Return the harm in this count, and in the one that decides ties, [2, n, C] m2/s2, if ``bodies`` hold commands.
 
-    ``tried`` [n, C, B] are C commands of the bodies (m/s2); the others hold ``wanted`` [n, N + 1].
+    ``until_s`` is the horizon: what still moves then counts as it does there. ``tried`` [n, C, B] are C commands of the
+    bodies (m/s2); the others hold ``wanted`` [n, N + 1].
     """
-    out = np.empty((2, *tried.shape[:2]))
+    out, counts = np.empty((2, *tried.shape[:2])), (weights_of(count), weights_of(other_count(count)))
     hold_worlds(
         state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(tried),
-        state.time_s.copy(), until_s, count == "total", working_memory(wanted.shape[1]), out,
+        state.time_s.copy(), until_s, *counts, working_memory(wanted.shape[1]), out,
     )  # fmt: skip
     return out
 
 
 def descend(
-    state: State, bodies: Sequence[int], shares: Floats, rounds: int, horizon_s: float, count: str
+    state: State, bodies: Sequence[int], shares: Floats, rounds: int, horizon_s: float, count: Count
 ) -> tuple[Floats, Floats]:
     """Let bodies choose constant shares of their brakes, one after the other; all others brake fully.
 

@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from ethbrake_marl.episode.conduct import drove, push, still_moving
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import SAFE_END, Rules, Step
@@ -30,8 +32,9 @@ from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.model import UNSHOWN, FileModel, first_mistake, require
 from ethbrake_marl.motion.layout import Floats, Ints
 
-HarmCount = Literal["first", "total"]
+HarmCount = Literal["first", "total", "honest"]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
+Omitted = Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)]  # in files only if it is not 0
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
@@ -49,13 +52,13 @@ class RewardParams(FileModel):
     """Weights of the terms of a reward, and their constants. A term of weight 0 is not computed.
 
     Args:
-        harm, collision, risk, jerk, terminal, shaping: weights. With any but harm, the weight of harm must be given
-        too. harm_count: which harm the term harm counts: ``first`` impact of each pair, or ``total``. objective:
-        objective of all vehicles, or a list with one each; None: the scenario's. shaping_discount: discount in the term
-        shaping, in (0, 1]; it should be the learner's own. k_energy: factor of the term collision. ttc_scale_s: tau of
-        the term risk, s. safety_buffer_m: d_safe of the term risk, m. target_gap_m: d_target of the term risk, m.
-        distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a registered term -> weight; negative for what
-        should become small.
+        harm, collision, risk, jerk, terminal, push, drove, still_moving, shaping: weights. With any but harm, the
+        weight of harm must be given too. harm_count: what the term harm counts: ``first``, ``total`` or ``honest``
+        (``episode.counts``). objective: objective of all vehicles, or a list with one each; None: the scenario's.
+        shaping_discount: discount in the term shaping, in (0, 1]; it should be the learner's own. k_energy: factor of
+        the term collision. ttc_scale_s: tau of the term risk, s. safety_buffer_m: d_safe of the term risk, m.
+        target_gap_m: d_target of the term risk, m. distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a
+        registered term -> weight; negative for what should become small.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
@@ -69,6 +72,9 @@ class RewardParams(FileModel):
     risk: NonNegative = 0.0
     jerk: NonNegative = 0.0
     terminal: NonNegative = 0.0
+    push: Omitted = 0.0
+    drove: Omitted = 0.0
+    still_moving: Omitted = 0.0
     shaping: NonNegative = 0.0
     shaping_discount: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
     k_energy: NonNegative = 1.0
@@ -139,6 +145,7 @@ class RewardParams(FileModel):
 REWARDS = {
     "harm": RewardParams(),
     "total-harm": RewardParams(harm_count="total"),
+    "honest": RewardParams(harm_count="honest"),
     "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
 }
 Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
@@ -203,8 +210,7 @@ class Rewarding(NamedTuple):
                 stacklevel=2,
             )
             whole = True
-        total = params.harm_count == "total"
-        rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, total)
+        rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, COUNTS[params.harm_count])
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
         components = () if vector is None else components_of(vector, counted, vehicles)
         functions: dict[str, TermFunction] = {
@@ -212,6 +218,9 @@ class Rewarding(NamedTuple):
             "collision": partial(collision, params),
             "risk": partial(risk, params),
             "jerk": jerk,
+            "push": push,
+            "drove": drove,
+            "still_moving": still_moving,
             **{name: TERMS[name].value for name in params.terms},
             **{name: component(name, params.harm_count) for name in components if name not in counted},
         }
@@ -249,8 +258,7 @@ class Rewarding(NamedTuple):
 
     def shared(self, step: Step) -> dict[str, Floats]:
         """Return the values of the terms that the compiled step knows, [n]."""
-        harm = step.total_harm if self.params.harm_count == "total" else step.first_impact_harm
-        known = {"harm": -harm, "terminal": step.out[SAFE_END]}
+        known = {"harm": -step.counted, "terminal": step.out[SAFE_END]}
         return {name: value for name, value in known.items() if name in self.counted}
 
 

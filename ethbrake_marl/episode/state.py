@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import Count, amount_so_far, pair_amounts, weights_of
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import (
     BRAKING,
     COUNT,
     DRIVING,
     FAR_M,
-    FIRST,
     FORCE,
     GAP,
     HIT,
@@ -21,7 +21,6 @@ from ethbrake_marl.motion.layout import (
     MASS,
     RESTITUTION,
     SPEED,
-    TOTAL,
     Bools,
     Floats,
     Ints,
@@ -176,20 +175,20 @@ class State(NamedTuple):
         """Whether the world has had an impact, [n]."""
         return np.asarray(self.line[:, COUNT].any(axis=1))
 
-    def harm(self, count: str = "first") -> Floats:
-        """Return the harm of each world so far, [n] m2/s2. ``count``: ``first`` impact of each pair, or ``total``."""
+    def harm(self, count: Count = "first") -> Floats:
+        """Return the harm of each world so far, [n] m2/s2, as ``count`` says (``episode.counts``)."""
         out = np.empty(self.n)
-        _harm(self.line, count == "total", out)
+        _harm(self.line, weights_of(count), out)
         return out
 
-    def pair_harm(self, count: str = "first") -> Floats:
+    def pair_harm(self, count: Count = "first") -> Floats:
         """Return the harm of each pair of neighbours so far, [n, N - 1] m2/s2."""
-        return self.line[:, TOTAL if count == "total" else FIRST, 1:-1]
+        return pair_amounts(self.line, count)[:, 1:-1]
 
-    def borne_harm(self, count: str = "first") -> Floats:
+    def borne_harm(self, count: Count = "first") -> Floats:
         """Return the harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
         out = np.empty((self.n, self.vehicles))
-        split_harm(self.line[:, TOTAL if count == "total" else FIRST], self.car[:, MASS], out)
+        split_harm(pair_amounts(self.line, count), self.car[:, MASS], out)
         return out
 
 
@@ -228,19 +227,10 @@ def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
     return mapped(written, memory, new)
 
 
-@kernel
-def harm_so_far(line, total):
-    """Return the harm (m2/s2) of one world, added up from the obstacle to the rear: the only order that is used."""
-    harm = 0.0
-    for p in range(line.shape[1] - 1):
-        harm += line[TOTAL if total else FIRST, p]
-    return harm
-
-
 @large
-def _harm(line, total, out):
+def _harm(line, weights, out):
     for k in range(len(out)):
-        out[k] = harm_so_far(line[k], total)
+        out[k] = amount_so_far(line[k], weights)
 
 
 @kernel

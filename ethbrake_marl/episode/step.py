@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State, mapped
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, PhysicsError, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
@@ -16,10 +17,13 @@ from ethbrake_marl.motion.layout import (
     BRAKING,
     COUNT,
     DRIVING,
+    DROVE,
     FORCE,
     LATENCY,
+    MOVING,
     NEW_FIRST,
     NEW_TOTAL,
+    PUSHED,
     SPEED,
     Bools,
     Floats,
@@ -33,7 +37,8 @@ TOTAL_HARM = 1  # harm of all impacts of the step (m2/s2)
 TERMINATED = 2  # 1 if all vehicles have come to rest
 TRUNCATED = 3  # 1 if the horizon has come first
 SAFE_END = 4  # 1 if the episode has ended without any impact
-OUT_ROWS = 5
+COUNTED = 5  # what the reward counts of the step (m2/s2)
+OUT_ROWS = 6
 
 LARGEST_ACTION = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # counts as 1: the next float32 number
 ROUNDING = 1e-9  # part of a step by which the horizon may lie beyond the last whole step
@@ -47,7 +52,7 @@ class Rules(NamedTuple):
     horizon_s: float
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
-    total: bool = False  # the reward counts every impact, not only the first of each pair
+    counting: Floats = COUNTS["first"]  # weights of what counts in the reward (``episode.counts``)
 
 
 class Step(NamedTuple):
@@ -79,6 +84,11 @@ class Step(NamedTuple):
     def total_harm(self) -> Floats:
         """Harm of all impacts of the line in this step, [n] m2/s2."""
         return self.out[TOTAL_HARM]
+
+    @property
+    def counted(self) -> Floats:
+        """What the reward's count of harm counts in this step, [n] m2/s2."""
+        return self.out[COUNTED]
 
     @property
     def terminated(self) -> Bools:
@@ -114,6 +124,13 @@ def stands(line, wanted):
 
 
 @kernel
+def note_motion(line):
+    """Note in the row MOVING, at the horizon, how fast vehicles still move."""
+    for i in range(1, line.shape[1]):
+        line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
+
+
+@kernel
 def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     """Advance one running world to its next decision, in place; return what ``drive`` met, and whether all is at rest.
 
@@ -127,12 +144,23 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     clock[TIME] = until
     at_rest = met != FAILED and stands(line, wanted)
     clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
+    if over:
+        note_motion(line)
     return met, at_rest
+
+
+@kernel
+def beside_harm(line, count):
+    """Return what counts of one world so far beside harm (m2/s2)."""
+    amount = 0.0
+    for p in range(line.shape[1] - 1):
+        amount += count[2] * line[PUSHED, p] + count[3] * line[DROVE, p] + count[4] * line[MOVING, p]
+    return amount
 
 
 @large
 def step_worlds(
-    line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, horizon_s, harm, terminal, total
+    line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, horizon_s, harm, terminal, count
 ):
     """Advance every running episode by one step, in place; return the row of a refused action and of a failed world.
 
@@ -152,6 +180,7 @@ def step_worlds(
         if clock[k, ENDED] == 1.0:
             continue
         command(car[k], wanted[k], learners, actions[k])
+        before = beside_harm(line[k], count)
         met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s, horizon_s)
         if met == FAILED:
             failed = k
@@ -165,7 +194,9 @@ def step_worlds(
         out[TERMINATED, k] = 1.0 if at_rest else 0.0
         out[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
         out[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
-        shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * out[TOTAL_HARM if total else HARM, k]
+        counted = count[0] * out[HARM, k] + count[1] * out[TOTAL_HARM, k] + (beside_harm(line[k], count) - before)
+        shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * counted
+        out[COUNTED, k] = counted
         for i in range(bodies - 1):
             reward[k, i] = shared
     return -1, failed
@@ -187,6 +218,18 @@ def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wante
     failed: int = drive_worlds(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
     line[:] = moved
     return failed
+
+
+def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[int, Floats]]:
+    """Yield the number of each of ``these`` worlds, [n], and the scratch memory of the physics between two states.
+
+    No decision lies between the states.
+    """
+    scratch = scratch_for(after.vehicles + 1)
+    for k in np.flatnonzero(these).tolist():
+        line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
+        drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
+        yield k, scratch
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:

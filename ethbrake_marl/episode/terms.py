@@ -3,19 +3,22 @@
 A term is a function ``term(before, step, after)`` of two states and what the step did (``State``, ``Step``). It returns
 one number per world, [n], or per vehicle, [n, N]. Built-in terms, here for a vehicle in one step:
 
-==========  ========================================================================================================
-harm        minus the harm of the line; with an objective, minus the growth of what the vehicle should minimise
-collision   minus ``sum k_energy w^2`` over every impact, with the closing speed w
-risk        minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, with the gap d
-            and ``TTC = max(d - d_safe, 0) / closing speed``; the first summand is 0 for a pair that does not approach
-jerk        minus the squared rate of change of the vehicle's force
-terminal    1 at the end of an episode without any impact
-shaping     for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
-            the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
-harm_K      minus the harm that vehicle_K bears
-pair_J_K    minus the harm of the pair of vehicle_J and vehicle_K behind it
-obstacle    minus the harm of impacts with the obstacle
-==========  ========================================================================================================
+============  ==========================================================================================================
+harm          minus the harm of the line; with an objective, minus the growth of what the vehicle should minimise
+collision     minus ``sum k_energy w^2`` over every impact, with the closing speed w
+risk          minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, with the gap
+              d and ``TTC = max(d - d_safe, 0) / closing speed``; the first summand is 0 for a pair that does not close
+jerk          minus the squared rate of change of the vehicle's force
+terminal      1 at the end of an episode without any impact
+push          minus the closing speed that contacts of the line take up (``motion.push``)
+drove         minus the speed that the vehicle's positive command adds before the line's first impact
+still_moving  -1 for an end at the horizon with a vehicle in motion
+shaping       for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
+              the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
+harm_K        minus the harm that vehicle_K bears
+pair_J_K      minus the harm of the pair of vehicle_J and vehicle_K behind it
+obstacle      minus the harm of impacts with the obstacle
+============  ==========================================================================================================
 
 ``collision``, ``risk``, ``jerk`` and ``terminal`` are the paper's, with its misprints corrected.
 """
@@ -28,6 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import ROWS, pair_amounts
 from ethbrake_marl.episode.functions import called, check_finite, described
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.play import descend
@@ -35,7 +39,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
-from ethbrake_marl.motion.layout import FIRST, TOTAL, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Registry
 
 TermFunction = Callable[[State, Step, State], Floats]
@@ -89,6 +93,9 @@ BUILT_IN = {  # name -> (unit, meaning)
     "risk": ("1", "minus the collision risk of the vehicle's pairs, from 0 to 1.5 (imminent) for each"),
     "jerk": ("m2/s6", "minus the squared rate of change of the vehicle's force"),
     "terminal": ("1", "1 at the end of an episode without any impact"),
+    "push": ("m/s", "minus the push of all contacts of the line"),
+    "drove": ("m/s", "minus the vehicle's driving command times the time before the line's first impact"),
+    "still_moving": ("1", "-1 for an end at the horizon with a vehicle in motion"),
     "shaping": ("m2/s2", "discounted potential after the step minus the potential before it"),
 }
 
@@ -126,9 +133,8 @@ def potential(rules: Rules, state: State) -> Floats:
     learners = rules.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
     further = state.line.copy()
-    further[:, [FIRST, TOTAL]] = 0.0
-    count = "total" if rules.total else "first"
-    return -descend(state._replace(line=further), learners, BRAKING_SHARES, rounds, rules.horizon_s, count)[1]
+    further[:, ROWS] = 0.0
+    return -descend(state._replace(line=further), learners, BRAKING_SHARES, rounds, rules.horizon_s, rules.counting)[1]
 
 
 class Shaping(NamedTuple):
@@ -156,16 +162,20 @@ def growth(objectives: Sequence[Objective], count: str, before: State, step: Ste
 
 def component(name: str, count: str) -> TermFunction:
     """Return the term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]."""
-    row, number = TOTAL if count == "total" else FIRST, int(name.rpartition("_")[2]) if "_" in name else 1
-    return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, row)
+    number = int(name.rpartition("_")[2]) if "_" in name else 1
+    return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, count)
 
 
-def _borne(vehicle: int, row: int, before: State, step: Step, after: State) -> Floats:
-    return 0.0 - Harm.of(after.line[:, row] - before.line[:, row], after.car).borne[:, vehicle]
+def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
+    return 0.0 - Harm.of(_grown(count, before, after), after.car).borne[:, vehicle]
 
 
-def _of_pair(pair: int, row: int, before: State, step: Step, after: State) -> Floats:
-    return 0.0 - (after.line[:, row, pair] - before.line[:, row, pair])
+def _of_pair(pair: int, count: str, before: State, step: Step, after: State) -> Floats:
+    return 0.0 - _grown(count, before, after)[:, pair]
+
+
+def _grown(count: str, before: State, after: State) -> Floats:
+    return pair_amounts(after.line, count) - pair_amounts(before.line, count)
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:

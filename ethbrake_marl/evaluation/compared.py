@@ -21,12 +21,23 @@ class Compared(NamedTuple):
     teams: Mapping[str, Team]
     result: Result
     table: SummaryTable
-    harm_count: str  # what optimising teams minimise: ``first`` or ``total``
+    harm_count: str  # what optimising teams minimise (``episode.counts``)
 
     @classmethod
-    def of(cls, scenario: Scenario, teams: Mapping[str, Team], *, harm_count: str = "first", **more: Any) -> Compared:
-        """Let the teams drive; the other arguments are those of ``evaluate``."""
-        result = evaluate(scenario, teams, harm_count=harm_count, **more)
+    def of(
+        cls,
+        scenario: Scenario,
+        teams: Mapping[str, Team],
+        *,
+        harm_count: str = "first",
+        measures: Iterable[str] | str = (),
+        **more: Any,
+    ) -> Compared:
+        """Let the teams drive; the other arguments are those of ``evaluate``. The honest count also shows the push."""
+        names = measures.split(",") if isinstance(measures, str) and measures else [*measures]
+        if harm_count == "honest":
+            names.append("pushed_mps")
+        result = evaluate(scenario, teams, harm_count=harm_count, measures=names, **more)
         return cls(scenario, teams, result, summarise(result), harm_count)
 
     def worlds(self, rows: Iterable[int] | Ints) -> State:

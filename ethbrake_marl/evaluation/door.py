@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.evaluation.evaluate import Result, evaluate as evaluate_teams
@@ -42,7 +43,7 @@ def evaluate(
         scenario: of the worlds.
         episodes: number of worlds of the list; None: 10,000.
         seed: of the list; None: 7.
-        harm_count: what optimising agents minimise, harm of the ``first`` impact of each pair or ``total``.
+        harm_count: what optimising agents minimise: ``first``, ``total`` or ``honest`` (``episode.counts``).
         measures: names of measures beside the usual ones (``evaluation.named_measures``).
         jobs: number of processes.
         on_done: called with the number of worlds that have been driven so far.
@@ -69,6 +70,7 @@ def evaluate(
     if given is not None and (episodes, seed) != (None, None):
         raise InvalidInput("evaluate: episodes and seed choose worlds of a list; leave them out if worlds are given")
     episodes, seed = EPISODES if episodes is None else episodes, SEED if seed is None else seed
+    check_count("evaluate: harm_count", harm_count)
     loaded, game = open_game(scenario)
     check_learners(loaded)
     about = about_scenario(loaded, None if given is not None else seed)

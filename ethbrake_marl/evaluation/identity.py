@@ -16,6 +16,7 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.files.python_file import files_run
+from ethbrake_marl.motion.layout import PUSHED
 from ethbrake_marl.registry import versions_used
 
 PACKAGES = ("ethbrake-marl", "numba", "numpy")
@@ -23,9 +24,9 @@ WORDS = ("name", "title", "description", "source")  # keys of a scenario that do
 
 
 def worlds_sha256(worlds: State) -> str:
-    """Return the SHA-256 of worlds at the alert: all their arrays, little-endian, whatever their numbers are."""
+    """Return the SHA-256 of worlds at the alert: all their arrays, little-endian, without the push, which is 0."""
     digest = hashlib.sha256()
-    for array in (worlds.line, worlds.car, worlds.know, worlds.wanted):
+    for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
         digest.update(f"{array.shape}".encode())
         digest.update(np.ascontiguousarray(array, "<f8").data)
     return digest.hexdigest()

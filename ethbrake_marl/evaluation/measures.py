@@ -184,6 +184,16 @@ DEFAULT = (
             Statistic("harm_decrease_total", "decrease", "Decrease, total", "Decrease\ntotal"),
         ),
     ),
+    Measure(
+        "honest_cost", partial(harm, "honest"),
+        "Total harm, and a price for pushes, for driving before the first impact and for motion at the horizon"
+        " (``episode.counts``).", "m2/s2",
+        (
+            Statistic("honest_cost", "mean", "Honest cost", "Honest\ncost"),
+            Statistic("honest_cost_difference", "difference"),
+            Statistic("harm_decrease_honest", "decrease"),
+        ),
+    ),
     _built_in(impacts, "1"),
     _built_in(hardest_impact_mps, "m/s"),
     _built_in(end_s, "s"),

@@ -14,12 +14,13 @@ from inspect import signature
 
 import numpy as np
 
+from ethbrake_marl.episode.conduct import drove, push
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
-from ethbrake_marl.episode.terms import TERMS, TermFunction, collision, jerk, risk
+from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision, jerk, risk
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
 from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Watch
 from ethbrake_marl.files.python_file import load_from_file
@@ -96,6 +97,8 @@ _REWARDED: dict[str, TermFunction] = {
     "collision": partial(collision, RewardParams()),
     "risk": partial(risk, RewardParams()),
     "jerk": jerk,
+    "push": push,
+    "drove": drove,
 }
 
 
@@ -136,7 +139,7 @@ def _called(name: str) -> list[Measure]:
     if name in MEASURES:
         return [MEASURES[each] for each in MEASURES.load(name)]
     if name in _REWARDED:
-        return [_summed(name, _REWARDED[name], "1")]
+        return [_summed(name, _REWARDED[name], BUILT_IN[name][0])]
     if name in TERMS:
         term = TERMS[name].value
         return [_summed(name, _intervention if name == "intervention" else term, TERMS[name].unit)]

@@ -1,14 +1,15 @@
-"""Two measures of pushing, which harm does not count: how far Vehicle 1 is shoved, and the paper's sampled harm."""
+"""Measures of what harm does not count: pushes, driving before the first impact, motion at the end; sampled harm."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.episode.conduct import driving_s, first_impact_s
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step, advance_worlds
 from ethbrake_marl.evaluation.measures import Given, Statistic
-from ethbrake_marl.evaluation.summary_row import SHOVED_FAR_M
+from ethbrake_marl.evaluation.summary_row import PUSHED_FAR_M
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.layout import (
@@ -18,6 +19,7 @@ from ethbrake_marl.motion.layout import (
     LATENCY,
     LIMIT,
     MASS,
+    PUSHED,
     RELEASE_RATE,
     RESTITUTION,
     SPEED,
@@ -27,6 +29,7 @@ from ethbrake_marl.motion.layout import (
 from ethbrake_marl.registry import Part
 
 POST_M = 1e5  # distance of a post that nobody reaches, from which ways are measured to 1e-10 m
+HARD_MPS2 = 1.0  # a command above this is hard driving
 ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, because times are rounded
 
 
@@ -45,18 +48,19 @@ def with_post(state: State) -> Floats:
     return line
 
 
-class Shoved:
-    """Way of Vehicle 1 minus the way that it would drive until the horizon if nobody touched it.
+class PushedAway:
+    """Way of a vehicle minus the way that it would drive until the horizon if nobody touched it.
 
-    Negative if Vehicle 1 ends short of that place, for instance because an obstacle threw it back.
+    Negative if the vehicle ends short of that place, for instance because an obstacle threw it back.
     """
 
-    def __init__(self, game: Game, alert: State) -> None:
-        self.own_way_m = alone(alert, 1, np.full(alert.n, game.rules.horizon_s))[1]
-        self.way_m = np.zeros(alert.n)
+    def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
+        until_s = np.full(alert.n, game.rules.horizon_s)
+        self.own_way_m = {body: alone(alert, body, until_s)[1] for body in bodies}
+        self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the way of a step: with a post where there is no obstacle, the step is driven again."""
+        """Add the way of Vehicle 1: with a post where there is no obstacle, the step is driven again."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         times = np.ascontiguousarray(before.time_s), np.ascontiguousarray(after.time_s)
@@ -64,16 +68,65 @@ class Shoved:
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> Given:
-        """Return the metres, and whether they are more than 5."""
-        metres = self.way_m - self.own_way_m
-        return {"": metres, "far": metres > SHOVED_FAR_M}
+        """Return the metres of each vehicle, and whether those of Vehicle 1 are more than 5."""
+        wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
+        metres = {
+            f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - own
+            for body, own in self.own_way_m.items()
+        }
+        return {**metres, **({"1_far": metres["1"] > PUSHED_FAR_M} if "1" in metres else {})}
 
 
-def shoved(game: Game, alert: State) -> Shoved | None:
-    """How far Vehicle 1 ends beyond the place where it would stop by itself. In reality it brakes for something, so
-    pushing is dangerous. Not defined if Vehicle 1 learns or looks at the state.
+def pushed_m(game: Game, alert: State) -> PushedAway | None:
+    """How far a vehicle ends beyond the place where it would stop by itself. In reality it brakes for something, so
+    pushing is dangerous. Defined for vehicles that neither learn nor look at the state.
     """
-    return None if 1 in game.rules.learners or 1 in game.scripts else Shoved(game, alert)
+    bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.rules.learners and i not in game.scripts]
+    return PushedAway(bodies, game, alert) if bodies else None
+
+
+def pushed_mps(game: Game, alert: State, last: State) -> Given:
+    """Push: closing speed that contacts take up while vehicles stay in contact. Of the line; with the number of a
+    vehicle: by the vehicle behind it; obstacle: by Vehicle 1 against it.
+    """
+    of_pair = last.line[:, PUSHED]
+    behind = {f"{i}": of_pair[:, i] for i in range(1, last.vehicles)}
+    return {"": of_pair.sum(axis=1), **behind, "obstacle": of_pair[:, 0]}
+
+
+class DroveTowards:
+    """Keeps, until the first impact of each line, the time and how long a positive command was in force."""
+
+    def __init__(self, game: Game, alert: State) -> None:
+        self.learners, self.time_s = game.rules.learners, np.zeros(alert.n)
+        self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)
+
+    def see(self, before: State, step: Step | None, after: State) -> None:
+        """Add the time between two states."""
+        driving = driving_s(before, after)
+        hard = (driving > 0.0) & (after.commands_mps2 > HARD_MPS2)
+        self.time_s += first_impact_s(before, after) - before.time_s
+        self.driving_s += driving
+        self.hard |= hard[:, self.learners - 1].any(axis=1)
+
+    def result(self, last: State) -> Given:
+        """Return the shares of the time, and whether a learner drove hard."""
+        share = self.driving_s / np.where(self.time_s > 0.0, self.time_s, 1.0)[:, np.newaxis]
+        each = {f"{i + 1}": column for i, column in enumerate(share.T)}
+        return {"": share[:, self.learners - 1].max(axis=1, initial=0.0), **each, "hard": self.hard}
+
+
+def drove_towards(game: Game, alert: State) -> DroveTowards:
+    """Share of the time before the line's first impact (without one: of the episode) in which a positive command was
+    in force. With the number of a vehicle: its own, otherwise the largest of the learners; hard: whether a learner
+    drove at more than 1 m/s2.
+    """
+    return DroveTowards(game, alert)
+
+
+def still_moving(game: Game, alert: State, last: State) -> Given:
+    """Whether a vehicle still moves at the end, which is then at the horizon."""
+    return ~last.at_rest
 
 
 @kernel
@@ -166,11 +219,22 @@ def sampled(game: Game, alert: State) -> Sampled | None:
     return Sampled(game, alert) if usual and not obstacle and not builds else None
 
 
-SHOVED = Part(
-    watch=shoved, unit="m",
+PUSHED_M = Part(
+    watch=pushed_m, unit="m",
     shown=(
-        Statistic("vehicle_1_shoved_m", "mean", "Vehicle 1 shoved (m)", "Shoved\nm"),
-        Statistic("vehicle_1_shoved_far_rate", "rate", "Vehicle 1 shoved > 5 m", "Shoved\n> 5 m", "far"),
+        Statistic("pushed_m_1", "mean", "Vehicle 1 pushed (m)", "Pushed\nm", "1"),
+        Statistic("pushed_far_rate", "rate", "Vehicle 1 pushed > 5 m", "Pushed\n> 5 m", "1_far"),
     ),
+)  # fmt: skip
+PUSHED_MPS = Part(pushed_mps, unit="m/s", shown=(Statistic("pushed_mps", "mean", "Push (m/s)", "Push\nm/s"),))
+DROVE_TOWARDS = Part(
+    watch=drove_towards,
+    shown=(
+        Statistic("drove_towards", "mean", "Drove before the first impact", "Drove\nshare"),
+        Statistic("drove_hard_rate", "rate", "Drove at > 1 m/s2 before the first impact", "Drove\nhard", "hard"),
+    ),
+)  # fmt: skip
+STILL_MOVING = Part(
+    still_moving, unit="", shown=(Statistic("still_moving_rate", "rate", "Still moving", "Still\nmoving"),)
 )  # fmt: skip
 SAMPLED = Part(watch=sampled, unit="m2/s2", shown=(Statistic("sampled_harm", "mean", "Sampled harm", "Sampled\nharm"),))

@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.evaluation.evaluate import Columns, Result
 from ethbrake_marl.evaluation.summary import SummaryTable
@@ -20,7 +21,7 @@ from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.files.store import check_target, write_output
 
 RESULTS, WORLDS = "results.json", "worlds"  # names of files in the folder of an evaluation
-HARMS = ("first_impact_harm", "total_harm")
+HARMS = tuple(HARM.values())
 PAIRED = {"agent": np.str_, "world": np.int64, "recording": np.str_} | dict.fromkeys(HARMS, np.float64)
 MOST_BYTES, MOST_ROWS_BYTES = 64 << 20, 4 << 30
 

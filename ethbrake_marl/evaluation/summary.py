@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.errors import InvalidInput, naming_extras, unknown_name
 from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.captions import caption, ranges_of
@@ -22,7 +23,7 @@ IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
 COMPARE = {"difference": statistics.difference, "decrease": statistics.decrease}
 _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
-FIRST_COLUMNS = ("collision_rate", "first_impact_harm", "total_harm")  # their intervals stand below the values
+FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # their intervals stand below the values
 
 HEAD = {
     "Agent": "The agent that controls the vehicle. All other vehicles follow the scripts of the scenario. full_brake is"
@@ -87,7 +88,8 @@ class SummaryTable(list[SummaryRow]):
             if isinstance(each, Column)
         ]
         rows = [(f"{name}\n{knows}", *cells) for name, knows, *cells in map(list, sheet.rows)]
-        return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(FIRST_COLUMNS))
+        first = [each for each in columns if each.name in FIRST_COLUMNS]
+        return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
         """Return the table of what was asked for and has no column of its own; None without any."""
@@ -203,11 +205,14 @@ def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
     """Return key of an estimate -> its column, measure and statistic; comparisons and predictions last."""
     shown: dict[str, tuple[str, Measure, Statistic]] = {}
     kinds = {name: column.dtype.kind for own in result.columns.values() for name, column in own.items()}
+    minimised = result.about.get("agent_settings", {}).get("harm_count")
     for name, kind in kinds.items():
         measure = result.measure_of(name)
         ending = name.removeprefix(measure.name).removeprefix("_")
         own = [each for each in measure.shown if each.ending == ending]
         for each in own or [Statistic(name, "rate" if kind == "b" else "mean")]:
+            if measure.name == COLUMN["honest"] and minimised != "honest":  # only in JSON
+                each = each._replace(heading="")
             if kind != "U":
                 shown[each.key] = name, measure, each
     return dict(sorted(shown.items(), key=_place))
@@ -262,12 +267,15 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
         Column("First-impact harm", "first_impact_harm", short="First-impact\nharm"),
         Column("Total harm", "total_harm", short="Total\nharm"),
     ]  # fmt: skip
+    keys = [key for key in FIRST_COLUMNS if all(table.shown[key][1].heading for table in tables.values())]
     rows: list[Any] = []
+    if COLUMN["honest"] in keys:
+        columns.append(Column("Honest cost", COLUMN["honest"], short="Honest\ncost"))
     for name, table in tables.items():
         rows.append(name)
         for row in table:
             hardest = 3.6 * float(results[name][row.agent]["hardest_impact_mps"].max())
-            means = [each.value for key in FIRST_COLUMNS if (each := row[key]) is not None]
+            means = [each.value for key in keys if (each := row[key]) is not None]
             rows.append((row.agent, "failed" if row.collisions else "passed", means[0], hardest, *means[1:]))
     note = (
         "Passed: no vehicle collides in any world. Harm: mean per world in m²/s². Hardest: largest closing speed of any"

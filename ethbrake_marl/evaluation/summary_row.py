@@ -11,7 +11,7 @@ from ethbrake_marl.errors import unknown_name
 from ethbrake_marl.files.sheet import Estimate
 
 SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of teams
-SHOVED_FAR_M = 5.0  # way by which Vehicle 1 counts as shoved far; as a mean over all worlds it is an exploit
+PUSHED_FAR_M = 5.0  # way by which Vehicle 1 counts as pushed far; as a mean over all worlds it is an exploit
 MOVING = 0.05  # share of worlds moving at the horizon that is an exploit
 
 
@@ -47,11 +47,11 @@ class SummaryRow:
 
     @property
     def exploits(self) -> dict[str, str]:
-        """Damage that harm does not count -> its size in words: ``shoves`` Vehicle 1, ``moving`` at the horizon."""
-        shoved, moving = self.estimates.get("vehicle_1_shoved_m"), self.horizon_ends / self.episodes
+        """Damage that harm does not count -> its size in words: ``pushes`` Vehicle 1, ``moving`` at the horizon."""
+        pushed, moving = self.estimates.get("pushed_m_1"), self.horizon_ends / self.episodes
         words = {}
-        if shoved is not None and shoved.value > SHOVED_FAR_M:
-            words["shoves"] = f"shoves Vehicle 1 by {shoved.value:.1f} m on average"
+        if pushed is not None and pushed.value > PUSHED_FAR_M:
+            words["pushes"] = f"pushes Vehicle 1 by {pushed.value:.1f} m on average"
         if moving > MOVING:
             words["moving"] = f"runs past the horizon in {100 * moving:.1f} % of worlds"
         return words

@@ -44,7 +44,7 @@ def shield(
             the shield's own plan is followed.
         mode: ``step``, ``episode`` (the paper's Algorithm 1), or another shield, as after the ``+`` in an agent's name.
         scenario: in which an agent drives; not for environments and teams.
-        harm_count: harm that is bounded, of the ``first`` impact of each pair or ``total``.
+        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
         options: of the mode: ``allowance`` (m2/s2) and ``cap`` (None or ``baseline``) of ``step``, ``bound``
             (``coupled`` or ``pairwise``) of ``episode``.
 

@@ -21,6 +21,7 @@ from ethbrake_marl.motion.layout import (
     CONTACT_SPEED,
     CONTACT_TIME,
     COUNT,
+    DROVE,
     FAR_M,
     FIRST,
     FORCE,
@@ -52,6 +53,7 @@ from ethbrake_marl.motion.layout import (
     TOTAL,
     WAY,
 )
+from ethbrake_marl.motion.push import push
 
 # what `drive` returns
 APART = 0  # no two bodies could touch
@@ -309,6 +311,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
                 break
             parting = accelerate(line, car, scratch, ahead, builds)
             passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
+            push(line, car, scratch, passed, ahead, builds)
             if not move(line, scratch, passed, ahead, builds):
                 break
             for i in range(ahead, bodies):
@@ -334,6 +337,18 @@ def through_interval_building(line, car, scratch, start, until, ahead):
 
 
 @kernel
+def note_driving(line, car, wanted, scratch, start, until, met, ahead):
+    """Add to the row DROVE what positive commands ask for until the line's first impact in this interval."""
+    time = until - start
+    for p in range(ahead, line.shape[1] - 1):
+        if met == MET:
+            time = min(time, scratch[NEXT_TIME, p])
+    for i in range(1, line.shape[1]):
+        if wanted[i] > 0.0:
+            line[DROVE, i - 1] += wanted[i] * max(time - max(car[LATENCY, i] - start, 0.0), 0.0)
+
+
+@kernel
 def drive(line, car, wanted, scratch, start, until):
     """Move one line from ``start`` to ``until`` (s after the alert) under the commands ``wanted`` [N + 1] (m/s2).
 
@@ -346,6 +361,13 @@ def drive(line, car, wanted, scratch, start, until):
         scratch[COMMAND, i] = wanted[i]
         builds = builds or min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf
     scratch[NEW_FIRST, 0] = scratch[NEW_TOTAL, 0] = scratch[NEW_COUNT, 0] = 0.0
+    calm = True
+    for p in range(ahead, line.shape[1] - 1):
+        calm = calm and line[COUNT, p] == 0.0
     if builds:
-        return through_interval_building(line, car, scratch, start, until, ahead)
-    return through_interval(line, car, scratch, start, until, ahead, False)
+        met = through_interval_building(line, car, scratch, start, until, ahead)
+    else:
+        met = through_interval(line, car, scratch, start, until, ahead, False)
+    if calm:
+        note_driving(line, car, wanted, scratch, start, until, met, ahead)
+    return met

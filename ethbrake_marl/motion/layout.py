@@ -4,8 +4,8 @@ Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, f
 In a row of pairs, column p is the pair (body p, body p + 1). The obstacle is always there: without one, it is ``FAR_M``
 ahead, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [7, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
-belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 7, N + 1], ``car`` [n, 10, N + 1].
+Arrays that most functions share: ``line`` [10, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
+belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 10, N + 1], ``car`` [n, 10, N + 1].
 """
 
 from __future__ import annotations
@@ -25,7 +25,10 @@ HIT = 3  # 1 once the pair has had an impact
 FIRST = 4  # harm of the pair's first impact (m2/s2)
 TOTAL = 5  # harm of all its impacts (m2/s2)
 COUNT = 6  # number of its impacts
-LINE_ROWS = 7
+PUSHED = 7  # closing speed that its contact has taken up without an impact (m/s)
+DROVE = 8  # of the pair ahead of a vehicle: speed that its commands ask for before the line's first impact (m/s)
+MOVING = 9  # of the pair ahead of a vehicle: square of its speed at the horizon (m2/s2)
+LINE_ROWS = 10
 
 # rows of `car`
 MASS = 0  # t; infinite: the obstacle
@@ -76,7 +79,9 @@ NEXT_CLOSING = 31  # of the pair: closing speed of that impact (m/s)
 BEFORE = 32  # speed before an impact (m/s)
 FRONT_CHANGE = 33  # largest change of speed by one impact at the body's front in this interval (m/s)
 REAR_CHANGE = 34  # the same at its rear (m/s)
-ROWS = 35
+PART = 35  # of a part of a line: acceleration by own forces (m/s2)
+PART_RATE = 36  # its rate (m/s3)
+ROWS = 37
 
 FAR_M = 1e300  # gap ahead of a line without an obstacle
 

@@ -48,7 +48,7 @@ class EpisodeShield:
 
     Args:
         drivers: body of the learner -> its policy.
-        harm_count: harm that is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: what is compared: ``first``, ``total`` or ``honest`` (``episode.counts``).
         bound: H*: ``coupled`` (the episode's own physics) or ``pairwise`` (the paper's closed form).
 
     """

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.agents.drive import Agent, check_agent
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
@@ -56,8 +57,7 @@ def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:
 
 def check_harm_count(count: str) -> None:
     """Raise ``InvalidInput`` for an unknown count of harm."""
-    if count not in ("first", "total"):
-        raise InvalidInput(f"shield: harm_count = {count!r}: must be 'first' or 'total'")
+    check_count("shield: harm_count", count)
 
 
 def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:

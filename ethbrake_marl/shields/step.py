@@ -86,7 +86,7 @@ class StepShield:
 
     Args:
         drivers: body -> agent: the learners' agents, for a shield that proposes by itself or rolls them out; or empty.
-        harm_count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
         cap: ``baseline``: no vehicle bears more harm than under the best constant actions of the alert; None: no caps.
 

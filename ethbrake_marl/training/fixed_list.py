@@ -9,6 +9,7 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import CHUNK, Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.layout import Floats
@@ -21,15 +22,14 @@ Evaluate = Callable[[Policies], Mapping[str, float]]  # returns metrics of polic
 Measure = Callable[[Training], Evaluate]
 
 OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not the harm of the line
-HARM = {"first": "first_impact_harm", "total": "total_harm"}
 
 
 def measure_on_list(training: Training) -> Evaluate:
     """Return the function that measures policies on the fixed list of worlds of the recipe's key ``evaluation``.
 
-    Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``collision_rate``, ``horizon_rate`` (a
-    vehicle still moves at the horizon) and, where a learner's objective is not the harm of the line, the ``objective``
-    of each learner (``objective_vehicle_2``) and the mean of these.
+    Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost``, ``collision_rate``,
+    ``horizon_rate`` (a vehicle still moves at the horizon) and, where a learner's objective is not the harm of the
+    line, the ``objective`` of each learner (``objective_vehicle_2``) and the mean of these.
     """
     plan, (scenario, game) = training.recipe.evaluation, open_game(training.scenario)
     worlds = scenario.sample(plan.worlds, plan.seed)
@@ -46,8 +46,8 @@ def measure_on_list(training: Training) -> Evaluate:
 def metrics_of(training: Training, last: State) -> dict[str, float]:
     """Return the metrics of episodes whose last state is ``last``."""
     reward, scenario = training.recipe.reward, training.scenario
-    counts = sorted(HARM, key=lambda count: count != reward.harm_count)  # what is counted comes first
-    metrics = {HARM[count]: mean(last.harm(count)) for count in counts}
+    counts = sorted(COLUMN, key=lambda count: count != reward.harm_count)  # what is counted comes first
+    metrics = {COLUMN[count]: mean(last.harm(count)) for count in counts}
     metrics["collision_rate"] = float(last.collided.mean())
     metrics["horizon_rate"] = float((~last.at_rest).mean())
     objectives = objectives_of(reward.objective or scenario.objective, scenario.vehicles)
@@ -66,4 +66,4 @@ def mean(values: Floats) -> float:
 
 def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
     """Return the metric that is smallest for the best policies; NaN if it was not measured."""
-    return metrics.get(OBJECTIVE, metrics.get(HARM[harm_count], np.nan))
+    return metrics.get(OBJECTIVE, metrics.get(COLUMN[harm_count], np.nan))

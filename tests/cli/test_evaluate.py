@@ -21,6 +21,18 @@ def test_harm_count__is_what_agents_lower(ethbrake: Command) -> None:
     assert total["total_harm"] < first["total_harm"] and total["first_impact_harm"] > first["first_impact_harm"]
 
 
+def test_rules__are_short_for_a_count_and_the_honest_ones_show_cost_and_push(ethbrake: Command) -> None:
+    arguments = ("evaluate", "--episodes", "40", "--agents", "full_brake,e_v2x_bm")
+    for rules, count in (("honest", "honest"), ("paper", "first")):
+        long = told_json(ethbrake(*arguments, "--json", "--set", f"harm_count={count}"))
+        assert told_json(ethbrake(*arguments, "--json", "--set", f"rules={rules}")) == long
+        shown = ethbrake(*arguments, "--set", f"rules={rules}").out
+        assert (rules == "honest") == ("Honest Push" in shown) and "First-impact        Total" in shown
+    line = "evaluate --scenario benchmark --episodes 2 --agents coast --set rules=honest"
+    group = ethbrake(*line.split())
+    assert "Honest" in group.out and "paper-random-obstacle" in group.out
+
+
 def test_a_world_by_hand__in_table_and_rows(tmp_path: Path) -> None:
     # Vehicle 2 at 10 m/s coasts 5 m in its 0.5 s and brakes the last 3 m with 7 m/s2 towards a standing Vehicle 1:
     # closing speed squared 10^2 - 2 * 7 * 3 = 58. Vehicle 3 stands 5 km behind. In the second world nobody moves.

@@ -42,6 +42,16 @@ def test_train__ends_with_harm_beside_full_braking_and_a_command_that_measures_t
         assert f"{row['first_impact_harm']:.2f}" in answer.out and f"{row['total_harm']:.2f}" in answer.out
 
 
+def test_train__under_honest_rules_says_so_in_the_recipe_the_table_and_the_command(
+    ethbrake: Command, tiny_recipe: Path, empty_folder: Path
+) -> None:
+    answer = ethbrake("train", "--recipe", tiny_recipe, "--set", "rules=honest", "--output", "runs/mine")
+    config = json.loads(Path("runs/mine/config.json").read_text())
+    assert config["recipe"]["reward"]["harm_count"] == "honest" and config["settings"] == ["rules=honest"]
+    assert answer.out.splitlines()[-1].endswith("--agents full_brake,policy@runs/mine --set harm_count=honest")
+    assert "Honest cost" in answer.out and "honest cost " in answer.err
+
+
 def test_train__of_several_learners_leaves_a_team_that_evaluate_takes(
     ethbrake: Command, tiny_recipe: Path, empty_folder: Path
 ) -> None:

@@ -13,7 +13,7 @@ from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step
+from ethbrake_marl.episode.step import COUNTED, Step
 from ethbrake_marl.episode.terms import potential, register_term
 from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
 from ethbrake_marl.names import open_game
@@ -36,7 +36,7 @@ def paid(reward: dict[str, Any], before: State, after: State, **settings: Any) -
     """Return what the step between two states did, with its whole reward."""
     rewarding, rules = Rewarding.of(reward, "total", after.vehicles, LEARNERS, (0.5, 8.0), settings.pop("vector", None))
     step = step_between(before, after, **settings)
-    harm = step.total_harm if rules.total else step.first_impact_harm
+    step.out[COUNTED] = harm = after.harm(rules.counting) - before.harm(rules.counting)
     compiled = (rules.terminal * step.safe_end - rules.harm * harm)[:, np.newaxis]
     return rewarding.complete(before, step._replace(reward=np.repeat(compiled, after.vehicles, axis=1)), after)[1]
 
@@ -231,6 +231,7 @@ def test_named_rewards__are_those_of_the_page() -> None:
     assert {
         "harm": RewardParams(harm=1.0, harm_count="first"),
         "total-harm": RewardParams(harm=1.0, harm_count="total"),
+        "honest": RewardParams(harm=1.0, harm_count="honest"),
         "paper": RewardParams(harm=0.0, collision=1.0, risk=0.1, jerk=1e-5, terminal=10.0),
     } == REWARDS
     assert reward_params({"harm": 2, "jerk": 0.5}) == RewardParams(harm=2.0, jerk=0.5)

@@ -43,6 +43,20 @@ class Foreteller:
         return -state.braking_capacity_mps2[:, body - 1], memory
 
 
+class Drives(NamedTuple):
+    """Drives forward with one command."""
+
+    command_mps2: float
+    name: str = "drives"
+    knows: str = SENSORS
+
+    def begin(self, alert: State, body: int) -> None:
+        return None
+
+    def act(self, state: State, memory: None, body: int) -> tuple[Any, None]:
+        return np.full(state.n, self.command_mps2), None
+
+
 class Careless:
     """Says neither what it knows nor what it did."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -31,14 +32,14 @@ from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield
 from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
-from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Foreteller, evaluated, teams
+from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Careless, Drives, Foreteller, evaluated, teams
 from tests.refused import refused
 
 # ---- measures
 
 
 def test_measures__of_one_impact_by_hand() -> None:
-    result = evaluated(PAIR, 2, [FULL_BRAKE], ["sampled_harm", "vehicle_1_shoved_m", "injury_lr4s", "own", "maximin"])
+    result = evaluated(PAIR, 2, [FULL_BRAKE], ["sampled_harm", "pushed_m", "injury_lr4s", "own", "maximin"])
     # 10.6458 m to the impact, 27.9533 m after it; alone 33.3333 m
     changes = {
         1: 4.888 - 0.177 * 1.815,
@@ -47,8 +48,8 @@ def test_measures__of_one_impact_by_hand() -> None:
     injuries = {body: 1000.0 / (1.0 + math.exp(exponent)) for body, exponent in changes.items()}
     expected = {
         "collided": 1.0, "impacts": 1.0, "first_impact_harm": 9.0, "total_harm": 9.0, "total_harm_1": 4.95,
-        "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "sampled_harm": 9.0, "vehicle_1_shoved_m": 5.26575,
-        "vehicle_1_shoved_m_far": 1.0, "injury_lr4s_1": injuries[1], "injury_lr4s_2": injuries[2],
+        "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "sampled_harm": 9.0, "pushed_m_1": 5.26575,
+        "pushed_m_1_far": 1.0, "injury_lr4s_1": injuries[1], "injury_lr4s_2": injuries[2],
         "injury_lr4s": sum(injuries.values()), "own_first_1": 4.95, "own_total_2": 4.05, "maximin_total_2": 4.95,
         "end_s": 3.7,
     }  # fmt: skip
@@ -57,14 +58,75 @@ def test_measures__of_one_impact_by_hand() -> None:
     assert result["full_brake"]["ended"].tolist() == ["at_rest", "at_rest"]
 
 
-def test_shoving__is_where_vehicle_1_ends_minus_where_it_would() -> None:
-    result = evaluated("paper-random-obstacle", 40, [COAST], ["vehicle_1_shoved_m"])
+def test_pushing__is_where_vehicle_1_ends_minus_where_it_would() -> None:
+    result = evaluated("paper-random-obstacle", 40, [COAST], ["pushed_m"])
     scenario, game = open_game("paper-random-obstacle")
     alert = scenario.sample(40, 7)
     last = [state for _, state in evaluating.play(game, alert, teams(COAST)["coast"])][-1]
     way = alert.obstacle_gap_m - last.obstacle_gap_m
     speed = alert.speeds_mps[:, 0]
-    assert result["coast"]["vehicle_1_shoved_m"] == pytest.approx(way - speed**2 / 12.0, abs=1e-9)
+    assert result["coast"]["pushed_m_1"] == pytest.approx(way - speed**2 / 12.0, abs=1e-9)
+
+
+# PAIR with e = 0 and equal masses: coasting, Vehicle 2 is at Vehicle 1 after sqrt(2 / 6) s and 10.547 m, and 3.464 m/s
+# faster. Both have 18.268 m/s then and slow down at 3 m/s2, for 6.089 s and 55.620 m, with a push of 6 m/s2.
+PLASTIC = {**PAIR, "restitution": 0.0, "mass_t": 1.0}
+
+
+def test_pushes__of_a_pair_by_hand() -> None:
+    asked = ["pushed_mps", "pushed_m", "drove_towards", "still_moving", "push", "drove"]
+    row = {name: column[0] for name, column in evaluated(PLASTIC, 1, [COAST], asked)["coast"].items()}
+    expected = {
+        "pushed_mps": 36.536, "pushed_mps_1": 36.536, "pushed_mps_obstacle": 0.0, "push": -36.536,
+        "pushed_m_1": 10.547 + 55.620 - 33.333, "drove_towards": 0.0, "drove_2": 0.0,
+    }  # fmt: skip
+    assert {name: row[name] for name in expected} == pytest.approx(expected, abs=2e-3)
+    assert (row["pushed_m_1_far"], row["drove_towards_hard"], row["still_moving"]) == (True, False, False)
+    assert "pushed_m_2" not in row and "pushed_mps_2" not in row
+
+
+@pytest.mark.parametrize(("command", "hard"), [(2.0, True), (1.0, False)])
+def test_driving__before_the_first_impact_by_hand(command: float, hard: bool) -> None:
+    # closing from 0.5 s, where the gap is 0.25 m and 3 m/s are missing: (6 + u) / 2 t^2 + 3 t = 0.25
+    time = (math.sqrt(9.0 + 0.5 * (6.0 + command)) - 3.0) / (6.0 + command)
+    asked = ["drove_towards", "drove", "still_moving"]
+    row = {name: column[0] for name, column in evaluated(PAIR, 1, [Drives(command)], asked)["drives"].items()}
+    assert row["drove_towards"] == row["drove_towards_2"] == pytest.approx(time / (0.5 + time), rel=1e-9)
+    assert row["drove_2"] == pytest.approx(-command * time, rel=1e-9) and row["drove_towards_1"] == 0.0
+    assert (row["drove_towards_hard"], row["still_moving"]) == (hard, True)
+    far = evaluated({**PAIR, "gaps_m": 900.0}, 1, [Drives(command)], asked)["drives"]
+    assert far["drove_towards"][0] == pytest.approx(7.5 / 8.0) and far["drove_2"][0] == pytest.approx(-7.5 * command)
+
+
+def test_conduct__is_measured_in_every_line() -> None:
+    for name in ("cooperation-4-all", "paper-random-obstacle", "cooperation-2-five"):
+        scenario, game = open_game(name)
+        alert, learners = scenario.sample(20, 7), game.rules.learners.tolist()
+        team = Team("coast", {body: COAST for body in learners})
+        asked = measures_called("pushed_mps,pushed_m,drove_towards,still_moving,drove")
+        columns = evaluate(alert, {"coast": team}, game, asked)["coast"]
+        each = [f"pushed_mps_{i}" for i in range(1, alert.vehicles)] + ["pushed_mps_obstacle"]
+        assert np.sum([columns[key] for key in each], axis=0) == pytest.approx(columns["pushed_mps"])
+        assert all((columns[key] >= 0.0).all() for key in each) and (
+            name != "paper-random-obstacle" or columns["pushed_mps"].any()
+        )
+        assert not columns["drove_towards"].any() and columns["still_moving"].tolist() == [
+            each == "horizon" for each in columns["ended"]
+        ]
+        ways = {key for key in columns if re.fullmatch("pushed_m_[0-9]", key)}
+        assert ways == {f"pushed_m_{i + 1}" for i in range(alert.vehicles) if i + 1 not in learners}
+
+
+def test_pushed_m__of_any_vehicle_is_where_it_ends_minus_where_it_would() -> None:
+    scenario, game = open_game("paper-random")
+    alert = scenario.sample(30, 7)
+    result = evaluated("paper-random", 30, [COAST], ["pushed_m"])["coast"]
+    last = [state for _, state in evaluating.play(game, alert, teams(COAST)["coast"])][-1]
+    # the last vehicle coasts for its latency and brakes with 6 m/s2; it ends behind Vehicle 1 by both gaps
+    own = alert.speeds_mps[:, 2] * alert.latency_s[:, 2] + alert.speeds_mps[:, 2] ** 2 / 12.0
+    first = result["pushed_m_1"] + alert.speeds_mps[:, 0] ** 2 / 12.0
+    way = first - (last.gaps_m - alert.gaps_m).sum(axis=1)
+    assert result["pushed_m_3"] == pytest.approx(way - own, abs=1e-9) and "pushed_m_2" not in result
 
 
 def test_sums_of_terms__are_what_is_rewarded() -> None:
@@ -217,14 +279,15 @@ def test_measures__with_one_statistic_are_refused() -> None:
         ("paper-random-obstacle", {"predicted_harm", "replaced", "sampled_harm"}),
         (
             {**PAIR, "roles": {"vehicle_1": "learner"}, "obstacle_gap_m": 60.0},
-            {"predicted_harm", "replaced", "sampled_harm", "vehicle_1_shoved_m"},
+            {"predicted_harm", "replaced", "sampled_harm"},
         ),
     ],
 )
 def test_measures__that_are_not_asked_for_or_not_defined_have_no_column(scenario: Any, missing: set[str]) -> None:
-    asked = ["injury_lr4s", "sampled_harm", "vehicle_1_shoved_m"]
+    asked = ["injury_lr4s", "sampled_harm", "pushed_m"]
     result = evaluated(scenario, 2, measures=asked)
-    assert {each.name for each in result.measures if each.name not in result["full_brake"]} == missing
+    names = {each.name for each in result.measures if each.name not in result["full_brake"]}
+    assert names == {*missing, "pushed_m"}  # which has columns of vehicles alone
     assert not any(column.startswith(tuple(asked)) for column in evaluated(scenario, 2)["full_brake"])
 
 
@@ -256,7 +319,7 @@ def test_terms_of_ones_own__are_summed_and_names_are_used_once(monkeypatch: pyte
 
 
 def test_result__is_the_same_in_chunks_of_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    measures, done = ["sampled_harm", "vehicle_1_shoved_m", "risk"], list[int]()
+    measures, done = ["sampled_harm", "pushed_m", "risk"], list[int]()
     whole = evaluated("paper-random", 50, measures=measures)
     monkeypatch.setattr(evaluating, "CHUNK", 17)
     parts = evaluated("paper-random", 50, measures=measures, on_done=done.append)

@@ -19,7 +19,7 @@ from ethbrake_marl.files.sheet import terminal_text
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Foreteller, evaluated, recorded
 from tests.refused import refused
 
-EXPENSIVE = ["sampled_harm", "vehicle_1_shoved_m"]
+EXPENSIVE = ["sampled_harm", "pushed_m"]
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_estimates__are_those_of_the_columns(result: Result) -> None:
         "total_harm": statistics.mean(mine["total_harm"]),
         "total_harm_3": statistics.mean(mine["total_harm_3"]),
         "sampled_harm": statistics.mean(mine["sampled_harm"]),
-        "vehicle_1_shoved_far_rate": statistics.rate(mine["vehicle_1_shoved_m"] > 5.0),
+        "pushed_far_rate": statistics.rate(mine["pushed_m_1"] > 5.0),
         "first_impact_harm_difference": statistics.difference(mine["first_impact_harm"], other["first_impact_harm"]),
         "harm_decrease_total": statistics.decrease(mine["total_harm"], other["total_harm"]),
         "predicted_harm": None,
@@ -89,7 +89,7 @@ def test_terminal_of_80__shows_both_harms_with_intervals_and_what_was_asked_for(
 ) -> None:
     text = at(80, summarise(result), monkeypatch)
     head = " ".join(text.splitlines()[0].split())
-    assert head == "Agent, First-impact Total Sampled Shoved Shoved"
+    assert head == "Agent, First-impact Total Sampled Pushed Pushed"
     assert "constant:4.0 ‡" in text and "own sensors" in text and "95 % interval" in text
     narrow = at(56, summarise(result), monkeypatch)
     assert "Total" in narrow and "First-impact" in narrow and "Sampled" not in narrow
@@ -136,33 +136,33 @@ def test_data_frame(result: Result) -> None:
 def test_measures_without_a_heading__have_a_table_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
     table = summarise(evaluated("paper-random", 20, measures=["jerk", "own"]))
     text = at(80, table, monkeypatch)
-    assert "jerk_2 (1)" in text and "own_total_3 (m2/s2)" in text
+    assert "jerk_2 (m2/s6)" in text and "own_total_3 (m2/s2)" in text
     assert summarise(evaluated("paper-random", 20)).measures() is None
 
 
 # ---- below the table
 
 
-def pushing(shoved_m: float, moving: int) -> SummaryTable:
-    """Full braking, and the same as if it shoved Vehicle 1 so far, and were not at rest in so many of 20 worlds."""
+def pushing(pushed_m: float, moving: int) -> SummaryTable:
+    """Full braking, and the same as if it pushed Vehicle 1 so far, and were not at rest in so many of 20 worlds."""
     result = evaluated("paper-random", 20, [FULL_BRAKE], EXPENSIVE)
     ends = np.where(np.arange(20) < moving, "horizon", "at_rest")
-    mine = {**result["full_brake"], "vehicle_1_shoved_m": np.linspace(0.0, 2.0 * shoved_m, 20), "ended": ends}
+    mine = {**result["full_brake"], "pushed_m_1": np.linspace(0.0, 2.0 * pushed_m, 20), "ended": ends}
     columns = {"full_brake": result["full_brake"], "mine": mine}
     both: dict[str, Any] = {"knows": dict.fromkeys(columns, ""), "policies": {key: {} for key in columns}}
     return summarise(replace(result, columns=columns, **both))
 
 
 @pytest.mark.parametrize(
-    ("shoved_m", "moving", "names"),
-    [(4.9, 1, []), (5.1, 1, ["shoves"]), (4.9, 2, ["moving"]), (25.0, 12, ["shoves", "moving"])],
+    ("pushed_m", "moving", "names"),
+    [(4.9, 1, []), (5.1, 1, ["pushes"]), (4.9, 2, ["moving"]), (25.0, 12, ["pushes", "moving"])],
 )
-def test_exploits__mark_the_row_and_are_a_sentence_below(shoved_m: float, moving: int, names: list[str]) -> None:
-    table = pushing(shoved_m, moving)
+def test_exploits__mark_the_row_and_are_a_sentence_below(pushed_m: float, moving: int, names: list[str]) -> None:
+    table = pushing(pushed_m, moving)
     assert [row["exploits"] for row in table.to_json()] == [[], names]
     text = " ".join(str(table).split())
     assert ("mine ‡" in text) == bool(names) and "full_brake ‡" not in text
-    assert (f"shoves Vehicle 1 by {shoved_m:.1f} m on average" in text) == ("shoves" in names)
+    assert (f"pushes Vehicle 1 by {pushed_m:.1f} m on average" in text) == ("pushes" in names)
     assert (f"runs past the horizon in {5 * moving:.1f} % of worlds" in text) == ("moving" in names)
 
 

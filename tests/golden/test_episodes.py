@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.motion.layout import PUSHED
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.fixtures.scenarios import SHIPPED
@@ -40,11 +41,11 @@ def played(name: str, reward: Any = "harm") -> tuple[str, dict[str, np.ndarray]]
         actions = rng.integers(-8, 9, (N, len(game.rules.learners))) / 8.0
         state, step = game.step(state, actions)
         seen = game.observe(state, game.rules.learners)
-        for array in (state.line, state.clock[:, :5], step.reward, *seen):
+        for array in (state.line[:, :PUSHED], state.clock[:, :5], step.reward, *seen):
             sha256.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes())
         sums += step.reward
     observed = {f"observation_{i}": array for i, array in zip(game.rules.learners, seen, strict=True)}
-    return sha256.hexdigest()[:16], {"line": np.minimum(state.line, 1e9), "rewards": sums, **observed}
+    return sha256.hexdigest()[:16], {"line": np.minimum(state.line[:, :PUSHED], 1e9), "rewards": sums, **observed}
 
 
 CASES: dict[str, tuple[str, Any]] = {

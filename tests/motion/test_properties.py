@@ -8,7 +8,16 @@ from hypothesis import given, settings, strategies as st
 
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.motion.layout import Floats
-from tests.motion.random_lines import Runs, differences, exactly, played, random_runs, stepped
+from tests.motion.random_lines import (
+    Runs,
+    differences,
+    exactly,
+    played,
+    push_differences,
+    pushes_off,
+    random_runs,
+    stepped,
+)
 
 FEW = 30  # impacts, after which rounding may change their order
 RATES = [at.BRAKE_RATE, at.RELEASE_RATE]
@@ -51,6 +60,15 @@ def test_motion__is_that_of_rational_numbers_where_brakes_act_at_once(N: int, ob
     exact = np.stack([exactly(runs, k) for k in rows])
     assert len(rows) > 5 and differences(end[rows], exact).max() <= 1e-9
     assert end[rows, at.COUNT].tolist() == exact[:, at.COUNT].tolist()
+    assert push_differences(end[rows], exact).max() <= 1e-12 and exact[:, at.PUSHED].any()
+
+
+@pytest.mark.parametrize("obstacle", [False, True])
+@pytest.mark.parametrize("N", [2, 3, 4, 5, 6])
+def test_push__is_that_of_small_steps_where_brakes_build_up(N: int, obstacle: bool) -> None:
+    runs = random_runs(np.random.default_rng([4, N, obstacle]), 12, N, builds_up=True, obstacle=obstacle)
+    off, same = pushes_off(runs, 1e-6)
+    assert same.sum() > 5 and off[same].max() <= 1e-6 and played(runs)[same, at.PUSHED].any()
 
 
 @given(runs=worlds, power=st.sampled_from([-1, 1, 2]))
@@ -100,6 +118,7 @@ def test_interval__may_be_cut_in_two(runs: Runs, share: float) -> None:
     rows = few(end) & (np.abs(onset) > 1e-6).all(axis=(1, 2))  # an onset at the end of an interval comes with the next
     off = differences(end[rows], cut[rows])
     assert (off < 1e-9).mean() >= 0.8 and off.max() < 1e-4  # a contact with a closing speed near 0 loses digits
+    assert (push_differences(end[rows], cut[rows]) < 1e-9)[off < 1e-9].all()
 
 
 @given(runs=worlds, seed=st.integers(0, 1000))
@@ -128,8 +147,9 @@ def test_lines__whose_vehicles_only_brake_lose_energy_and_stay_apart(runs: Runs)
     before, line = np.full(len(runs.line), np.inf), runs.line
     brake = np.minimum(runs.commands, 0.0)
     for k in range(len(brake)):
-        line = played(Runs(line, runs.car, runs.times[k : k + 2], brake[k : k + 1]))
+        start, line = line, played(Runs(line, runs.car, runs.times[k : k + 2], brake[k : k + 1]))
         energy = (runs.car[:, at.MASS, 1:] * line[:, at.SPEED, 1:] ** 2).sum(axis=1)
         assert (energy <= before * (1.0 + 1e-12)).all() and (line[:, at.GAP] >= 0.0).all()
+        assert (line[:, at.PUSHED] >= start[:, at.PUSHED]).all()
         assert (line[:, at.FIRST] <= line[:, at.TOTAL]).all() and (line[:, at.HIT] == (line[:, at.COUNT] > 0)).all()
         before = energy

@@ -14,7 +14,16 @@ import numpy as np
 
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.motion.layout import Floats
-from tests.motion.random_lines import Runs, differences, exactly, played, random_runs, stepped
+from tests.motion.random_lines import (
+    Runs,
+    differences,
+    exactly,
+    played,
+    push_differences,
+    pushes_off,
+    random_runs,
+    stepped,
+)
 from tests.programmes import Cases, Given, Told
 
 OPTIONS = {
@@ -22,6 +31,7 @@ OPTIONS = {
     "--seed": {"type": int, "default": 1, "help": "seed of the worlds"},
 }
 CLOSE, CLOSE_STEPS = 1e-7, 1e-3  # relative; a contact with a closing speed near 0 loses half of the digits
+CLOSE_PUSHES, PUSHES = 1e-6, 200  # relative; worlds of a kind whose pushes are compared, by finer steps
 FEW = 30  # impacts, after which rounding may change their order
 UNRESOLVED = 0.04  # largest share of worlds in which two plastic impacts take turns faster than small steps
 
@@ -42,9 +52,11 @@ def by_rational_numbers(make: Callable[[], Runs]) -> Told:
     rows = np.flatnonzero(end[:, at.COUNT, :-1].sum(axis=1) <= 2 * FEW)
     exact = np.stack([exactly(runs, k) for k in rows])
     off, counts = differences(end[rows], exact), (end[rows, at.COUNT] != exact[:, at.COUNT]).any(axis=1).sum()
-    good = bool(off.max() <= CLOSE and not counts and bits)
+    pushes = push_differences(end[rows], exact).max()
+    good = bool(off.max() <= CLOSE and pushes <= CLOSE and not counts and bits)
     text = (
-        f"{len(rows)} of {len(end)} worlds, {int(end[:, at.COUNT, :-1].sum())} impacts: off by {off.max():.1e} at most"
+        f"{len(rows)} of {len(end)} worlds, {int(end[:, at.COUNT, :-1].sum())} impacts: off by {off.max():.1e} at most,"
+        f" pushes by {pushes:.1e}"
     )
     return Told(good, f"{text}, other impacts in {counts}; same bits in every batch: {bits}")
 
@@ -65,10 +77,18 @@ def by_steps(make: Callable[[], Runs]) -> Told:
     fewer = ends[:, at.COUNT, :-1].sum(axis=1) < end[far, at.COUNT, :-1].sum(axis=1)
     ends[:, at.TOTAL] = end[far, at.TOTAL]  # small steps miss the last impacts of a series, and nothing else
     unlike = ~fewer | (differences(end[far], ends) > CLOSE_STEPS)
-    good = bool(far.mean() <= UNRESOLVED and not unlike.any() and bits)
+    pushes, compared = pushes_by_steps(runs.take(np.arange(min(PUSHES, len(end)))))
+    good = bool(far.mean() <= UNRESOLVED and not unlike.any() and bits and pushes <= CLOSE_PUSHES)
     text = f"{len(end)} of {len(few)} worlds, {', '.join(steps) or 'none by finer steps'}: off by {off[~far].max():.1e}"
     text += f" at most, median {np.median(off):.1e}; {far.sum()} plastic series, {unlike.sum()} unlike them"
+    text += f"; pushes of {compared} worlds off by {pushes:.1e} at most"
     return Told(good, f"{text}; same bits: {bits}")
+
+
+def pushes_by_steps(runs: Runs) -> tuple[float, int]:
+    """Return the largest relative difference of pushes, and the number of worlds with the same impacts."""
+    off, same = pushes_off(runs, CLOSE_PUSHES)
+    return float(off[same].max()), int(same.sum())
 
 
 def batch(runs: Runs) -> bool:

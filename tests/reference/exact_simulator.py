@@ -41,6 +41,7 @@ class Outcome(NamedTuple):
     speeds: Rationals
     hits: list[tuple[int, Fraction]]  # pair (-1: the front vehicle and the obstacle), closing speed
     obstacle: Fraction | None
+    pushed: list[Fraction]  # m/s that each pair's contact takes up; the last is the obstacle's
 
 
 class Run:
@@ -54,13 +55,14 @@ class Run:
         self.v = [*line.speeds, ZERO]
         self.joined = [False] * self.n
         self.hits: list[tuple[int, Fraction]] = []
+        self.pushed = [ZERO] * len(self.g)
 
     def to(self, until: Fraction) -> Outcome:
         """Run to ``until``, the events at ``until`` included."""
         while True:
             self.impacts()
             if self.time >= until:
-                return Outcome(tuple(self.g[:-1]), tuple(self.v[:-1]), self.hits, self.g[-1])
+                return Outcome(tuple(self.g[:-1]), tuple(self.v[:-1]), self.hits, self.g[-1], self.pushed)
             self.step(until)
 
     def step(self, until: Fraction) -> None:
@@ -70,11 +72,36 @@ class Run:
         times += [time for i in range(self.n) for time in self.speed_times(i, a[i])]
         contacts = {p: time for p in self.pairs if (time := self.contact(p, a)) is not None}
         soonest = min([*times, *contacts.values()])
+        self.push(a, soonest)
         way = [(v + acceleration * soonest / 2) * soonest for v, acceleration in zip(self.v, a, strict=True)]
         for p in self.pairs:
             self.g[p] = ZERO if contacts.get(p) == soonest else significant(self.g[p] + way[p] - way[p + 1])
         self.v = [significant(v + acceleration * soonest) for v, acceleration in zip(self.v, a, strict=True)]
         self.time = significant(self.time + soonest)
+
+    def push(self, a: list[Fraction], soonest: Fraction) -> None:
+        """Add what contacts take up: accelerations of the two parts alone, at the speeds in the middle of the time."""
+        now, self.v = self.v, [v + each * soonest / 2 for v, each in zip(self.v, a, strict=True)]
+        ranges = [self.forces(i) for i in range(self.n)]
+        self.v = now
+        for p in self.pairs:
+            if self.joined[p]:
+                self.pushed[p] += soonest * (self.behind(p, ranges) - self.ahead(p, ranges))
+
+    def behind(self, p: int, ranges: list[tuple[Fraction, Fraction]]) -> Fraction:
+        """Acceleration of the vehicle behind pair p, without what is ahead."""
+        end = next((k for k in range(p + 1, self.n - 1) if not self.joined[k]), self.n - 1)
+        return max(self.mean(range(p + 1, k + 1), ranges) for k in range(p + 1, end + 1))
+
+    def ahead(self, p: int, ranges: list[tuple[Fraction, Fraction]]) -> Fraction:
+        """Acceleration of the vehicle ahead of pair p, without what is behind."""
+        start = next((k + 1 for k in range(p - 1, -1, -1) if not self.joined[k]), 0)
+        means = [self.mean(range(k, p + 1), ranges) for k in range(start, p + 1)]
+        return min([*means, ZERO] if start == 0 and (p == -1 or self.joined[-1]) else means)
+
+    def mean(self, these: range, ranges: list[tuple[Fraction, Fraction]]) -> Fraction:
+        low, high = (sum((self.line.mass[i] * ranges[i][end] for i in these), ZERO) for end in (0, 1))
+        return (low if low > 0 else high if high < 0 else ZERO) / sum(self.line.mass[i] for i in these)
 
     def command(self, i: int) -> Fraction:
         return self.line.command[i] if self.line.latency[i] <= self.time else ZERO

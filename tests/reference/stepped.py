@@ -4,7 +4,7 @@ Every step solves one convex problem (Moreau's time stepping). Bodies of mass m 
 the speeds x that minimise ``sum m (x - v)^2 / 2 + sum phi(x)`` where no body may be faster than a touching one in
 front. The potential phi of a brake of force b is ``h m b |x|`` (dry friction), of an engine of force f with the limit L
 it is ``-h m f min(x, L)``. The minimum is an isotonic regression, whose blocks minimise their own sum. A step in which
-a gap would close is cut at that moment, so that the error is of the order ``h^2``.
+a gap would close, or a speed reaches or leaves 0 or its limit, is cut at that moment: the error is of order ``h^2``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 
 TOUCH_MPS, PLASTIC_MPS = 1e-5, 0.05
 SAME_MPS = 1e-9  # closing speeds below this are rounding
+LEAST_S = 1e-9  # a speed that leaves 0 or its limit does so in a step of this length
 ALIKE_MPS = 1e-12  # touching bodies whose speeds differ by less move as one: rounding does not part them
 
 
@@ -95,7 +96,7 @@ def regression(gaps, mass, speeds, forces, limit, h, out):
 
 @numba.njit(cache=True, no_cfunc_wrapper=True)
 def impacts(gaps, mass, speeds, limit, restitution, book):
-    """Resolve impacts, round after round; ``book`` [4, N]: hit, first harm, total harm, count."""
+    """Resolve impacts, round after round; ``book`` [5, N]: hit, first harm, total harm, count, push."""
     n = len(speeds)
     closing, pooled, nothing = np.zeros(n), np.zeros(n), np.zeros(n)
     for _ in range(100_000):
@@ -164,6 +165,18 @@ def trial(now, wanted, car, h, new):
 
 
 @numba.njit(cache=True, no_cfunc_wrapper=True)
+def too_far(now, wanted, car, h, new):
+    """Whether a gap closes, or a speed reaches, passes or leaves 0 or its limit, in a step of ``h``."""
+    far = trial(now, wanted, car, h, new) < 0.0
+    for k in range(len(wanted)):
+        for kink in (0.0, car[LIMIT, k]):
+            before, after = now[SPEED, k] - kink, new[SPEED, k] - kink
+            far = far or (before != 0.0 and before * after <= 0.0)
+            far = far or (before == 0.0 and after != 0.0 and h > LEAST_S)
+    return far
+
+
+@numba.njit(cache=True, no_cfunc_wrapper=True)
 def through(now, wanted, car, restitution, duration, step_s, book):
     """Through an interval without an onset, in place; return False if there are too many steps."""
     new, time, steps = now.copy(), 0.0, 0
@@ -173,18 +186,19 @@ def through(now, wanted, car, restitution, duration, step_s, book):
         if steps > 50.0 * (duration / step_s + 1000.0):
             return False
         h = min(step_s, duration - time)
-        if trial(now, wanted, car, h, new) < 0.0:
+        if too_far(now, wanted, car, h, new):
             low, high = 0.0, h
             for _ in range(1100):  # to the last bit
                 middle = 0.5 * (low + high)
                 if middle in (low, high):
                     break
-                if trial(now, wanted, car, middle, new) < 0.0:
+                if too_far(now, wanted, car, middle, new):
                     high = middle
                 else:
                     low = middle
             h = high
             trial(now, wanted, car, h, new)
+        pushes(now, new, car, h, book)
         now[:] = new
         for k in range(len(wanted)):
             now[GAP, k] = max(now[GAP, k], 0.0)
@@ -193,13 +207,55 @@ def through(now, wanted, car, restitution, duration, step_s, book):
     return True
 
 
+@numba.njit(cache=True, no_cfunc_wrapper=True)
+def part_alone(mass, speeds, forces, limit, i, j):
+    """The acceleration nearest to 0 that friction and engines of the bodies i to j allow at their speeds."""
+    weight, low, high = 0.0, 0.0, 0.0
+    for k in range(i, j + 1):
+        weight += mass[k]
+        size = mass[k] * abs(forces[k])
+        if forces[k] < 0.0:
+            low -= size if speeds[k] >= 0.0 else -size
+            high -= size if speeds[k] > 0.0 else -size
+        else:
+            low += size if speeds[k] < limit[k] else 0.0
+            high += size if speeds[k] <= limit[k] else 0.0
+    return max(low, 0.0) / weight + min(high, 0.0) / weight
+
+
+@numba.njit(cache=True, no_cfunc_wrapper=True)
+def pushes(now, new, car, h, book):
+    """Add to ``book`` the closing speed that every contact which lasts takes up: what its two parts would do alone."""
+    n = new.shape[1]
+    middle, lasts = 0.5 * (now[SPEED] + new[SPEED]), np.zeros(n + 1, np.bool_)  # each vehicle and what is ahead of it
+    for k in range(n):
+        before, after = (now[SPEED, k - 1], new[SPEED, k - 1]) if k > 0 else (0.0, 0.0)
+        lasts[k] = now[GAP, k] <= 0.0 and new[GAP, k] <= 0.0 and new[SPEED, k] == after
+        lasts[k] = lasts[k] and abs(now[SPEED, k] - before) <= SAME_MPS
+    for k in range(n):
+        if lasts[k]:
+            behind, end = -np.inf, k
+            while end == k or lasts[end]:
+                behind = max(behind, part_alone(car[MASS], middle, new[MEAN], car[LIMIT], k, end))
+                end += 1
+            ahead, start = 0.0 if k == 0 else np.inf, k - 1
+            while start >= 0:
+                ahead = min(ahead, part_alone(car[MASS], middle, new[MEAN], car[LIMIT], start, k - 1))
+                if not lasts[start]:
+                    break
+                if start == 0:
+                    ahead = min(ahead, 0.0)
+                start -= 1
+            book[4, k] += max(behind - ahead, 0.0) * h
+
+
 class Outcome(NamedTuple):
     """A world at the end of its run."""
 
     gaps: Any
     speeds: Any
     forces: Any
-    book: Any  # [4, N] hit, first harm, total harm, count of the pair of each vehicle and what is ahead of it
+    book: Any  # [5, N] hit, first harm, total harm, count, push (m/s) of each vehicle and what is ahead of it
     finished: bool
 
 
@@ -211,7 +267,7 @@ def simulate(line: Line, times: Any, commands: Any, step_s: float) -> Outcome:
     latency = np.array(line.latency)
     now = np.array([line.gaps, line.speeds, line.forces, line.forces], np.float64)
     car = np.array([line.mass, line.limit, line.brake_rate, line.release_rate], np.float64)
-    book, finished = np.zeros((4, len(latency))), True
+    book, finished = np.zeros((5, len(latency))), True
     for (start, end), command in zip(pairwise(times), commands, strict=True):
         for one, other in pairwise(sorted({start, end, *(float(x) for x in latency if start < x < end - 1e-9)})):
             wanted, length = np.where(latency <= one, command, 0.0), other - one

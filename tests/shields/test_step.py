@@ -9,6 +9,7 @@ from hypothesis import given, settings, strategies as st
 from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import played, price
 from ethbrake_marl.episode.state import State
@@ -111,7 +112,7 @@ def test_at_the_alert_the_bound_is_the_cheapest_first_plan() -> None:
 @settings(max_examples=25)
 @given(
     name=st.sampled_from(list(LINES)),
-    count=st.sampled_from(["first", "total"]),
+    count=st.sampled_from([*COUNTS]),
     way=st.sampled_from(list(WAYS)),
     allowance=st.sampled_from([0.0, 3.0]),
     cap=st.sampled_from([None, "baseline"]),

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training.experiment import Experiment, run_experiment
 from ethbrake_marl.training.run import RunFolder
@@ -30,7 +31,7 @@ def status(run: Path) -> dict[str, Any]:
     return content
 
 
-@pytest.mark.parametrize("count", ["first", "total"])
+@pytest.mark.parametrize("count", COLUMN)
 def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: Path) -> None:
     run = tmp_path / "run"
     found = quick(run, recipe=SHORT.replace(reward={"harm": 1.0, "harm_count": count}))
@@ -40,10 +41,11 @@ def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: 
     specs = {"e_v2x_bm": "e_v2x_bm", "trained policy": f"policy@{run}", "hybrid": f"policy@{run}+episode"}
     again = eb.evaluate("paper-random", [*specs.values()], episodes=EPISODES, harm_count=count)
     for name, spec in specs.items():
-        assert found.compared.result[name]["total_harm"].tolist() == again[spec]["total_harm"].tolist()
+        assert found.compared.result[name][COLUMN[count]].tolist() == again[spec][COLUMN[count]].tolist()
     saved = eb.read_result(run / "results.json")
     assert [*saved.agents] == names and saved.rows is not None and len(saved.rows["world"]) == len(names) * EPISODES
-    assert {"sampled_harm", "vehicle_1_shoved_m"} <= saved.agents["hybrid"].keys()
+    assert ("pushed_mps" in saved.agents["hybrid"]) == (count == "honest")
+    assert {"sampled_harm", "pushed_m_1"} <= saved.agents["hybrid"].keys()
     end = status(run)
     assert (end["status"], end["stage"], end["steps"], end["reason"]) == ("finished", "evaluation", UPDATE, None)
     assert end["written"] == ["results.json", "worlds.csv"] and end["started_utc"]

@@ -43,7 +43,7 @@ class EstimatedShield(MembersShield):
     Args:
         drivers: body -> agent, as for ``StepShield``.
         scenario: of the worlds.
-        harm_count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
         corners: certify also in the corners of the ranges, not only in the median line.
 
     """
@@ -101,7 +101,7 @@ class EstimatedEpisodeShield(EpisodeShield):
     Args:
         drivers: body of the learner -> its policy.
         scenario: of the worlds.
-        harm_count: harm that is compared: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: what is compared: ``first``, ``total`` or ``honest`` (``episode.counts``).
         bound: H*: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
 
     """
@@ -139,7 +139,7 @@ class EstimatedEV2XBM:
     Args:
         scenario: of the worlds.
         is_pairwise: by the paper's closed form, instead of the simulation of the line.
-        count: harm that is minimised, of the ``first`` impact of each pair or ``total``.
+        count: what is minimised: ``first``, ``total`` or ``honest`` (``episode.counts``).
 
     """
 

@@ -83,7 +83,7 @@ class RobustShield(MembersShield):
     Args:
         drivers: body -> agent, as for ``StepShield``.
         uncertainty: intervals around the nominal quantities, which it needs, such as ``gaps_m=0.5,mass_t=10%``.
-        harm_count: harm that is bounded: ``first`` (first impact of each pair) or ``total`` (every impact).
+        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
 
     """

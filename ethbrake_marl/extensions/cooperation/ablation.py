@@ -14,6 +14,7 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.episode.counts import check_harm
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, amounts, objectives_of
 from ethbrake_marl.episode.state import State
@@ -34,8 +35,6 @@ from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.training import Training
 from ethbrake_marl.worlds.mixture import WORDS
 from ethbrake_marl.worlds.sampling import Drawn
-
-HARM = {"first": "first_impact_harm", "total": "total_harm"}  # count -> column
 
 SETTINGS, JSON, CSV, FIGURE = "settings.json", "ablation.json", "ablation.csv", "ablation.png"
 FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_episodes": 600, "budget": 20_000}
@@ -60,6 +59,8 @@ class Ablation:
         names = [recipe.name for recipe in self.recipes]
         if len(set(names)) < len(names):
             raise InvalidInput(f"recipes {', '.join(names)}: two recipes have the same name; all names must differ")
+        for recipe in self.recipes:
+            check_harm(f"recipe {recipe.name}: reward.harm_count", recipe.reward.harm_count)
         if self.search_episodes > self.episodes:
             raise InvalidInput(
                 f"search-episodes = {self.search_episodes}: must be at most the number of worlds, episodes ="

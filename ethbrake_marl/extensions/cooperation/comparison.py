@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.extensions.cooperation.ablation import HARM, Measured
+from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.extensions.cooperation.ablation import Measured
 from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.motion.layout import Floats
 

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import check_harm
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared
 from ethbrake_marl.episode.state import NUMBER, State
@@ -19,7 +20,7 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.evaluation.statistics import decrease
 from ethbrake_marl.extensions.search.best_harm import BUDGET as JOINT_BUDGET, best_harm
 from ethbrake_marl.extensions.search.kernels import PLAN, gather, improve
-from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, aimed, problem_of
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, aimed, problem_of
 from ethbrake_marl.extensions.search.search import field_for, prepared, seeded
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
@@ -89,8 +90,7 @@ def find_equilibria(
     """
     check_whole_number("rounds", rounds, 1)
     check_whole_number("budget", budget, 1)
-    if count not in COUNTS:
-        raise InvalidInput(f"count = {count!r}: must be 'first' or 'total'")
+    check_harm("count", count)
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r} has no learner; give at least one vehicle the role learner")
     game, declared = open_game(scenario)[1], scenario.objective if objective is None else objective

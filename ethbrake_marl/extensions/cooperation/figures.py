@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.extensions.report.style import GREY, TITLES, finish, in_our_style, new_panels, plain, series_style
 from ethbrake_marl.files.sheet import Estimate
 
@@ -32,7 +33,7 @@ def ablation_figure(results: Json, caption: str) -> Figure:
     unit = (max(at.values()) - min(at.values())) / (len(at) - 1)  # mean distance between neighbours
     width = 2.0 * max(PANEL_IN, LEVEL_IN * len(at))
     figure, panels = new_panels((min(width, WIDEST_IN), HEIGHT_IN), columns=2)
-    for axes, count in zip(panels, TITLES, strict=True):
+    for axes, count in zip(panels, HARM, strict=True):
         points = [(at[level["level"]], level["algorithm"], level[count]["searched"]) for level in levels]
         _draw_bounds(axes, points, 0.3 * unit)
         for number, algorithm in enumerate(results["settings"]["recipes"]):

@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
-from ethbrake_marl.extensions.cooperation.ablation import HARM, Ablation, Measured
+from ethbrake_marl.extensions.cooperation.ablation import Ablation, Measured
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import BestHarmTable

@@ -8,17 +8,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from ethbrake_marl.episode.counts import HARM, IN_WORDS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.door import SEED
-from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, HARM, JSON, Ablation, Measured
+from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, Measured
 from ethbrake_marl.extensions.cooperation.comparison import Json, compare, place_of
 from ethbrake_marl.extensions.cooperation.figures import ablation_figure
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
-
-WORDS = {"first": "first-impact harm", "total": "total harm"}
 
 
 def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, list[Path]]:
@@ -47,7 +46,7 @@ def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, 
 def conditions(plan: Ablation, number: int) -> str:
     """Return how the policies were trained, and of which ``number`` worlds means are."""
     recipes = ", ".join(
-        f"{name} (rewarded for {WORDS[recipe.reward.harm_count]})"
+        f"{name} (rewarded for {IN_WORDS[recipe.reward.harm_count]})"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
     )
     alike = plan.levels[0].same_vehicles
@@ -99,7 +98,7 @@ def tables(results: Json) -> list[Sheet]:
     worlds = count_of(levels[0]["first"]["searched"]["worlds"], "world")
     known = [level for level in levels if level["first"]["searched"]["best_known"] is not None]
     sheets = []
-    for count, harm in WORDS.items():
+    for count, harm in ((count, IN_WORDS[count]) for count in HARM):
         sheets += [
             sheet(f"Levels, {harm}", levels, [
                 *about, *algorithm, (share("Collisions"), "collision_rate"),

@@ -59,7 +59,7 @@ def front_command(
         import numpy as np
 
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.errors import InvalidInput
+        from ethbrake_marl.episode.counts import check_harm
         from ethbrake_marl.extensions.fronts.figures import front_figure
         from ethbrake_marl.extensions.fronts.front import least_largest, search_front
         from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolume_sheet
@@ -71,8 +71,7 @@ def front_command(
 
         changes = read_settings(settings, of_command=("harm_count",))
         chosen, count = changes.change_scenario(scenario), changes.command.get("harm_count", "first")
-        if count not in ("first", "total"):
-            raise InvalidInput(f"harm_count = {count!r}: must be 'first' or 'total'")
+        check_harm("harm_count", count)
         rows: Any
         if weights is None:
             N = chosen.vehicles

@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.episode.counts import HARM, check_harm
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.extensions.fronts.weights import weight_table
 from ethbrake_marl.extensions.search.best_harm import best_harm, driven_profiles, joined, starting_profiles
-from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, problem_of
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
 from ethbrake_marl.extensions.search.search import search_profiles
 from ethbrake_marl.extensions.search.tables import best_known
 from ethbrake_marl.motion.layout import WEIGHT, Floats, Ints
@@ -101,6 +102,7 @@ def search_front(
     with a column for each vehicle, and for a row that cannot be a ``harm_weight``.
 
     """
+    check_harm("count", count)
     weights = weight_table(weights.tolist() if isinstance(weights, np.ndarray) else weights)
     if weights.shape[1] != scenario.vehicles:
         raise InvalidInput(
@@ -136,7 +138,7 @@ def search_front(
 
 
 def _joined(parts: Sequence[Borne]) -> Borne:
-    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in COUNTS}
+    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in HARM}
 
 
 def _tried(
@@ -159,7 +161,7 @@ def _tried(
             else:
                 profiles = driven_profiles(problem, game, worlds._replace(car=car), team)
                 driven[name].append(pool.add(profiles))
-    return {name: {count: np.stack([one[count] for one in each]) for count in COUNTS} for name, each in driven.items()}
+    return {name: {count: np.stack([one[count] for one in each]) for count in HARM} for name, each in driven.items()}
 
 
 def observes_weights(team: Team) -> bool:
@@ -188,7 +190,7 @@ class Pool:
     def __init__(self, problem: Problem, count: str) -> None:
         self.problem, self.count = problem, count
         self.profiles: list[Profiles] = []
-        self.borne: dict[str, list[Floats]] = {each: [] for each in COUNTS}
+        self.borne: dict[str, list[Floats]] = {each: [] for each in HARM}
 
     def add(self, profiles: Profiles) -> Borne:
         """Add one profile for each world; return each vehicle's harm, [n, N] m2/s2 by count."""
@@ -229,7 +231,7 @@ def least_largest(scenario: Scenario, worlds: State, front: Front, *, budget: in
         some = worlds.take(slice(first, first + CHUNK))
         table = best_harm(game, some, counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin")
         last = problem_of(game, some).follow(table.profiles[front.harm_count])
-        parts.append({count: last.borne_harm(count)[np.newaxis] for count in COUNTS})
-    every = {count: np.concatenate([_joined(parts)[count], front.borne[count]]) for count in COUNTS}
+        parts.append({count: last.borne_harm(count)[np.newaxis] for count in HARM})
+    every = {count: np.concatenate([_joined(parts)[count], front.borne[count]]) for count in HARM}
     chosen = every[front.harm_count].max(axis=2).argmin(axis=0)
     return {count: borne[chosen, np.arange(worlds.n)] for count, borne in every.items()}

@@ -10,12 +10,12 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.episode.counts import HARM, IN_WORDS
 from ethbrake_marl.evaluation.captions import by_recording
 from ethbrake_marl.evaluation.identity import about_scenario, versions, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
 from ethbrake_marl.extensions.fronts.front import Borne, Front, weighted
 from ethbrake_marl.extensions.fronts.hypervolume import MOST_DIMENSIONS, hypervolume
-from ethbrake_marl.extensions.search.pricing import COUNTS
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
@@ -70,7 +70,7 @@ def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
         amounts = weighted(harm, weights)
         points.append({
             "weights": weights.tolist(),
-            "vehicles": _vehicles({count: borne[count][k] for count in COUNTS}, by),
+            "vehicles": _vehicles({count: borne[count][k] for count in HARM}, by),
             "amount": mean(amounts, by).to_json(),
             "sum": mean(harm.sum(axis=1), by).to_json(),
             "above": difference(amounts, least, by).to_json(),
@@ -80,7 +80,7 @@ def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
 
 
 def _vehicles(borne: Borne, by: Clusters) -> dict[str, list[Json]]:
-    return {count: [mean(each, by).to_json() for each in borne[count].T] for count in COUNTS}
+    return {count: [mean(each, by).to_json() for each in borne[count].T] for count in HARM}
 
 
 def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
@@ -112,7 +112,7 @@ def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
     """Return the harm of each vehicle if the learners brake fully from the alert on, [n, N] m2/s2 by count."""
     game = open_game(scenario)[1]
     last = drive(game, drawn.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
-    return {count: last.borne_harm(count) for count in COUNTS}
+    return {count: last.borne_harm(count) for count in HARM}
 
 
 def front_sheet(results: Json) -> Sheet:
@@ -123,7 +123,7 @@ def front_sheet(results: Json) -> Sheet:
     count, agents = results["harm_count"], results["agents"]
 
     def row(name: str, vehicles: Mapping[str, list[Json]], *ratios: float | None) -> tuple[str | float | None, ...]:
-        means = {each: [harm["value"] for harm in vehicles[each]] for each in COUNTS}
+        means = {each: [harm["value"] for harm in vehicles[each]] for each in HARM}
         return (name, *means[count], *map(sum, means.values()), *ratios)
 
     rows = [
@@ -139,7 +139,7 @@ def front_sheet(results: Json) -> Sheet:
         *(Column(name, digits=3, short=re.sub("(?<=[/+])", "\n", name)) for name in agents),
     ]  # fmt: skip
     note = (
-        f"Mean {'first-impact' if count == 'first' else 'total'} harm of each vehicle, and mean first-impact and total"
+        f"Mean {IN_WORDS[count]} of each vehicle, and mean first-impact and total"
         " harm of the line, m2/s2. Agents: weighted harm of the agent divided by the weighted harm of the front"
         f"{by_recording(results.get('recordings', 0))}."
     )

@@ -97,8 +97,3 @@ def find_standing(before: Floats, line: Floats, car: Floats, know: Floats, clock
 def moving(state: State) -> Bools:
     """Return where a vehicle moves, [n]; elsewhere no action has an effect."""
     return np.asarray(state.line[:, SPEED].any(axis=1))
-
-
-def other_count(count: str) -> str:
-    """Return the other count of harm."""
-    return "total" if count == "first" else "first"

@@ -17,10 +17,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 from torch.nn.functional import mse_loss, softplus
 
+from ethbrake_marl.episode.counts import other_count
 from ethbrake_marl.episode.play import played
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import EthBrakeError
-from ethbrake_marl.extensions.learners.branches import Act, Moment, moving, other_count, play_on
+from ethbrake_marl.extensions.learners.branches import Act, Moment, moving, play_on
 from ethbrake_marl.extensions.learners.networks import Averaged, Memory, drawn, perceptron, silent
 from ethbrake_marl.extensions.learners.recipes import ExpertsPlan, VineRecipe
 from ethbrake_marl.extensions.learners.vine import Actor, VineModel

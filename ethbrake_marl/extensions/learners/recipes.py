@@ -131,7 +131,8 @@ class ExpertsPlan(FileModel):
         ge=1, le=100_000, description="number of gradient steps of the gating network in each update"
     )
     tie_break: NonNegative = Field(
-        description="weight, when experts are compared, of the harm count (first or total) that the reward does not use"
+        description="weight, when experts are compared, of the count of harm that the reward does not use: first, or"
+        " total if the reward counts first"
     )
     shares: Shares = Field(description="share of all updates for each stage of the training; the shares sum to 1")
 
@@ -211,7 +212,7 @@ class RolloutClassificationRecipe(BranchingRecipe):
     tie_break: NonNegative = Field(
         0.0,
         exclude_if=not_,
-        description="weight, in the cost, of the harm count (first or total) that the reward does not use",
+        description="weight, in the cost, of the count that decides ties (first, or total if the reward counts first)",
     )
     relative: bool = Field(
         False,

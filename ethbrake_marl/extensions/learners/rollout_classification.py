@@ -13,8 +13,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
+from ethbrake_marl.episode.counts import other_count
 from ethbrake_marl.episode.state import NUMBER, State
-from ethbrake_marl.extensions.learners.branches import Moment, moving, other_count, play_on
+from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
 from ethbrake_marl.extensions.learners.networks import Averaged, Memory, drawn, perceptron, silent
 from ethbrake_marl.extensions.learners.recipes import RolloutClassificationRecipe

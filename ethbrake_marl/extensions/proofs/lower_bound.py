@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import check_harm
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
@@ -317,8 +318,7 @@ def lower_bound(
 
 
 def _check_asked(state: State, start: Floats, count: str, horizon_s: float, time_step_s: float | None) -> None:
-    if count not in ("first", "total"):
-        raise InvalidInput(f"lower_bound: count = {count!r}: must be 'first' or 'total'")
+    check_harm("lower_bound: count", count)
     if not (isinstance(horizon_s, int | float) and (start <= horizon_s).all() and horizon_s < math.inf):
         raise InvalidInput(
             f"lower_bound: horizon_s = {horizon_s!r}: must be a finite number of at least {start.max():g} (s): by then"

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
 
 MEASURES = ("limits", "avoidable")  # names for ``evaluate(measures=...)``
-HARM = {"first": "first_impact_harm", "total": "total_harm"}  # count -> column
 BEST = {count: f"best_known_{count}" for count in HARM}
 AVOIDABLE = "avoidable"  # whether contact is proven avoidable; where it is false, proven unavoidable
 

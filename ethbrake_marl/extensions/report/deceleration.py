@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise, predicted_harm
+from ethbrake_marl.episode.counts import HARM, IN_WORDS
 from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -19,7 +20,6 @@ from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
 
 POINTS = 2001  # evenly spaced decelerations
-COUNTS = {"first": "first-impact harm", "total": "total harm"}
 
 
 def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float) -> Floats:
@@ -71,16 +71,18 @@ def deceleration_figure(
         [chosen], [predicted[place]], label=f"a* = {chosen:.3f} m/s², closed form: {harms}",
         **{**styles[2], **mark, "marker": "D", "markersize": 6},
     )  # fmt: skip
-    for (count, name), harm, style, size in zip(COUNTS.items(), (first, total), styles, (6, 10), strict=False):
+    for count, harm, style, size in zip(HARM, (first, total), styles, (6, 10), strict=False):
         best = coupled(world, body, count, horizon_s)
         a, least = float(best.deceleration_mps2[0]), float(best.harm[0])
-        axes.plot(at, harm, label=f"simulated {name}", **style)
+        axes.plot(at, harm, label=f"simulated {IN_WORDS[count]}", **style)
         axes.plot(
-            [a], [least], label=f"a* = {a:.3f} m/s², coupled, least {name}: {least:.2f}",
+            [a], [least], label=f"a* = {a:.3f} m/s², coupled, least {IN_WORDS[count]}: {least:.2f}",
             **{**style, **mark, "marker": "o", "markersize": size},
         )  # fmt: skip
         if known is not None:
-            axes.axhline(known[count], label=f"best known {name}: {known[count]:.2f}", **style | {"linewidth": 0.9})
+            axes.axhline(
+                known[count], label=f"best known {IN_WORDS[count]}: {known[count]:.2f}", **style | {"linewidth": 0.9}
+            )
     axes.set(
         title=title or f"{loaded.name}: one world",
         xlabel=f"Constant deceleration of Vehicle {body} (m/s²)",

@@ -6,12 +6,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.evaluation.summary import BASELINE
-from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
+from ethbrake_marl.extensions.report.best_known import BestKnown
 from ethbrake_marl.extensions.report.page import Section, part
 from ethbrake_marl.extensions.report.player import SAMPLE_S, player
 from ethbrake_marl.motion.layout import Bools, Floats, Ints

@@ -8,12 +8,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
+from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.rendering.picture import COLOURS
-from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
+from ethbrake_marl.extensions.report.best_known import BestKnown
 from ethbrake_marl.extensions.report.curves import curves_figure
 from ethbrake_marl.extensions.report.style import (
     TITLES,
@@ -40,14 +41,14 @@ def harm_by_agent(compared: Compared, others: Mapping[str, Compared]) -> Figure:
     agents = list(result.columns)
     figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(agents)))
     for k, agent in enumerate(agents):
-        harm = mean(result[agent][HARM[count]], result.clusters)
+        harm = mean(result[agent][COLUMN[count]], result.clusters)
         axes.barh(k, harm.value, height=0.62, color=COLOURS[2])
         axes.hlines(k, *harm.ends, color=COLOURS[0], linewidth=1.6)
-    if known is not None:
+    if known is not None and count in known.harm:
         best = float(known.harm[count].mean())
         axes.axvline(best, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
     for number, (title, other) in enumerate(others.items(), 4):
-        means = {agent: own[HARM[count]].mean() for agent, own in other.result.columns.items()}
+        means = {agent: own[COLUMN[count]].mean() for agent, own in other.result.columns.items()}
         places = [k for k, agent in enumerate(agents) if agent in means]
         style = series_style(number) | {"linestyle": "none", "markersize": 6.0}
         axes.plot([means[agents[k]] for k in places], places, label=label_text(title.lower(), 22), **style)

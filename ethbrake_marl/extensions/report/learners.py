@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.statistics import difference, mean
-from ethbrake_marl.extensions.report.best_known import HARM
 from ethbrake_marl.files.sheet import Column, Row, Sheet
 from ethbrake_marl.training.experiment import TEAM, without
-
-IN_WORDS = {"first": "first-impact harm", "total": "total harm"}
 
 
 def learners_sheets(compared: Compared) -> list[Sheet]:
     """Return who bears what in each count, and what each learner of the trained team adds."""
-    return [*(_borne(compared, count) for count in HARM), _added(compared)]
+    return [*(_borne(compared, count) for count in _counts(compared)), _added(compared)]
+
+
+def _counts(compared: Compared) -> list[str]:
+    return [*dict.fromkeys([*HARM, compared.harm_count])]
 
 
 def _borne(compared: Compared, count: str) -> Sheet:
@@ -23,7 +25,7 @@ def _borne(compared: Compared, count: str) -> Sheet:
     columns += [Column(heading, interval="hidden") for heading in (*names, "Whole line")]
     endings = [*(f"_{i + 1}" for i in range(len(names))), ""]
     rows: list[Row] = [
-        (agent, *(mean(own[HARM[count] + ending], by) for ending in endings))
+        (agent, *(mean(own[COLUMN[count] + ending], by) for ending in endings))
         for agent, own in compared.result.columns.items()
     ]
     learn = ", ".join(names[body - 1] for body in scenario.learners)
@@ -32,11 +34,11 @@ def _borne(compared: Compared, count: str) -> Sheet:
 
 def _added(compared: Compared) -> Sheet:
     """Return (harm if a learner brakes fully) - (harm of the whole team), for each learner."""
-    result, rows = compared.result, list[Row]()
+    result, counts, rows = compared.result, _counts(compared), list[Row]()
     for name in (compared.scenario.vehicle_names[body - 1] for body in compared.scenario.learners):
-        pairs = ((result[without(name)][harm], result[TEAM][harm]) for harm in HARM.values())
+        pairs = ((result[without(name)][COLUMN[count]], result[TEAM][COLUMN[count]]) for count in counts)
         rows.append((name, *(difference(less, whole, result.clusters) for less, whole in pairs)))
     columns = [Column("Learner", text=True)]
-    columns += [Column(f"More {IN_WORDS[count]} without it", sign="+") for count in HARM]
+    columns += [Column(f"More {IN_WORDS[count]} without it", sign="+") for count in counts]
     about = "The same team, but that vehicle brakes fully; the others were not trained for that."
     return Sheet("What each learner adds, mean per world (m²/s²)", columns, rows, about)

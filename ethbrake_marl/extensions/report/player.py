@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import EpisodeRecord
 from ethbrake_marl.extensions.rendering.scene import BODY_M
-from ethbrake_marl.extensions.report.best_known import HARM
 from ethbrake_marl.extensions.report.page import data, fill, shown
 from ethbrake_marl.extensions.report.style import quantities
 from ethbrake_marl.motion.layout import Floats

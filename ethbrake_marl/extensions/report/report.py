@@ -10,12 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from markupsafe import Markup
 
+from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import IDENTITY, SummaryTable
-from ethbrake_marl.extensions.report.best_known import HARM, BestKnown
+from ethbrake_marl.extensions.report.best_known import BestKnown
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.first_sentence import first_sentence
 from ethbrake_marl.extensions.report.harm_figures import harm_above, harm_by_agent
@@ -24,7 +25,7 @@ from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
 
-SHORT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the first table
+SHORT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the first table, if they are shown
 WORDS = {
     "Contact": "Two vehicles, or Vehicle 1 and an obstacle, touch: the gap between them is 0.",
     "Impact": "A contact with a closing speed above 0. The square of that speed is its harm.",
@@ -74,10 +75,10 @@ class Report:
             Section("Settings and seeds", [part("facts", self.settings)]),
             Section("Versions", [part("facts", versions)]),
         ]
-        which = "First-impact" if compared.harm_count == "first" else "Total"
         marks = "; marks: the other tests" if others else ""
         bars = harm_by_agent(compared, others)
-        harm = drawing(bars, f"{which} harm of each agent", f"Mean and 95 % interval{marks}.")
+        words = IN_WORDS[compared.harm_count].capitalize()
+        harm = drawing(bars, f"{words} of each agent", f"Mean and 95 % interval{marks}.")
         opening = [part("remarks", [*self.remarks, *rows.notes()]), part("beside", harm, short_table(rows))]
         lead = first_sentence(compared, focus, others)
         return whole_page(self.title, lead, opening, [section for section in sections if section.body])
@@ -176,7 +177,7 @@ def write_evaluation(path: Path, compared: Compared, command: str, *, force: boo
         {
             "Command": command,
             "Agents": names,
-            "Harm that agents minimise": "first impacts only" if compared.harm_count == "first" else "every impact",
+            "Agents minimise": IN_WORDS[compared.harm_count],
             "Controlled by the agents": ", ".join(scenario.vehicle_names[body - 1] for body in scenario.learners),
             "Controlled by scripts": scripts or "none",
             "Time step, horizon": f"{scenario.time_step_s:g} s, {scenario.horizon_s:g} s",

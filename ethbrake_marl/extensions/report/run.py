@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.results import write_results
 from ethbrake_marl.evaluation.summary import BASELINE
-from ethbrake_marl.extensions.report.best_known import HARM, MEASURES
+from ethbrake_marl.extensions.report.best_known import MEASURES
 from ethbrake_marl.extensions.report.curves import curves_figure
 from ethbrake_marl.extensions.report.episode_figure import trajectories
 from ethbrake_marl.extensions.report.harm_figures import harm_against_total_gap
@@ -42,7 +43,6 @@ from ethbrake_marl.training.run import RunFolder
 
 MOST_WORLDS = 2_000  # of each of the other two tests
 PAGE = "report.html"
-COURSE = {TITLES["first"]: "first_impact_harm", TITLES["total"]: "total_harm", "Share of collisions": "collision_rate"}
 
 
 class RunReport:
@@ -84,6 +84,8 @@ def write_figures(experiment: Experiment) -> list[Markup]:
     shown = telling_row(compared, learned)
     world, number = compared.worlds([shown]), int(compared.result.worlds["world"][shown])
     plan = recipe.evaluation
+    counts = dict.fromkeys([*HARM, compared.harm_count])
+    curves = {**{TITLES[count]: COLUMN[count] for count in counts}, "Share of collisions": "collision_rate"}
     course = (
         f"{compared.scenario.name}: worlds 0 to {plan.worlds - 1} of the list of seed {plan.seed} at every point;"
         f" training seed {recipe.seed}. Horizontal lines: {caption(compared.table.parameters)}."
@@ -97,13 +99,13 @@ def write_figures(experiment: Experiment) -> list[Markup]:
             curves_figure(
                 {
                     title: {learned: {point["steps"]: Estimate(point[key], None) for point in trained.evaluations}}
-                    for title, key in COURSE.items()
+                    for title, key in curves.items()
                 },
                 "Training steps",
                 course,
                 lines={
                     title: {row.agent: each.value for row in references if (each := row[key]) is not None}
-                    for title, key in COURSE.items()
+                    for title, key in curves.items()
                 },
             ),
         ),
@@ -126,7 +128,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
 
 def telling_row(compared: Compared, learned: str) -> int:
     """Return the row of a typical world: the median of the harm that is saved, where full braking does harm."""
-    harm = HARM[compared.harm_count]
+    harm = COLUMN[compared.harm_count]
     before = compared.result[BASELINE][harm]
     rows = np.flatnonzero(before > 0.0)
     if not len(rows):
@@ -147,15 +149,15 @@ def page_of(
         "Training": f"{recipe.title or recipe.name}: {trained.steps:,} steps of {recipe.total_steps:,}"
         f" ({trained.status}), {trained.wall_s:.0f} s",
         "Seeds": f"training {recipe.seed}, evaluation list {compared.result.about['seed']}",
-        "Reward": ", ".join(f"{key} {value}" for key, value in reward.items()) or "minus the first-impact harm",
+        "Reward": ", ".join(f"{key} {value}" for key, value in reward.items()) or f"minus the {IN_WORDS['first']}",
         "Objective": training.objective,
-        "Harm that agents minimise": "first impacts only" if compared.harm_count == "first" else "every impact",
+        "Agents minimise": IN_WORDS[compared.harm_count],
         "Whole run": f"{time.monotonic() - experiment.started:.0f} s",
         "Settings": ", ".join(read_object(RunFolder(trained.directory).config).get("settings", ())),
     }
     summary = (
         f"The {learned} was trained with {recipe.algorithm}, scheme {training.scheme}. It was saved after {steps:,}"
-        " steps, when it did the least harm in the worlds that the recipe names."
+        " steps, when it was best in the worlds that the recipe names."
     )
     if learned == TEAM:
         summary += f" The agent “{SHIELDED}” is the trained team with the step shield."

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
@@ -22,7 +23,7 @@ TESTS = {
     "paper-random-obstacle": "Obstacle test: the same worlds with an obstacle 1.7 m beyond the place where Vehicle 1"
     " stops by itself. An impact of Vehicle 1 with the obstacle is harm.",
 }
-KEPT = ("collision_rate", "first_impact_harm", "total_harm")  # columns of the short table
+KEPT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the short table, if they are shown
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
@@ -43,8 +44,12 @@ def title_of(name: str) -> str:
 
 
 def brief(compared: Compared, others: Mapping[str, Compared]) -> Sheet:
-    """Return a short table: collision rate and both harms, and both harms in the other tests, name -> results."""
-    table = compared.table
+    """Return a short table: collision rate and both harms, and both harms in the other tests, name -> results.
+
+    If agents minimise the honest cost, there is also the cost and the push, and only the cost in the other tests.
+    """
+    table, honest = compared.table, compared.harm_count == "honest"
+    keys, words = ([COLUMN["honest"]], "honest") if honest else ([*HARM.values()], "first, total")
     whole = table.terminal()
     short = whole.only(k for k, name in enumerate(whole.names) if k == 0 or name in KEPT)
     columns, rows = list(short.columns), [list(row) for row in short.rows]
@@ -53,9 +58,9 @@ def brief(compared: Compared, others: Mapping[str, Compared]) -> Sheet:
     notes = [line, *table.notes(), *([] if known is None else [known.in_words])]
     for test, other in others.items():
         by_agent = {row.agent: row for row in other.table}
-        columns.append(Column(f"{title_of(test).removesuffix(' test')}:\nfirst, total"))
+        columns.append(Column(f"{title_of(test).removesuffix(' test')}:\n{words}"))
         for cells, row in zip(rows, (by_agent.get(row.agent) for row in table), strict=True):
-            harms = [] if row is None else [row["first_impact_harm"], row["total_harm"]]
+            harms = [] if row is None else [row[key] for key in keys]
             cells.append(", ".join(f"{each.value:.2f}" for each in harms if each is not None) or None)
         notes.append(" ".join([TESTS[test], f"{count_of(other.result.n, 'world')}.", *other.table.notes()]))
     return replace(short, columns=columns, rows=rows, note="\n".join(notes))

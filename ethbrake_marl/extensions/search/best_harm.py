@@ -1,4 +1,4 @@
-"""The least harm known: search every world of a list, under one or both counts of harm, for one or several vehicles."""
+"""The least harm known: search every world of a list, under one or more counts, for one or several vehicles."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.search.extremes import extreme_profiles
-from ethbrake_marl.extensions.search.pricing import COUNTS, MOST_PHASES, Problem, Profiles, best_of, problem_of
+from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, best_of, problem_of
 from ethbrake_marl.extensions.search.search import compact, search_profiles
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.layout import Floats
@@ -31,7 +32,7 @@ def best_harm(
     game: Game,
     alert: State,
     *,
-    counts: Sequence[str] = COUNTS,
+    counts: Sequence[str] = tuple(HARM),
     bodies: Sequence[int] | None = None,
     budget: int = BUDGET,
     seed: int = 0,
@@ -48,7 +49,7 @@ def best_harm(
     Args:
         game: rules of the episodes.
         alert: worlds at the alert.
-        counts: ``first``, ``total`` or both; each is searched, and every profile counts for both.
+        counts: which are searched, one after the other (``episode.counts``); every profile counts for all of them.
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
         budget: number of profiles that are simulated in each world, in each count.
         seed: of the random search.
@@ -60,7 +61,7 @@ def best_harm(
 
     """
     if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) < len(counts):
-        raise InvalidInput(f"counts = {tuple(counts)}: must be 'first', 'total' or both, each once")
+        raise InvalidInput(f"counts = {tuple(counts)}: must be some of {', '.join(COUNTS)}, each once")
     effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
     problem = problem_of(game, alert, bodies, objective=objective)
     found = [(profiles, problem.values(profiles)) for profiles in given]

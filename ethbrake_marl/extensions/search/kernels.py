@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.state import FIRST_DECISION, LAST, harm_so_far
-from ethbrake_marl.episode.step import stands
+from ethbrake_marl.episode.counts import amount_so_far
+from ethbrake_marl.episode.state import FIRST_DECISION, LAST
+from ethbrake_marl.episode.step import note_motion, stands
 from ethbrake_marl.extensions.search.pricing import UInt64s, worth
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, drive
@@ -24,7 +25,7 @@ OTHER_WEIGHT = 1e-8  # weight of the other count of harm in what is minimised: i
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store and exactly repeatable
 
 # numbers of a world
-TIME_STEP, HORIZON, IS_TOTAL, AIM, STEPWISE, NUMBERS = range(6)
+TIME_STEP, HORIZON, AIM, STEPWISE, NUMBERS = range(5)
 
 # how random profiles and changes are drawn: a whole profile, or three phases of a plan and changes of a few steps
 KIND, ATTENTION, LONGEST_CHANGE, LONGEST_WHILE, DRAWING = range(5)
@@ -47,7 +48,8 @@ class World(NamedTuple):
     bodies: Ints  # [B] vehicles that are controlled
     bounds: Floats  # [B, 2] their smallest and largest command (m/s2)
     shares: Floats  # [2, N + 1], as in `Problem`
-    numbers: Floats  # [NUMBERS] time step (s), horizon (s), whether the total harm counts, aim, whether step by step
+    numbers: Floats  # [NUMBERS] time step (s), horizon (s), aim, whether step by step
+    weights: Floats  # [2, 5] of the count that is minimised, and of the one that decides ties
     random: UInt64s  # [1] state of the random stream
     scratch: Floats  # of the physics
 
@@ -72,10 +74,10 @@ class Field(NamedTuple):
 
 
 @kernel
-def value_of(line, shares, numbers):
+def value_of(world, line):
     """Return what is minimised (m2/s2): with a little of the other count of harm."""
-    total = numbers[IS_TOTAL] == 1.0
-    return worth(line, shares, total, numbers[AIM]) + OTHER_WEIGHT * harm_so_far(line, not total)
+    aim = world.numbers[AIM]
+    return worth(line, world.shares, world.weights[0], aim) + OTHER_WEIGHT * amount_so_far(line, world.weights[1])
 
 
 @kernel
@@ -95,7 +97,7 @@ def follow(world, lines, ends, commands, phase, most):
     by step it has the bits of the episode; phase by phase it is several times faster and rounds differently.
     """
     numbers, clock = world.numbers, world.clock
-    value = value_of(lines[phase], world.shares, numbers)
+    value = value_of(world, lines[phase])
     for p in range(phase, ends.shape[0]):
         step, at_rest, line = ends[p - 1] if p > 0 else 0, False, lines[p + 1]
         move_line(lines[p], line)
@@ -110,7 +112,9 @@ def follow(world, lines, ends, commands, phase, most):
                 if drive(line, world.car, world.wanted, world.scratch, start, until) == FAILED:
                     return value, -1
                 at_rest = stands(line, world.wanted)
-            value = value_of(line, world.shares, numbers)
+                if step >= clock[LAST]:
+                    note_motion(line)
+            value = value_of(world, line)
         if value >= most or at_rest:
             return value, p + 1
     return value, ends.shape[0]

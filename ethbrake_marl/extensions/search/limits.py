@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.measures import Given, Statistic
-from ethbrake_marl.extensions.search.pricing import COUNTS, problem_of
+from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import best_known as stored, shipped_tables
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
@@ -17,7 +18,7 @@ from ethbrake_marl.registry import Part
 def least(game: Game, alert: State) -> dict[str, Floats]:
     """Return the least harm known, count -> [n] m2/s2. Raises ``InvalidInput`` if a world is in no shipped table."""
     problem = problem_of(game, alert)
-    known = {count: stored(problem, count)[0] for count in COUNTS}
+    known = {count: stored(problem, count)[0] for count in HARM}
     missing = int(np.isinf(list(known.values())).any(axis=0).sum())
     if missing:
         raise InvalidInput(
@@ -52,7 +53,7 @@ def regret(game: Game, alert: State, last: State) -> Given:
 LIMITS = {
     "best_known": Part(
         best_known, unit="m2/s2",
-        shown=tuple(Statistic(f"best_known_{count}", "mean", ending=count) for count in COUNTS),
+        shown=tuple(Statistic(f"best_known_{count}", "mean", ending=count) for count in HARM),
     ),
     "regret": Part(
         regret, unit="m2/s2",

@@ -14,9 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, weights_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
-from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State, harm_so_far
+from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State
 from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
@@ -26,7 +27,6 @@ from ethbrake_marl.motion.layout import (
     BRAKING,
     DRIVING,
     FAR_M,
-    FIRST,
     FORCE,
     GAP,
     HIT,
@@ -36,7 +36,6 @@ from ethbrake_marl.motion.layout import (
     RELEASE_RATE,
     RESTITUTION,
     SPEED,
-    TOTAL,
     Floats,
     Ints,
     scratch_for,
@@ -45,7 +44,6 @@ from ethbrake_marl.motion.layout import (
 UInt64s = NDArray[np.uint64]
 
 MOST_PHASES = 12  # of a profile that a search returns
-COUNTS = ("first", "total")
 
 # what a search minimises
 WHOLE = 0.0  # harm of the line
@@ -128,7 +126,7 @@ class Problem(NamedTuple):
     state: State  # at the first decision; all other vehicles hold ``wanted``
     time_step_s: float
     horizon_s: float
-    total: bool  # every impact counts, not only the first of each pair
+    harm_count: str  # what is minimised (`episode.counts`)
     aim: float  # WHOLE, WEIGHTED or LARGEST
     shares: Floats  # [n, 2, N + 1] of each pair: weight of its harm in that of its front vehicle; of its rear vehicle
     identity: UInt64s  # [n] hash of everything that decides the harm of a profile (``identities``)
@@ -137,11 +135,6 @@ class Problem(NamedTuple):
     def n(self) -> int:
         """Number of worlds."""
         return self.state.n
-
-    @property
-    def harm_count(self) -> str:
-        """Count of harm that is minimised: ``first`` or ``total``."""
-        return "total" if self.total else "first"
 
     @property
     def last_step(self) -> Ints:
@@ -159,8 +152,8 @@ class Problem(NamedTuple):
         return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
 
     def counting(self, count: str) -> Problem:
-        """Return the problem that minimises the harm of the ``first`` impact of each pair, or ``total``."""
-        return self._replace(total=count == "total")
+        """Return the problem that minimises another count of harm."""
+        return self._replace(harm_count=count)
 
     def even_grid(self, number: int) -> Floats:
         """Return evenly spaced commands from full braking to full driving, [n, number, B] m/s2."""
@@ -204,8 +197,8 @@ class Problem(NamedTuple):
 
     def value(self, last: State, count: str | None = None) -> Floats:
         """Return what the search minimises, [n] m2/s2, of episodes with these last states. ``count`` None: its own."""
-        total, value = self.total if count is None else count == "total", np.empty(self.n)
-        worths(last.line, self.shares, total, self.aim, value)
+        value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
+        worths(last.line, self.shares, weights, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:
@@ -260,14 +253,15 @@ def problem_of(
         game: rules of the episodes.
         alert: worlds at the alert.
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
-        count: harm of the ``first`` impact of each pair, or ``total``.
+        count: what is minimised (``episode.counts``).
         objective: what the controlled vehicles minimise, as under a scenario's key ``objective``.
         deciders: the first decision is at their shortest latency; None: ``bodies``.
 
-    Raises ``InvalidInput`` for vehicles that do not exist, an objective that is no weighted harm, and a script that
-    looks at the state, whose commands are not known at the alert.
+    Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is no weighted harm, and
+    a script that looks at the state, whose commands are not known at the alert.
 
     """
+    check_count("count", count)
     chosen = np.array(game.rules.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
         raise InvalidInput(f"vehicles {chosen.tolist()}: must be one or more of 1 to {alert.vehicles}, each once")
@@ -286,7 +280,7 @@ def problem_of(
     shares = np.zeros((alert.n, 2, wanted.shape[1]))
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST]]]
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack([*times, np.full((alert.n, 1), horizon)]))
-    return aimed(Problem(chosen, state, dt, horizon, count == "total", WHOLE, shares, identity), objective)
+    return aimed(Problem(chosen, state, dt, horizon, count, WHOLE, shares, identity), objective)
 
 
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
@@ -336,25 +330,26 @@ def aimed(problem: Problem, objective: Declared) -> Problem:
 
 
 @kernel
-def worth(line, shares, total, aim):
+def worth(line, shares, weights, aim):
     """Return what a search minimises (m2/s2) of one world; it never falls in an episode."""
     if aim == WHOLE:
-        return harm_so_far(line, total)
-    row, value, from_ahead = TOTAL if total else FIRST, 0.0, 0.0
+        return amount_so_far(line, weights)
+    value, from_ahead = 0.0, 0.0
     for i in range(line.shape[1]):
         borne = from_ahead
         if i < line.shape[1] - 1:
-            borne += shares[0, i] * line[row, i]
-            from_ahead = shares[1, i] * line[row, i]
+            amount = pair_amount(line, i, weights)
+            borne += shares[0, i] * amount
+            from_ahead = shares[1, i] * amount
         value = max(value, borne) if aim == LARGEST else value + borne
     return value
 
 
 @large
-def worths(line, shares, total, aim, out):
+def worths(line, shares, weights, aim, out):
     """Write what a search minimises to ``out`` [n]."""
     for k in range(len(out)):
-        out[k] = worth(line[k], shares[k], total, aim)
+        out[k] = worth(line[k], shares[k], weights, aim)
 
 
 @large

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import other_count, weights_of
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.kernels import CHANGE, DRAWING, PLAN, STEPWISE, Field, Room, World, gather, improve
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, UInt64s
@@ -34,7 +35,7 @@ PROFILES = np.zeros(DRAWING, np.int64)  # random profiles and changes are those 
 def search_profiles(
     problem: Problem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1
 ) -> tuple[Profiles, dict[str, Floats]]:
-    """Search each world for the best profile; return it, and its values in both counts of harm, [n] m2/s2.
+    """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
 
     It has at most ``MOST_PHASES`` phases and is at least as good as every given one.
 
@@ -201,10 +202,12 @@ def field_for(profiles: int, phases: int, controlled: int) -> Field:
 def prepared(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
     """Return world k of a problem, and working memory for profiles of so many phases."""
     state = problem.state
-    numbers = np.array([problem.time_step_s, problem.horizon_s, problem.total, problem.aim, stepwise])
+    numbers = np.array([problem.time_step_s, problem.horizon_s, problem.aim, stepwise])
+    count = problem.harm_count
+    weights = np.stack([weights_of(count), weights_of(other_count(count))])
     world = World(
         state.car[k], state.clock[k], state.wanted[k].copy(), problem.bodies, problem.bounds[k], problem.shares[k],
-        numbers, random[k : k + 1], scratch_for(state.wanted.shape[1]),
+        numbers, weights, random[k : k + 1], scratch_for(state.wanted.shape[1]),
     )  # fmt: skip
     lines = np.zeros((phases + 1, *state.line[k].shape))
     lines[0] = state.line[k]

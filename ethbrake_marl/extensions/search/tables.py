@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.errors import CorruptBundle, InvalidInput, describe_error
-from ethbrake_marl.extensions.search.pricing import COUNTS, Problem, Profiles, UInt64s, best_of
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, UInt64s, best_of
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.motion.layout import Floats
@@ -31,7 +32,7 @@ OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # a
 
 @dataclass(frozen=True, slots=True)
 class BestHarmTable:
-    """The least harm known in n worlds, in one or both counts."""
+    """The least harm known in n worlds, in one or more counts."""
 
     identity: UInt64s  # [n] hash of each world (``pricing.identities``)
     harm: Mapping[str, Floats]  # count -> [n] m2/s2, or what else the search has minimised

@@ -40,7 +40,7 @@ class Measure(NamedTuple):
     scenario: Scenario
     game: Game
     teams: tuple[Team, ...]  # the agent, then the other one if there is one
-    harm_count: str  # ``first`` impact of each pair, or ``total``
+    harm_count: str  # (``episode.counts``)
 
     @classmethod
     def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> Measure:

@@ -46,6 +46,7 @@ def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, 
         ("--steps 50", ("1,326 choices of weights", "at most 1,000")),
         ("--set roles.vehicle_2=full_brake", ("has no learner",)),
         ("--set harm_count=last", ("must be 'first' or 'total'",)),
+        ("--set rules=honest", ("harm_count = 'honest': must be 'first' or 'total'",)),
     ],
 )
 def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple[str, ...]) -> None:

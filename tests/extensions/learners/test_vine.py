@@ -67,6 +67,15 @@ def test_training__starts_from_a_policy_and_drives_as_it_did(tmp_path: Path) -> 
     assert eb.make_agent(f"vine@{tmp_path / 'run'}").name == f"vine@{tmp_path / 'run'}"
 
 
+def test_training__for_the_honest_count_selects_by_it(tmp_path: Path) -> None:
+    recipe = VINE.replace(reward={"harm": 1.0, "harm_count": "honest"})
+    trained = train(recipe, "paper-random", tmp_path / "run", on_progress=None)
+    course = [point["honest_cost"] for point in trained.evaluations]
+    assert len(course) > 1 and trained.metrics["honest_cost"] == min(course) > trained.metrics["total_harm"]
+    driven = eb.evaluate("paper-random", trained.agent, episodes=10, seed=7)[trained.agent]["honest_cost"]
+    assert driven.mean() == pytest.approx(trained.metrics["honest_cost"], abs=1e-3)
+
+
 def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -> None:
     (member,) = members_of(load_shipped("ppo"))
     turned = ["contact.brake_total_harm", *reversed(member.features)]

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.report.best_known import AVOIDABLE, BEST, HARM
+from ethbrake_marl.extensions.report.best_known import AVOIDABLE, BEST
 from ethbrake_marl.names import teams_of
 
 AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")

@@ -48,6 +48,25 @@ def test_first_sentence__compares_with_full_braking() -> None:
     )
 
 
+def test_first_sentence__of_the_honest_cost() -> None:
+    mine = with_best_known(compared_by("paper-random", "full_brake,ppo", 60, "honest"))
+    after, before = (mine.result[agent]["honest_cost"].mean() for agent in ("ppo", "full_brake"))
+    assert after > before + 20.0  # it pushes
+    assert first_sentence(mine, "ppo", {}) == (
+        f"ppo costs {100 * (after / before - 1):.0f} % more than full braking (honest cost: {after:.2f} m²/s² per"
+        f" emergency instead of {before:.2f})."
+    )
+    assert first_sentence(mine, "full_brake", {}) == (
+        f"Full braking costs {before:.2f} m²/s² per emergency (honest cost)."
+    )
+
+
+def test_page__of_the_honest_cost_shows_it_beside_both_harms() -> None:
+    page = Page(Report("Mine", compared_by("paper-random", "full_brake,e_v2x_bm", 60, "honest"), "Short.", {}).html)
+    assert "Honest cost of each agent" in page.text
+    assert "First-impact harm Total harm Honest cost Push (m/s)" in page.text
+
+
 def test_first_sentence__flatters_nobody(compared: Compared) -> None:
     def about(agents: str, **changes: Any) -> str:
         loaded = eb.load_scenario("paper-random").replace(**changes)

@@ -88,6 +88,10 @@ def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> 
         mine = [compared.result[each]["first_impact_harm"] for each in (f"all but {name}", "trained team")]
         assert less.value == pytest.approx((mine[0] - mine[1]).mean())
     assert [row[0] for row in added.rows] == ["vehicle_2", "vehicle_3"]
+    *_, cost, more = learners_sheets(compared._replace(harm_count="honest"))
+    means = [compared.result["full_brake"][f"honest_cost{ending}"].mean() for ending in ("_1", "_2", "_3", "")]
+    assert [cell.value for cell in cost.rows[0][1:]] == pytest.approx(means)
+    assert more.headings[-1] == "More honest cost without it"
 
 
 # ---- its parts
@@ -125,6 +129,16 @@ def test_brief__has_both_harms_of_each_test() -> None:
         harms = own and f"{own['first_impact_harm'].mean():.2f}, {own['total_harm'].mean():.2f}"
         assert row[-1] == harms and len(row) == 5
     assert "1.7 m beyond the place where Vehicle 1 stops by itself" in sheet.note and "30 worlds." in sheet.note
+
+
+def test_brief__of_the_honest_cost_has_it_in_each_test() -> None:
+    main, other = (compared_by(f"paper-random{end}", "full_brake,coast", 30, "honest") for end in ("", "-obstacle"))
+    sheet = brief(main, {"paper-random-obstacle": other})
+    names = ["collision_rate", "first_impact_harm", "total_harm", "honest_cost", "pushed_mps"]
+    assert [column.name for column in sheet.columns[1:-1]] == names
+    assert sheet.columns[-1].heading == "Obstacle:\nhonest"
+    means = [f"{own['honest_cost'].mean():.2f}" for own in other.result.columns.values()]
+    assert [row[-1] for row in sheet.rows] == means
 
 
 def test_paper_rows__are_consistent_and_shown_as_printed() -> None:

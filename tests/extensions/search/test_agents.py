@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.extensions.search.agents import Searched
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
 KEPT = PAPER.replace(early_impacts="keep")
-COLUMNS = {"first": "first_impact_harm", "total": "total_harm"}
 pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.Unfamiliar")
 
 
@@ -26,26 +26,29 @@ pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.Unfamiliar
 def test_planners__golden(name: str, agent: str, episodes: int, count: str, first: float, total: float) -> None:
     result = eb.evaluate(name, agent, episodes=episodes, harm_count=count)
     own = result[agent]
-    assert [own[column].mean() for column in COLUMNS.values()] == pytest.approx([first, total], abs=5e-5)
-    assert own["predicted_harm"].tolist() == own[COLUMNS[count]].tolist() and result.knows[agent] == "true model"
+    assert [own[column].mean() for column in HARM.values()] == pytest.approx([first, total], abs=5e-5)
+    assert own["predicted_harm"].tolist() == own[COLUMN[count]].tolist() and result.knows[agent] == "true model"
 
 
-def test_best_harm__of_no_table_is_never_worse_than_universal_or_e_v2x_bm() -> None:
-    result = eb.evaluate("paper-random", "universal,e_v2x_bm,best_harm:200", episodes=12, seed=5)
-    best, universal = result["best_harm:200"]["first_impact_harm"], result["universal"]["first_impact_harm"]
+@pytest.mark.parametrize("count", COLUMN)
+def test_best_harm__of_no_table_is_never_worse_than_universal_or_e_v2x_bm(count: str) -> None:
+    result = eb.evaluate("paper-random", "universal,e_v2x_bm,best_harm:200", episodes=12, seed=5, harm_count=count)
+    best, universal, constant = (result[name][COLUMN[count]] for name in ("best_harm:200", "universal", "e_v2x_bm"))
     assert (best <= universal).all() and (best < universal - 0.01).any()
-    assert (best <= result["e_v2x_bm"]["first_impact_harm"] + 1e-9).all()
+    assert (best <= constant + 1e-9).all()
+    assert result["best_harm:200"]["predicted_harm"].tolist() == best.tolist()
 
 
-@pytest.mark.parametrize(("inside", "count"), [("constant:5", "first"), ("ppo", "total")])
+@pytest.mark.parametrize(("inside", "count"), [("constant:5", "first"), ("ppo", "total"), ("ppo", "honest")])
 def test_searched__is_never_worse_and_better_with_more_candidates(inside: str, count: str) -> None:
-    agent, column = eb.make_agent(inside, scenario=PAPER), COLUMNS[count]
+    agent, column = eb.make_agent(inside, scenario=PAPER), COLUMN[count]
     agents = {"plain": agent, **{str(n): Searched(agent, PAPER, count, n) for n in (20, 200)}}
     result = eb.evaluate("paper-random", agents, episodes=30, seed=3, harm_count=count)
     plain, some, many = (result[name][column] for name in agents)
     assert (some <= plain).all() and (some < plain - 0.1).any() and many.mean() < some.mean()
 
 
+@pytest.mark.parametrize("count", ["total", "honest"])
 @pytest.mark.parametrize(
     ("name", "changes"),
     [
@@ -56,13 +59,13 @@ def test_searched__is_never_worse_and_better_with_more_candidates(inside: str, c
         ("cooperation-2-five", {}),
     ],
 )
-def test_planners__in_any_line_keep_what_they_predicted(name: str, changes: dict[str, object]) -> None:
+def test_planners__in_any_line_keep_what_they_predicted(name: str, changes: dict[str, object], count: str) -> None:
     scenario = eb.load_scenario(name).replace(early_impacts="keep", **changes)
     agents = "full_brake,best_harm:60,full_brake+search"
-    result = eb.evaluate(scenario, agents, episodes=10, seed=4, harm_count="total")
+    result = eb.evaluate(scenario, agents, episodes=10, seed=4, harm_count=count)
     for agent in ("best_harm:60", "full_brake+search"):
-        assert result[agent]["predicted_harm"].tolist() == result[agent]["total_harm"].tolist()
-    assert (result["full_brake+search"]["total_harm"] <= result["full_brake"]["total_harm"]).all()
+        assert result[agent]["predicted_harm"].tolist() == result[agent][COLUMN[count]].tolist()
+    assert (result["full_brake+search"][COLUMN[count]] <= result["full_brake"][COLUMN[count]]).all()
 
 
 def test_planners__minimise_the_objective_of_the_scenario_also_in_worlds_of_a_table() -> None:

@@ -7,8 +7,11 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search.best_harm import best_harm, joined, search_list, starting_profiles
 from ethbrake_marl.extensions.search.extremes import KEPT
+from ethbrake_marl.extensions.search.kernels import try_all
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
-from ethbrake_marl.extensions.search.search import compact, refine, search_profiles
+from ethbrake_marl.extensions.search.search import compact, prepared, refine, search_profiles, seeded
+from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.motion.layout import MOVING
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
 
@@ -85,6 +88,30 @@ def test_best_harm__keeps_for_each_count_the_better_of_both_searches() -> None:
         assert (table.harm[count] <= at_other).all() and (table.harm[count] < at_other - 1.0).any()
 
 
+def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_be_kept(tmp_path) -> None:
+    scenario, game = eb.open_game("paper-random-obstacle")
+    alert = scenario.sample(8, seed=7)
+    table, problem = best_harm(game, alert, counts=["honest"], budget=200, threads=1), problem_of(game, alert)
+    constant = eb.evaluate(alert, "e_v2x_bm", scenario=scenario, harm_count="honest")["e_v2x_bm"]["honest_cost"]
+    assert (table.harm["honest"] <= constant + 1e-9).all() and (table.harm["honest"] < constant - 1.0).any()
+    assert problem.values(table.profiles["honest"])["honest"].tolist() == table.harm["honest"].tolist()
+    table.save(tmp_path / "honest.npz")
+    again = BestHarmTable.load(tmp_path / "honest.npz")
+    assert again.stored(problem, "honest")[0].tolist() == table.harm["honest"].tolist() and [*again.harm] == ["honest"]
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
+    problem, values = PROBLEM.counting("honest"), np.empty(1)
+    driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), seeded(problem.identity, 0)
+    last = problem.follow(driving)
+    assert last.line[:, MOVING].any(axis=1).all()
+    for k, cost in enumerate(last.harm("honest")):
+        world, room = prepared(problem, k, random, driving.ends.shape[1], stepwise)
+        try_all(world, room, driving.ends[[k]], driving.commands_mps2[[k]], values)
+        assert values[0] == pytest.approx(cost, rel=1e-6)
+
+
 def test_extremes__are_better_than_constants() -> None:
     _, constants, extremes = starting_profiles(PROBLEM, WORLDS)
     least = [
@@ -137,8 +164,9 @@ def test_search_list__goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
 
 REFUSED = {
     "budget = 0: must be a whole number": lambda: search_profiles(PROBLEM, grid(PROBLEM), budget=0),
+    "count = 'best': must be 'first', 'total' or 'honest'": lambda: problem_of(GAME, WORLDS, count="best"),
     "threads = 0: must be a whole number": lambda: search_profiles(PROBLEM, grid(PROBLEM), budget=9, threads=0),
-    "counts = ('first', 'first'): must be 'first', 'total' or both": lambda: best_harm(
+    "counts = ('first', 'first'): must be some of first, total, honest, each once": lambda: best_harm(
         GAME, WORLDS, counts=("first", "first")
     ),
     "vehicles [2, 3]: plans are searched for one controlled vehicle": lambda: refine(

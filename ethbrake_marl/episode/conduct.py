@@ -1,0 +1,42 @@
+"""Conduct that harm does not count: pushing, driving before the first impact, and moving on past the horizon."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import TRUNCATED, Step, driven_again
+from ethbrake_marl.motion.layout import COUNT, DROVE, NEXT_TIME, PUSHED, Floats
+
+
+def push(before: State, step: Step, after: State) -> Floats:
+    """Return the term push, [n]: minus the push of all contacts (m/s), the obstacle's included (``motion.push``)."""
+    return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
+
+
+def drove(before: State, step: Step, after: State) -> Floats:
+    """Return the term drove, [n, N]: minus what a positive command adds to the speed before the first impact (m/s)."""
+    return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
+
+
+def still_moving(before: State, step: Step, after: State) -> Floats:
+    """Return the term still_moving, [n]: -1 for an end at the horizon with a vehicle in motion."""
+    return 0.0 - step.out[TRUNCATED]
+
+
+def first_impact_s(before: State, after: State) -> Floats:
+    """Return until when the line has had no impact, [n] s: from ``before.time_s`` to ``after.time_s``.
+
+    No decision lies between the states.
+    """
+    until: Floats = np.where(before.collided, before.time_s, after.time_s)
+    for k, scratch in driven_again(before, after, ~before.collided & after.collided):
+        struck = after.line[k, COUNT] > 0.0
+        until[k] = before.time_s[k] + scratch[NEXT_TIME, struck].min()
+    return until
+
+
+def driving_s(before: State, after: State) -> Floats:
+    """Return how long a positive command is in force before the line's first impact, [n, N] s."""
+    asked_mps, commands = after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1], after.commands_mps2
+    return asked_mps / np.where(commands > 0.0, commands, 1.0)

@@ -1,0 +1,80 @@
+"""What counts: which amounts of a line a reward, an agent, a shield or a search keeps small, and how much each weighs.
+
+======  ================================================================================================================
+first   harm of the first impact of each pair, as the paper counts it
+total   harm of every impact
+honest  harm of every impact, and what no impact shows: ``10 s`` for the push, the speed s that contacts take up while
+        one vehicle pushes another; ``10 s`` for the speed s that a vehicle asks for by driving before the line's first
+        impact; ``v^2`` for a vehicle that still moves at v at the horizon, as if it then hit something that stands
+======  ================================================================================================================
+
+All are in m2/s2, and none ever falls in an episode. ``honest`` adds a price to harm so that pushing never pays: without
+it the best braking pushes Vehicle 1 away (docs/findings.md).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.compiling import kernel
+from ethbrake_marl.motion.layout import DROVE, FIRST, MOVING, PUSHED, TOTAL, Floats
+
+ROWS = [FIRST, TOTAL, PUSHED, DROVE, MOVING]  # rows of a line that can count
+
+COUNTS = {  # name -> weight of each row
+    "first": np.array([1.0, 0.0, 0.0, 0.0, 0.0]),
+    "total": np.array([0.0, 1.0, 0.0, 0.0, 0.0]),
+    "honest": np.array([0.0, 1.0, 10.0, 10.0, 1.0]),
+}
+RULES = {"honest": "honest", "paper": "first"}  # short name -> count
+Count = str | Floats  # the name of a count, or weights of its own, [5]
+
+HARM = {"first": "first_impact_harm", "total": "total_harm"}  # counts of harm alone -> column of an evaluation
+COLUMN = {**HARM, "honest": "honest_cost"}  # count -> column
+IN_WORDS = {"first": "first-impact harm", "total": "total harm", "honest": "honest cost"}
+
+
+def weights_of(count: Count) -> Floats:
+    """Return the weights of a count."""
+    return COUNTS[count] if isinstance(count, str) else count
+
+
+def check_count(what: str, count: object) -> None:
+    """Raise ``InvalidInput`` unless this is the name of a count."""
+    if count not in COUNTS:
+        raise InvalidInput(f"{what} = {count!r}: must be 'first', 'total' or 'honest'")
+
+
+def check_harm(what: str, count: object) -> None:
+    """Raise ``InvalidInput`` unless this is the name of a count of harm alone."""
+    if count not in HARM:
+        raise InvalidInput(f"{what} = {count!r}: must be 'first' or 'total'")
+
+
+def other_count(count: Count) -> str:
+    """Return the count that decides ties."""
+    return "total" if isinstance(count, str) and count == "first" else "first"
+
+
+@kernel
+def pair_amount(line, p, weights):
+    """Return what counts of the pair p of one world so far (m2/s2)."""
+    harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
+    return harm + (weights[2] * line[PUSHED, p] + weights[3] * line[DROVE, p] + weights[4] * line[MOVING, p])
+
+
+@kernel
+def amount_so_far(line, weights):
+    """Return what counts of one world so far (m2/s2), added up from the obstacle to the rear: the only order used."""
+    amount = 0.0
+    for p in range(line.shape[1] - 1):
+        amount += pair_amount(line, p, weights)
+    return amount
+
+
+def pair_amounts(line: Floats, count: Count) -> Floats:
+    """Return what counts of each pair so far, [n, N + 1] m2/s2, as ``pair_amount`` does."""
+    first, total, push, drove, moving = weights_of(count)
+    harm = first * line[:, FIRST] + total * line[:, TOTAL]
+    return harm + (push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING])

@@ -1,0 +1,156 @@
+"""Counts: what the honest one adds to harm by hand, and what holds for all of them in random worlds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.episode.counts import COUNTS, ROWS, pair_amounts
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.play import hold, played, price
+from ethbrake_marl.episode.reward import RewardParams, reward_params
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.evaluation.door import evaluate
+from ethbrake_marl.motion.layout import BRAKING, DRIVING, DROVE, MOVING, PUSHED
+from ethbrake_marl.names import make_agent, open_game
+from ethbrake_marl.shields.step import StepShield
+from tests.contract.interfaces import CRASH, REST
+from tests.episode.lines import later, state_of
+from tests.refused import refused
+
+near = pytest.approx
+N = 12
+SCENARIOS = ["paper-random", "paper-random-obstacle", "paper-random-buildup", "cooperation-4-all"]
+
+# ---------------------------------------------------------------- by hand
+
+
+def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_horizon() -> None:
+    # Coasting, Vehicle 2 hits with 6 m/s at 1 s: 18.5 m/s in common. Vehicle 1 of 1 t brakes with 6 m/s2 against the
+    # 3 t behind it for 0.3 s: a push of 1.8 m/s, and 18.5 - 0.3 x 1.5 = 18.05 m/s of both at the horizon.
+    _, game = open_game(CRASH, reward="honest")
+    state, counted = game.reset(game.draw(1, 0, 0)), 0.0
+    while not state.ended[0]:
+        assert not state.line[:, MOVING].any()
+        state, step = game.step(state, np.zeros((1, 1)))
+        counted += step.counted[0]
+        assert step.reward[0].tolist() == [-step.counted[0]] * 2
+    assert state.line[0, PUSHED].tolist() == near([0.0, 1.8, 0.0])
+    assert state.line[0, MOVING].tolist() == near([18.05**2, 18.05**2, 0.0])
+    assert (state.harm("first"), state.harm("total")) == (near([36.0]), near([36.0]))
+    assert counted == near(36.0 + 10 * 1.8 + 2 * 18.05**2)
+    assert state.harm("honest").tolist() == near([counted])
+
+
+def test_honest__adds_nothing_to_a_line_that_brakes_to_rest_and_prices_driving_there() -> None:
+    _, game = open_game(REST)
+    alert = game.reset(game.draw(1, 0, 0))
+    last, cost = played(game, alert, np.full((1, 1, 1), -1.0), "honest")
+    assert last.at_rest.tolist() == [True] and cost.tolist() == [0.0] and not last.line[:, MOVING].any()
+    last, cost = played(game, alert, np.array([[[0.5], [0.5], [-1.0]]]), "honest")  # 3 m/s2 for 0.2 s
+    assert last.harm("total").tolist() == [0.0] and cost.tolist() == near([10 * 0.6])
+
+
+def test_push__of_a_pressed_pair_costs_10_m2_s2_for_each_m_per_s() -> None:
+    pressed = later(state_of([0.0], [0.0, 0.0], obstacle_gap_m=0.0), [3.0, 2.0], 0.5)  # 3 and 2 m/s2, for 0.5 s
+    assert pressed.line[0, PUSHED].tolist() == near([1.5, 1.0, 0.0]) and not pressed.harm("total").any()
+    driving = 0.5 * (3.0 + 2.0)  # an obstacle that is touched without an impact is no impact
+    assert pressed.harm("honest") == near([10 * (1.5 + 1.0) + 10 * driving])
+
+
+def test_amounts__of_pairs_and_worlds_have_the_weights_of_the_count() -> None:
+    state = state_of([5.0, 5.0], [1.0, 1.0, 1.0])
+    state.line[0, ROWS] = np.arange(1.0, 6.0)[:, np.newaxis] * [1.0, 10.0, 100.0, 0.0]
+    for count, weight in (("first", 1.0), ("total", 2.0), ("honest", 2.0 + 30.0 + 40.0 + 5.0)):
+        assert pair_amounts(state.line, count)[0].tolist() == [weight, 10.0 * weight, 100.0 * weight, 0.0]
+        assert state.harm(count).tolist() == [111.0 * weight]
+        assert state.pair_harm(count).tolist() == [[10.0 * weight, 100.0 * weight]]
+    own = np.array([0.5, 0.0, 0.0, 2.0, 0.0])
+    assert state.harm(own).tolist() == [111.0 * 8.5] and state.harm(COUNTS["honest"]) == state.harm("honest")
+
+
+# ---------------------------------------------------------------- in random worlds
+
+
+def opened(name: str, count: str) -> tuple[Game, State]:
+    """Return a game whose reward counts this, and its worlds at the first decision."""
+    _, game = open_game(name, reward={"harm": 1.0, "harm_count": count})
+    return game, game.reset(game.draw(N, 5, 0))
+
+
+def random_plans(game: Game, state: State, seed: int) -> np.ndarray:
+    """Return plans [n, T, L] that often drive, and brake at the end, so that every row of a count is met."""
+    rng, steps = np.random.default_rng(seed), 30
+    shape = state.n, steps, len(game.rules.learners)
+    plans = np.where(rng.random(shape) < 0.3, 1.0, rng.uniform(-1.0, 1.0, shape))
+    plans[:, -1] = np.where(rng.random((state.n, 1)) < 0.7, -1.0, 1.0)
+    return plans
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_counts__are_ordered_never_fall_and_are_the_sum_of_what_steps_count(name: str) -> None:
+    for count in COUNTS:
+        game, state = opened(name, count)
+        plans, counted = random_plans(game, state, 1), state.harm(count)
+        while not state.ended.all():
+            before = {each: state.harm(each) for each in COUNTS}
+            now = np.minimum(state.steps, plans.shape[1] - 1)
+            state, step = game.step(state, plans[np.arange(N), now])
+            counted = counted + step.counted
+            for each in COUNTS:
+                assert (state.harm(each) >= before[each]).all()
+            assert (state.harm("honest") >= state.harm("total")).all()
+            assert (state.harm("total") >= state.harm("first")).all()
+        assert counted == near(state.harm(count), rel=1e-12, abs=1e-9)
+        met = (state.line[:, [PUSHED, DROVE, MOVING]] > 0.0).any(axis=(0, 2)).tolist()
+        assert met == [True, True, name not in ("paper-random-obstacle", "cooperation-4-all")]
+
+
+@pytest.mark.parametrize("count", COUNTS)
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_price__is_what_happens_to_the_bit_and_depends_on_no_other_world(name: str, count: str) -> None:
+    game, state = opened(name, count)
+    plans = random_plans(game, state, 2)
+    expected, last = price(game, state, plans, count), state
+    while not last.ended.all():
+        last, _ = game.step(last, plans[np.arange(N), np.minimum(last.steps, plans.shape[1] - 1)])
+    assert last.harm(count).tolist() == expected.tolist()
+    for k in (7, 3):
+        alone = price(game, state.take([k]), plans[[k]], count)
+        assert alone.tolist() == expected[[k]].tolist()
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_hold__of_constant_commands_is_the_episode(name: str) -> None:
+    game, state = opened(name, "honest")
+    learners, shares = game.rules.learners, np.array([-1.0, -0.4, 0.0, 0.7])
+    braking, driving = (state.car[:, row][:, np.newaxis, learners] for row in (BRAKING, DRIVING))
+    tried = shares[:, np.newaxis] * np.where(shares[:, np.newaxis] < 0.0, braking, driving)
+    held = hold(state, state.wanted, learners, tried, game.rules.horizon_s, "honest")
+    for c, share in enumerate(shares):
+        last, cost = played(game, state, np.full((N, 1, len(learners)), share), "honest")
+        assert held[0, :, c] == near(cost, rel=1e-7, abs=1e-7)
+        assert held[1, :, c] == near(last.harm("first"), rel=1e-7, abs=1e-7)
+
+
+# ---------------------------------------------------------------- another count
+
+UNKNOWN: dict[str, Any] = {
+    "harm_count = 'best': must be": lambda: make_agent("e_v2x_bm", scenario="paper-random", harm_count="best"),
+    "shield: harm_count = 'best': must be": lambda: StepShield(harm_count="best"),
+    "reward: harm_count = 'best': must be": lambda: reward_params({"harm_count": "best"}),
+    "evaluate: harm_count = 'best': must be": lambda: evaluate(
+        "paper-random", {"mine": make_agent("coast")}, harm_count="best", episodes=1
+    ),
+}
+
+
+@pytest.mark.parametrize("message", UNKNOWN)
+def test_other_count__is_refused_and_the_three_are_listed(message: str) -> None:
+    with refused(message) as error:
+        UNKNOWN[message]()
+    for count in COUNTS:
+        assert count in str(error.value)
+    assert RewardParams(harm_count="honest").harm_count == "honest"

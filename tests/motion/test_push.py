@@ -1,0 +1,94 @@
+"""The push of a contact that lasts: numbers by hand. Masses are 1 t unless a case says otherwise."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ethbrake_marl.motion import layout as at
+from tests.motion.lines import driven, lines
+
+# The line, its command, the end, and the push of every pair (m/s), of the obstacle and Vehicle 1 first.
+CASES: dict[str, tuple[Any, Any, float, list[float]]] = {
+    "a coasting rear leans on a braking front": (  # -8 and 0: 8 m/s2 for 1 s, whatever the masses
+        lines([0.0], [10.0, 10.0], mass_t=[1.0, 3.0]), [-8.0, 0.0], 1.0, [0.0, 8.0],
+    ),
+    "somebody who drives far behind pushes nobody": (
+        lines([0.0, 90.0], [10.0] * 3), [-8.0, 0.0, 3.0], 1.0, [0.0, 8.0, 0.0],
+    ),
+    "a rear drives against a braking front": (  # 3 + 6 = 9 m/s2 for 2 s
+        lines([0.0], [20.0, 20.0]), [-6.0, 3.0], 2.0, [0.0, 18.0],
+    ),
+    "a rear at its speed limit drives, as soon as it is below": (  # the same: the block slows down at 1.5 m/s2
+        lines([0.0], [20.0, 20.0], speed_limit_mps=20.0), [-6.0, 3.0], 2.0, [0.0, 18.0],
+    ),
+    "a rear keeps its speed limit against a braking front": (  # with 1 m/s2 of its 3; alone it would need 0: 0 + 1
+        lines([0.0], [20.0, 20.0], speed_limit_mps=20.0), [-1.0, 3.0], 2.0, [0.0, 2.0],
+    ),
+    "three in a row, 1, 2 and 3 t": (
+        # -6, 0 and 2: the line has 0. Behind pair 1: (2 x 0 + 3 x 2) / 5 = 1.2, so 7.2; in front of pair 2:
+        # (1 x -6 + 2 x 0) / 3 = -2, so 4; for 1.5 s
+        lines([0.0, 0.0], [9.0] * 3, mass_t=[1.0, 2.0, 3.0]), [-6.0, 0.0, 2.0], 1.5, [0.0, 10.8, 6.0],
+    ),
+    "three in a row whose rear part would not stay together": (
+        # -6, 3 and 0: alone Vehicle 2 leaves Vehicle 3 with 3, so 9; in front of pair 2 there is (-6 + 3) / 2
+        lines([0.0, 0.0], [9.0] * 3), [-6.0, 3.0, 0.0], 1.0, [0.0, 9.0, 1.5],
+    ),
+    "brakes of the front build up": (  # -4 t until 2 s: 4 x 2^2 / 2, then -8 for 0.5 s
+        lines([0.0], [20.0, 20.0], brake_rate_mps3=[4.0, np.inf]), [-8.0, 0.0], 2.5, [0.0, 12.0],
+    ),
+    "a rear drives ever harder against one that its brakes hold": (
+        # at rest, brakes of 4: they hold 2 t against 3 m/s2 of 1 t. 2 t until 1.5 s: 1.5^2, then 3 for 0.5 s
+        lines([0.0], [0.0, 0.0], force_mps2=[-4.0, 0.0], release_rate_mps3=[np.inf, 2.0]), [-4.0, 3.0], 2.0,
+        [0.0, 3.75],
+    ),
+    "brakes of the one between take over": (
+        # at rest; Vehicle 3 drives at 2, Vehicle 2's brakes build up at 1 m/s3: on Vehicle 1 presses (2 - t) / 2 until
+        # 2 s, 1 m/s, then nothing; on Vehicle 2, which others hold, 2 for 3 s
+        lines([0.0, 0.0], [0.0] * 3, force_mps2=[-4.0, 0.0, 2.0], brake_rate_mps3=[np.inf, 1.0, np.inf]),
+        [-4.0, -3.5, 2.0], 3.0, [0.0, 1.0, 6.0],
+    ),
+    "a push moves one that its brakes hold": (
+        # at rest; -4 and 2 t: on the front, which is held, presses 2 t until 2 s; then both move, and the front alone
+        # would slow down at 4: 2 t + 4 for 1 s
+        lines([0.0], [0.0, 0.0], force_mps2=[-4.0, 0.0], release_rate_mps3=[np.inf, 2.0]), [-4.0, 16.0], 3.0,
+        [0.0, 4.0 + 9.0],
+    ),
+    "a part of the rear hangs on": (
+        # -6; 3 - 2 t; 1. Vehicle 2 alone, 3 - 2 t, until 1 s; then with Vehicle 3 (4 - 2 t) / 2: 2 + 0.375 until 1.5 s,
+        # and 6 x 1.5. In front of pair 2: (-3 - 2 t) / 2 = -2.25 - 1.125 in all, and 1 x 1.5
+        lines([0.0, 0.0], [20.0] * 3, force_mps2=[-6.0, 3.0, 1.0], brake_rate_mps3=[np.inf, 2.0, np.inf]),
+        [-6.0, -2.0, 1.0], 1.5, [0.0, 11.375, 4.875],
+    ),
+    "against an obstacle": (  # 3 against it; 2 against Vehicle 1, which it stops; for 2 s
+        lines([0.0], [0.0, 0.0], obstacle_gap_m=0.0), [3.0, 2.0], 2.0, [6.0, 4.0],
+    ),
+    "against an obstacle with somebody heavier behind": (  # Vehicle 2 presses with 4, both with (3 + 3 x 4) / 4
+        lines([0.0], [0.0, 0.0], obstacle_gap_m=0.0, mass_t=[1.0, 3.0]), [3.0, 4.0], 2.0, [7.5, 8.0],
+    ),
+    "against an obstacle with somebody parked behind": (  # who does not hold it back
+        lines([0.0], [0.0, 0.0], obstacle_gap_m=0.0), [3.0, -6.0], 2.0, [6.0, 0.0],
+    ),
+    "an impact is no push": (  # after 0.75 s both have 4 m/s; then the front brakes at 2 for 1 s
+        lines([6.0], [0.0, 8.0], latency_s=[0.75, 0.0]), [-2.0, 0.0], 1.75, [0.0, 2.0],
+    ),
+    "a bounce is no push": (lines([6.0], [0.0, 8.0], restitution=0.5), 0.0, 2.0, [0.0, 0.0]),
+    "a touch is no push: all brake alike": (lines([0.0, 0.0], [9.0] * 3, mass_t=[1.1, 0.7, 3.3]), -0.7, 5.0, [0.0] * 3),
+    "a touch is no push: the front drives away": (lines([0.0], [4.0, 4.0]), [2.0, 1.0], 2.0, [0.0, 0.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_push__by_hand(name: str) -> None:
+    (line, car), command, until, pushes = CASES[name]
+    after, _, _ = driven(line, car, command, 0.0, until)
+    assert after[0, at.PUSHED, :-1].tolist() == pytest.approx(pushes, abs=1e-7)  # a parting is delayed by 1e-9 s
+    assert [each == 0.0 for each in after[0, at.PUSHED, :-1]] == [each == 0.0 for each in pushes]
+    assert after[0, at.PUSHED, -1] == 0.0
+
+
+def test_push__adds_up_from_interval_to_interval() -> None:
+    line, car = lines([0.0], [10.0, 10.0])
+    half, _, _ = driven(line, car, [-8.0, 0.0], 0.0, 0.5)
+    whole, _, _ = driven(half, car, [-4.0, 0.0], 0.5, 1.0)
+    assert (half[0, at.PUSHED, 1], whole[0, at.PUSHED, 1]) == (4.0, 6.0)
