@@ -30,6 +30,7 @@ TESTS = {
 }
 PRICES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 WORLDS, SEED, BUDGET = 1_000, 7, 20_000
+LABELLED = (0.0, 0.3, 3.0, 10.0)  # prices that the figure names
 DROVE_MPS = 0.05  # driving that adds more than this before the first impact counts
 
 
@@ -83,9 +84,10 @@ def draw(found: dict[str, list[Cost]]) -> Figure:
             own = [cost for cost in costs if cost.agent == agent]
             axes.plot([cost.push_mps for cost in own], [cost.total for cost in own], label=agent, **series_style(k))
             for cost in own if agent == "best known" else ():
-                axes.annotate(f"{cost.price:g}", (cost.push_mps, cost.total), (3, 3), textcoords="offset points")
-        axes.set(title=TESTS[test], xlabel="push (m/s)", ylim=(0.0, None))
+                if cost.price in LABELLED:
+                    axes.annotate(f"{cost.price:g}", (cost.push_mps, cost.total), (2, 5), textcoords="offset points")
         axes.set_xscale("symlog", linthresh=0.1)
+        axes.set(title=TESTS[test], xlabel="push (m/s)", ylim=(0.0, None), xlim=(-0.01, 40.0))
     panels[0].set_ylabel("total harm (m²/s²)")
     panels[-1].legend(fontsize=8.5)
     return finish(figure, f"{WORLDS:,} worlds of seed {SEED}. Numbers: price of a push of 1 m/s, in m²/s².")
