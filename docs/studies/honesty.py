@@ -57,7 +57,8 @@ class Cost(NamedTuple):
 def with_price(problem: Problem, price: float) -> Problem:
     """Return the problem that minimises total harm and the costs of a price."""
     others = COUNTS["honest"][3:] if price else np.zeros(2)
-    return problem._replace(harm_count=np.array([0.0, 1.0, price, *others]))
+    COUNTS[f"a price of {price:g}"] = np.array([0.0, 1.0, price, *others])
+    return problem.counting(f"a price of {price:g}")
 
 
 def costs_of(test: str) -> list[Cost]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COUNTS, Count, amount_so_far, check_count, pair_amount, weights_of
+from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, weights_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
 from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State
@@ -126,7 +126,7 @@ class Problem(NamedTuple):
     state: State  # at the first decision; all other vehicles hold ``wanted``
     time_step_s: float
     horizon_s: float
-    harm_count: Count  # what is minimised (`episode.counts`)
+    harm_count: str  # what is minimised (`episode.counts`)
     aim: float  # WHOLE, WEIGHTED or LARGEST
     shares: Floats  # [n, 2, N + 1] of each pair: weight of its harm in that of its front vehicle; of its rear vehicle
     identity: UInt64s  # [n] hash of everything that decides the harm of a profile (``identities``)
