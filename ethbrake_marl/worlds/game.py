@@ -47,7 +47,7 @@ def game_of(
     Args:
         scenario: of the worlds.
         scripts: body -> script, for each vehicle whose role is an agent that looks at the state.
-        reward: ``harm``, ``total-harm``, ``paper``, a mapping of settings, or ``RewardParams``.
+        reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: features of all vehicles, or vehicle -> features; None: the scenario's.
         reward_vector: components of a vector reward (``episode.terms``).
 
