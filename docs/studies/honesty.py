@@ -4,7 +4,7 @@
 
 A push of s m/s costs PRICE times s (m2/s2); at a price of 0 everything is allowed. At any other price driving before
 the first impact costs 10 m2/s2 for each m/s, and a vehicle that still moves at v at the horizon v^2, as in the count of
-harm ``honest``, where a push costs 10. For each price Vehicle 2 is searched for anew. About eight minutes of processor time.
+harm ``honest``, where a push costs 10. For each price Vehicle 2 is searched for anew: about eight CPU-minutes.
 """
 
 from __future__ import annotations
