@@ -39,9 +39,11 @@ from ethbrake_marl.motion.layout import (
     NEXT_CLOSING,
     NEXT_TIME,
     POOLED,
+    PUSHED,
     REAR_CHANGE,
     RESTITUTION,
     SPEED,
+    THROWN,
     ZERO,
 )
 
@@ -129,12 +131,26 @@ def resolve_cluster(line, car, scratch, first, last):
             line[SPEED, i] = min(line[SPEED, i], line[SPEED, i - 1])
 
 
+@large
+def note_thrown(line, scratch, p):
+    """Add an impact's change of the closing speed of pair p to the row THROWN; if it is its own impact, add its push.
+
+    The pair has had an impact before.
+    """
+    change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
+    closing = scratch[CLOSING, p]
+    if closing > max(TOUCH_MPS, line[THROWN, p]):
+        line[PUSHED, p] -= change * min((closing - line[THROWN, p]) / closing, 1.0)
+    line[THROWN, p] += change
+
+
 @kernel
 def resolve_impacts(line, car, scratch, now, ahead):
     """Resolve every cluster in which a pair closes, and count its harm; return False if no pair closes.
 
-    Harm of an impact: the squared closing speed (m2/s2), added to the rows NEW of ``scratch``. A touch does none.
-    ``now`` (s from the start of the interval) is noted for the first impact of each pair.
+    Harm of an impact: the squared closing speed (m2/s2), added to the rows NEW of ``scratch``. A touch does none. The
+    part of a further impact that forces have built up since the pair last touched is a push (``motion.push``). ``now``
+    (s from the start of the interval) is noted for the first impact of each pair.
     """
     pairs, closes, first = line.shape[1] - 1, False, ahead
     for p in range(ahead, pairs):
@@ -143,6 +159,8 @@ def resolve_impacts(line, car, scratch, now, ahead):
             closing = scratch[CONTACT_SPEED, p]
             if closing == 0.0:
                 closing = line[SPEED, p + 1] - line[SPEED, p]
+            if closing <= 0.0:
+                line[THROWN, p] = 0.0
         scratch[CLOSING, p] = closing
         closes = closes or closing > 0.0
     if not closes:
@@ -159,6 +177,8 @@ def resolve_impacts(line, car, scratch, now, ahead):
         first = last + 1
     for p in range(ahead, pairs):
         scratch[CONTACT_SPEED, p] = 0.0
+        if line[HIT, p] == 1.0:
+            note_thrown(line, scratch, p)
         if scratch[CLOSING, p] > TOUCH_MPS:
             harm = scratch[CLOSING, p] * scratch[CLOSING, p]
             scratch[NEW_TOTAL, p] += harm

@@ -4,8 +4,8 @@ Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, f
 In a row of pairs, column p is the pair (body p, body p + 1). The obstacle is always there: without one, it is ``FAR_M``
 ahead, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [10, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
-belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 10, N + 1], ``car`` [n, 10, N + 1].
+Arrays that most functions share: ``line`` [11, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
+belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 11, N + 1], ``car`` [n, 10, N + 1].
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ HIT = 3  # 1 once the pair has had an impact
 FIRST = 4  # harm of the pair's first impact (m2/s2)
 TOTAL = 5  # harm of all its impacts (m2/s2)
 COUNT = 6  # number of its impacts
-PUSHED = 7  # closing speed that its contact has taken up without an impact (m/s)
+PUSHED = 7  # push: closing speed that forces have built up and the pair's contact has taken up (m/s)
 DROVE = 8  # of the pair ahead of a vehicle: speed that its commands ask for before the line's first impact (m/s)
 MOVING = 9  # of the pair ahead of a vehicle: square of its speed at the horizon (m2/s2)
-LINE_ROWS = 10
+THROWN = 10  # change of its closing speed by impacts since it last touched (m/s)
+LINE_ROWS = 11
 
 # rows of `car`
 MASS = 0  # t; infinite: the obstacle

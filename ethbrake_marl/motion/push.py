@@ -1,4 +1,9 @@
-"""The push: the closing speed that a contact takes up while the bodies move as one, without an impact.
+"""The push: the closing speed that forces build up and a contact takes up, in further impacts or as long as it lasts.
+
+An impact after the pair's first one changes the closing speed by c, from w before it. Of w the forces have built up
+``g = w - (row THROWN)``. Where g > 0, the push is ``c min(g / w, 1)``; ``motion.impact`` adds it. So ever smaller and
+more frequent impacts push as much as a contact that lasts, and one that is struck from behind and thrown forward does
+not push.
 
 Pair p, whose bodies touch and move as one, takes up the closing acceleration ``u_rear - u_front >= 0`` (m/s2): u_rear
 is what body p + 1 would do if no body were in front of it, u_front what body p would do if no body were behind it.

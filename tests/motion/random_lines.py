@@ -80,7 +80,7 @@ def stepped(runs: Runs, step_s: float) -> Floats:
         out[k, at.SPEED, 1:], out[k, at.FORCE, 1:] = end.speeds, end.forces
         out[k, at.GAP, 1:-1] = end.gaps[1:]
         out[k, at.GAP, 0] = min(end.gaps[0], at.FAR_M)
-        out[k, [at.HIT, at.FIRST, at.TOTAL, at.COUNT, at.PUSHED], :-1] = end.book
+        out[k, [at.HIT, at.FIRST, at.TOTAL, at.COUNT, at.PUSHED], :-1] = end.book[:5]
         if not end.finished:
             out[k] = np.nan
     return out
@@ -126,13 +126,16 @@ def exactly(runs: Runs, k: int) -> Floats:
     mass, limit = (rationals(car[row, 1:]) for row in (at.MASS, at.LIMIT))
     gaps, speeds = rationals(line[at.GAP, 1:-1]), rationals(line[at.SPEED, 1:])
     obstacle = Fraction(float(line[at.GAP, 0])) if line[at.GAP, 0] < at.FAR_M else None
+    by_forces, struck = None, set()
     for start, end, command in zip(runs.times[:-1], runs.times[1:], runs.commands[:, k], strict=True):
         left = rationals(np.maximum(car[at.LATENCY, 1:] - start, 0.0))
         world = exact.Line(
-            gaps, speeds, rationals(command), left, mass, limit, Fraction(float(car[at.RESTITUTION, 0])), obstacle
-        )
-        gaps, speeds, hits, obstacle, pushed = exact.Run(world).to(Fraction(end - start))
+            gaps, speeds, rationals(command), left, mass, limit, Fraction(float(car[at.RESTITUTION, 0])), obstacle,
+            by_forces, frozenset(struck),
+        )  # fmt: skip
+        gaps, speeds, hits, obstacle, pushed, by_forces = exact.Run(world).to(Fraction(end - start))
         line[at.PUSHED, :-1] += [float(pushed[-1]), *map(float, pushed[:-1])]
+        struck |= {pair for pair, _ in hits}
         for pair, closing in hits:
             harm, p = float(closing) ** 2, pair + 1
             line[at.FIRST, p] += 0.0 if line[at.HIT, p] else harm

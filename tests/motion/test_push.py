@@ -73,6 +73,22 @@ CASES: dict[str, tuple[Any, Any, float, list[float]]] = {
         lines([6.0], [0.0, 8.0], latency_s=[0.75, 0.0]), [-2.0, 0.0], 1.75, [0.0, 2.0],
     ),
     "a bounce is no push": (lines([6.0], [0.0, 8.0], restitution=0.5), 0.0, 2.0, [0.0, 0.0]),
+    "further impacts push: a bouncing rear comes back": (
+        # 8 against 4 at once, e = 0.5: they part with 2. The front brakes at 4: after 1 s they meet again with 2, all
+        # built up, and part with 1: 3. Then 1 and 0.5: 1.5, ... In all 6 until 2 s, as small impacts as one likes; then
+        # the contact lasts: 4 for 0.5 s. The last impacts, below 0.05 m/s, do not bounce.
+        lines([0.0], [4.0, 8.0], mass_t=1.0, restitution=0.5), [-4.0, 0.0], 2.5, [0.0, 8.0],
+    ),
+    "being struck from behind and thrown forward is no push": (
+        # Vehicle 2 strikes Vehicle 1 and bounces (e = 0.5), Vehicle 3 strikes it later; all coast
+        lines([0.0, 9.0], [4.0, 8.0, 16.0], restitution=0.5), 0.0, 6.0, [0.0, 0.0, 0.0],
+    ),
+    "of an impact only what forces have built up": (
+        # 4 and 8 become 7 and 5; Vehicle 1 brakes at 3 to 4 m/s until Vehicle 3 comes at 1 s: -2 + 3 = 1 is built up.
+        # Vehicle 2 then has 11.75. 0.5 = 7.75 t + 1.5 t^2 until it meets Vehicle 1; 1 + 3 t of 7.75 + 3 t is built up
+        lines([0.0, 9.0], [4.0, 8.0, 14.0], restitution=0.5), [-3.0, 0.0, 0.0], 1.2,
+        [0.0, 1.5 * (63.0625**0.5 - 6.75), 0.0],
+    ),
     "a touch is no push: all brake alike": (lines([0.0, 0.0], [9.0] * 3, mass_t=[1.1, 0.7, 3.3]), -0.7, 5.0, [0.0] * 3),
     "a touch is no push: the front drives away": (lines([0.0], [4.0, 4.0]), [2.0, 1.0], 2.0, [0.0, 0.0]),
 }  # fmt: skip

@@ -32,6 +32,8 @@ class Line:
     limit: Rationals
     restitution: Fraction
     obstacle: Fraction | None = None  # distance to an obstacle ahead
+    by_forces: Rationals | None = None  # of each pair that has had an impact: closing speed by forces since it touched
+    struck: frozenset[int] = frozenset()  # pairs that have had an impact
 
 
 class Outcome(NamedTuple):
@@ -42,6 +44,7 @@ class Outcome(NamedTuple):
     hits: list[tuple[int, Fraction]]  # pair (-1: the front vehicle and the obstacle), closing speed
     obstacle: Fraction | None
     pushed: list[Fraction]  # m/s that each pair's contact takes up; the last is the obstacle's
+    by_forces: Rationals
 
 
 class Run:
@@ -56,13 +59,15 @@ class Run:
         self.joined = [False] * self.n
         self.hits: list[tuple[int, Fraction]] = []
         self.pushed = [ZERO] * len(self.g)
+        self.struck, self.by_forces = set(line.struck), list(line.by_forces or self.pushed)
 
     def to(self, until: Fraction) -> Outcome:
         """Run to ``until``, the events at ``until`` included."""
         while True:
             self.impacts()
             if self.time >= until:
-                return Outcome(tuple(self.g[:-1]), tuple(self.v[:-1]), self.hits, self.g[-1], self.pushed)
+                by_forces = tuple(self.by_forces)
+                return Outcome(tuple(self.g[:-1]), tuple(self.v[:-1]), self.hits, self.g[-1], self.pushed, by_forces)
             self.step(until)
 
     def step(self, until: Fraction) -> None:
@@ -77,6 +82,8 @@ class Run:
         for p in self.pairs:
             self.g[p] = ZERO if contacts.get(p) == soonest else significant(self.g[p] + way[p] - way[p + 1])
         self.v = [significant(v + acceleration * soonest) for v, acceleration in zip(self.v, a, strict=True)]
+        for p in self.pairs:
+            self.by_forces[p] = significant(self.by_forces[p] + (a[p + 1] - a[p]) * soonest)
         self.time = significant(self.time + soonest)
 
     def push(self, a: list[Fraction], soonest: Fraction) -> None:
@@ -157,11 +164,21 @@ class Run:
 
     def impacts(self) -> None:
         """Resolve all approaching pairs that touch, round after round."""
-        while any(self.g[p] == 0 and self.v[p + 1] > self.v[p] for p in self.pairs):
+        while True:
+            for p in self.pairs:
+                if self.g[p] == 0 and self.v[p + 1] <= self.v[p]:
+                    self.by_forces[p] = self.v[p + 1] - self.v[p]
+            if not any(self.g[p] == 0 and self.v[p + 1] > self.v[p] for p in self.pairs):
+                return
             before = list(self.v)
             for run in self.runs(alike=False):
                 self.cluster(run)
             closing = [(p, before[p + 1] - before[p]) for p in self.pairs if self.g[p] == 0]
+            for p, speed in closing:
+                if speed > TOUCH_MPS and p in self.struck and self.by_forces[p] > 0:
+                    taken = speed - (self.v[p + 1] - self.v[p])
+                    self.pushed[p] += taken * min(self.by_forces[p], speed) / speed
+            self.struck |= {p for p, speed in closing if speed > TOUCH_MPS}
             self.hits += [(p, speed) for p, speed in closing if speed > TOUCH_MPS]
 
     def cluster(self, run: slice) -> None:

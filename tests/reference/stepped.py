@@ -96,13 +96,15 @@ def regression(gaps, mass, speeds, forces, limit, h, out):
 
 @numba.njit(cache=True, no_cfunc_wrapper=True)
 def impacts(gaps, mass, speeds, limit, restitution, book):
-    """Resolve impacts, round after round; ``book`` [5, N]: hit, first harm, total harm, count, push."""
+    """Resolve impacts, round after round; ``book`` [6, N]: hit, first harm, total, count, push, closing by forces."""
     n = len(speeds)
     closing, pooled, nothing = np.zeros(n), np.zeros(n), np.zeros(n)
     for _ in range(100_000):
         largest = 0.0
         for p in range(n):
             closing[p] = speeds[p] - (speeds[p - 1] if p > 0 else 0.0) if gaps[p] <= 0.0 else 0.0
+            if gaps[p] <= 0.0 and closing[p] <= SAME_MPS:
+                book[5, p] = closing[p]
             largest = max(largest, closing[p])
         if largest <= SAME_MPS:
             return
@@ -122,6 +124,9 @@ def impacts(gaps, mass, speeds, limit, restitution, book):
         for p in range(n):
             if closing[p] > TOUCH_MPS:
                 harm = closing[p] * closing[p]
+                if book[0, p] == 1.0 and book[5, p] > 0.0:
+                    apart = (speeds[p - 1] if p > 0 else 0.0) - speeds[p]
+                    book[4, p] += min(book[5, p] / closing[p], 1.0) * (closing[p] + apart)
                 book[1, p] += harm if book[0, p] == 0.0 else 0.0
                 book[0, p] = 1.0
                 book[2, p] += harm
@@ -199,6 +204,9 @@ def through(now, wanted, car, restitution, duration, step_s, book):
             h = high
             trial(now, wanted, car, h, new)
         pushes(now, new, car, h, book)
+        for k in range(len(wanted)):
+            ahead = new[SPEED, k - 1] - now[SPEED, k - 1] if k > 0 else 0.0
+            book[5, k] += new[SPEED, k] - now[SPEED, k] - ahead
         now[:] = new
         for k in range(len(wanted)):
             now[GAP, k] = max(now[GAP, k], 0.0)
@@ -255,7 +263,7 @@ class Outcome(NamedTuple):
     gaps: Any
     speeds: Any
     forces: Any
-    book: Any  # [5, N] hit, first harm, total harm, count, push (m/s) of each vehicle and what is ahead of it
+    book: Any  # [6, N] hit, first harm, total, count, push, closing speed by forces, of each vehicle and what is ahead
     finished: bool
 
 
@@ -267,7 +275,7 @@ def simulate(line: Line, times: Any, commands: Any, step_s: float) -> Outcome:
     latency = np.array(line.latency)
     now = np.array([line.gaps, line.speeds, line.forces, line.forces], np.float64)
     car = np.array([line.mass, line.limit, line.brake_rate, line.release_rate], np.float64)
-    book, finished = np.zeros((5, len(latency))), True
+    book, finished = np.zeros((6, len(latency))), True
     for (start, end), command in zip(pairwise(times), commands, strict=True):
         for one, other in pairwise(sorted({start, end, *(float(x) for x in latency if start < x < end - 1e-9)})):
             wanted, length = np.where(latency <= one, command, 0.0), other - one
