@@ -150,8 +150,9 @@ def allowed(command, low, high):
 
 
 @large
-def draw_command(random, low, high):
-    """Return a random command (m/s2), often full braking, full driving or coasting."""
+def draw_command(world, b):
+    """Return a random command (m/s2) of vehicle b, often full braking, full driving, coasting or a neighbour's."""
+    random, body, low, high = world.random, world.bodies[b], world.bounds[b, 0], world.bounds[b, 1]
     u = draw(random)
     if u < 0.35:
         return low
@@ -159,22 +160,25 @@ def draw_command(random, low, high):
         return high
     if u < 0.6:
         return 0.0
+    if u < 0.7:
+        return allowed(world.wanted[body - 1], low, high)
     return allowed(low + (high - low) * draw(random), low, high)
 
 
 @large
-def draw_profile(random, bounds, last, drawing, ends, commands):
+def draw_profile(world, drawing, ends, commands):
     """Draw a profile; return its number of phases.
 
     Six phases of random commands, of which short ones are likelier; or, for a plan, three: often full braking, another
     command for a while, and full braking.
     """
+    random, bounds, last = world.random, world.bounds, int(world.clock[LAST])
     if drawing[KIND] == PLAN:
         low, high = bounds[0, 0], bounds[0, 1]
         first = draw_below(random, drawing[ATTENTION])
         ends[0], ends[1], ends[2] = first, first + 1 + draw_below(random, drawing[LONGEST_WHILE]), last
-        commands[1, 0], commands[2, 0] = draw_command(random, low, high), low
-        commands[0, 0] = low if draw(random) < 0.8 else draw_command(random, low, high)
+        commands[1, 0], commands[2, 0] = draw_command(world, 0), low
+        commands[0, 0] = low if draw(random) < 0.8 else draw_command(world, 0)
         for p in range(3):
             ends[p] = min(ends[p], last)
         return 3
@@ -184,14 +188,15 @@ def draw_profile(random, bounds, last, drawing, ends, commands):
         step = min(step + 1 + int(u * u * 25.0), last)
         ends[p] = step
         for b in range(bounds.shape[0]):
-            commands[p, b] = draw_command(random, bounds[b, 0], bounds[b, 1])
+            commands[p, b] = draw_command(world, b)
     ends[5] = last
     return 6
 
 
 @large
-def draw_change(random, bounds, active, drawing, change):
+def draw_change(world, active, drawing, change):
     """Draw a change of a profile whose first ``active`` phases matter. The sizes of amounts are log-uniform."""
+    random, bounds = world.random, world.bounds
     if drawing[KIND] == PLAN:
         low, high = bounds[0, 0], bounds[0, 1]
         change[WHAT], change[VEHICLE] = ADD if draw(random) >= 0.1 else SET, 0
@@ -202,7 +207,7 @@ def draw_change(random, bounds, active, drawing, change):
             sign = draw_sign(random)
             change[AMOUNT] = sign * (high - low) * exp(-6.907755278982138 * draw(random))
         else:
-            change[AMOUNT] = draw_command(random, low, high)
+            change[AMOUNT] = draw_command(world, 0)
         return
     u = draw(random)
     change[PHASE], b, change[LENGTH] = draw_below(random, active), draw_below(random, bounds.shape[0]), 1
@@ -212,7 +217,7 @@ def draw_change(random, bounds, active, drawing, change):
         change[WHAT] = ADD if u < 0.45 else TRADE
         change[AMOUNT] = sign * (high - low) * exp(-13.815510557964275 * size)
     elif u < 0.78:
-        change[WHAT], change[AMOUNT] = SET, draw_command(random, low, high)
+        change[WHAT], change[AMOUNT] = SET, draw_command(world, b)
     else:
         change[WHAT], change[AMOUNT] = MOVE_END, sign * (1 + int(8.0 * size * size * size))
 
@@ -267,7 +272,7 @@ def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
         if s < number:
             copy_profile(ends[s], commands[s], room.ends, room.commands)
         else:
-            used = draw_profile(world.random, world.bounds, int(world.clock[LAST]), drawing, room.ends, room.commands)
+            used = draw_profile(world, drawing, room.ends, room.commands)
         if used == 0:
             continue
         tried_ends, tried = room.ends[:used], room.commands[:used]
@@ -300,7 +305,7 @@ def improve(world, room, ends, commands, budget, drawing, least):
         copy_profile(ends, commands, new_ends, new_commands)
         if spent >= 0:  # the first profile that is tried is the given one
             if not again:
-                draw_change(world.random, world.bounds, active, drawing, change)
+                draw_change(world, active, drawing, change)
             phase, again = int(change[PHASE]), False
             if not apply_change(change, world.bounds, new_ends, new_commands):
                 spent += 1 if drawing[KIND] == PLAN else 0
