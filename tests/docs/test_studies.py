@@ -62,7 +62,7 @@ def test_restamp__renews_a_table_only_if_all_its_harms_keep_their_bits(tmp_path,
         assert not renewed or BestHarmTable.load(file).content() == shipped.content()
     same, other_harm, other_worlds = capsys.readouterr().out.splitlines()
     assert same == f"cooperation-2-five: same bits, physics {physics_digest()}"
-    assert other_harm.endswith("NOT renewed: other harms in worlds: 1 of 300 (total); search the list again")
+    assert other_harm.endswith("NOT renewed: other harms in worlds: 1 of 400 (total); search the list again")
     assert other_worlds.endswith("NOT renewed: its worlds are not those of its list")
 
 
