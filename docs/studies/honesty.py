@@ -56,8 +56,8 @@ class Cost(NamedTuple):
 
 def with_price(problem: Problem, price: float) -> Problem:
     """Return the problem that minimises total harm and the costs of a price."""
-    others = COUNTS["honest"][3:] if price else np.zeros(2)
-    COUNTS[f"a price of {price:g}"] = np.array([0.0, 1.0, price, *others])
+    passed, _, *others = COUNTS["honest"][2:] if price else np.zeros(4)
+    COUNTS[f"a price of {price:g}"] = np.array([0.0, 1.0, passed, price, *others])
     return problem.counting(f"a price of {price:g}")
 
 

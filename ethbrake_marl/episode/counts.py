@@ -3,9 +3,10 @@
 ======  ================================================================================================================
 first   harm of the first impact of each pair, as the paper counts it
 total   harm of every impact
-honest  harm of every impact, and what no impact shows: ``10 s`` for the push, the speed s that contacts take up while
-        one vehicle pushes another; ``10 s`` for the speed s that a vehicle asks for by driving before the line's first
-        impact; ``v^2`` for a vehicle that still moves at v at the horizon, as if it then hit something that stands
+honest  harm of every impact, also where a contact passes it on, and what no impact shows: ``10 s`` for the push, the
+        speed s that forces have built up and contacts take up; ``10 s`` for the speed s that a vehicle asks for by
+        driving before the line's first impact; ``v^2`` for a vehicle that still moves at v at the horizon, as if it
+        then hit something that stands
 ======  ================================================================================================================
 
 All are in m2/s2, and none ever falls in an episode. ``honest`` adds a price to harm so that pushing never pays: without
@@ -18,17 +19,17 @@ import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel
-from ethbrake_marl.motion.layout import DROVE, FIRST, MOVING, PUSHED, TOTAL, Floats
+from ethbrake_marl.motion.layout import DROVE, FIRST, MOVING, PASSED, PUSHED, TOTAL, Floats
 
-ROWS = [FIRST, TOTAL, PUSHED, DROVE, MOVING]  # rows of a line that can count
+ROWS = [FIRST, TOTAL, PASSED, PUSHED, DROVE, MOVING]  # rows of a line that can count
 
 COUNTS = {  # name -> weight of each row
-    "first": np.array([1.0, 0.0, 0.0, 0.0, 0.0]),
-    "total": np.array([0.0, 1.0, 0.0, 0.0, 0.0]),
-    "honest": np.array([0.0, 1.0, 10.0, 10.0, 1.0]),
+    "first": np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+    "total": np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
+    "honest": np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]),
 }
 RULES = {"honest": "honest", "paper": "first"}  # short name -> count
-Count = str | Floats  # the name of a count, or weights of its own, [5]
+Count = str | Floats  # the name of a count, or weights of its own, [6]
 
 HARM = {"first": "first_impact_harm", "total": "total_harm"}  # counts of harm alone -> column of an evaluation
 COLUMN = {**HARM, "honest": "honest_cost"}  # count -> column
@@ -61,7 +62,8 @@ def other_count(count: Count) -> str:
 def pair_amount(line, p, weights):
     """Return what counts of the pair p of one world so far (m2/s2)."""
     harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
-    return harm + (weights[2] * line[PUSHED, p] + weights[3] * line[DROVE, p] + weights[4] * line[MOVING, p])
+    beside = weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
+    return harm + (weights[2] * line[PASSED, p] + beside)
 
 
 @kernel
@@ -75,6 +77,7 @@ def amount_so_far(line, weights):
 
 def pair_amounts(line: Floats, count: Count) -> Floats:
     """Return what counts of each pair so far, [n, N + 1] m2/s2, as ``pair_amount`` does."""
-    first, total, push, drove, moving = weights_of(count)
+    first, total, passed, push, drove, moving = weights_of(count)
     harm = first * line[:, FIRST] + total * line[:, TOTAL]
-    return harm + (push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING])
+    beside = push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING]
+    return harm + (passed * line[:, PASSED] + beside)

@@ -23,6 +23,7 @@ from ethbrake_marl.motion.layout import (
     MOVING,
     NEW_FIRST,
     NEW_TOTAL,
+    PASSED,
     PUSHED,
     SPEED,
     Bools,
@@ -151,10 +152,11 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
 
 @kernel
 def beside_harm(line, count):
-    """Return what counts of one world so far beside harm (m2/s2)."""
+    """Return what counts of one world so far beside first-impact and total harm (m2/s2)."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
-        amount += count[2] * line[PUSHED, p] + count[3] * line[DROVE, p] + count[4] * line[MOVING, p]
+        amount += count[2] * line[PASSED, p] + count[3] * line[PUSHED, p]
+        amount += count[4] * line[DROVE, p] + count[5] * line[MOVING, p]
     return amount
 
 

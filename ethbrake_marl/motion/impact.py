@@ -38,6 +38,7 @@ from ethbrake_marl.motion.layout import (
     NEW_TOTAL,
     NEXT_CLOSING,
     NEXT_TIME,
+    PASSED,
     POOLED,
     PUSHED,
     REAR_CHANGE,
@@ -144,6 +145,40 @@ def note_thrown(line, scratch, p):
     line[THROWN, p] += change
 
 
+@large
+def after_impact_of(car, scratch, first, last, body):
+    """Return the speed (m/s) of ``body`` after the impact if only the bodies ``first..last`` were there."""
+    largest = 0.0
+    for p in range(first, last):
+        largest = max(largest, scratch[CLOSING, p])
+    before = scratch[BEFORE, body]
+    if largest == 0.0:
+        return before
+    pool(
+        car[MASS], scratch[BEFORE], scratch[BEFORE], scratch[ZERO], scratch[ZERO], scratch, first, last,
+        scratch[POOLED], scratch[JERK],
+    )  # fmt: skip
+    bounce = car[RESTITUTION, 0] if largest >= PLASTIC_MPS else 0.0
+    return scratch[POOLED, body] + bounce * (scratch[POOLED, body] - before)
+
+
+@large
+def note_passed(line, car, scratch, first, last):
+    """Add to the row PASSED the harm that the contacts of a cluster of three bodies or more pass on in an impact.
+
+    In an impact a contact takes up the closing speed ``v_rear - v_front``: v_rear is what the body behind it would have
+    after the impact if no body were in front of it, v_front what the body in front of it would have if no body were
+    behind it. The harm that it passes on is the square of this, minus the harm of the pair's own closing speed. So
+    vehicles that touch when one of them is struck are not spared what they would bear a millimetre apart.
+    """
+    for p in range(first, last if last - first > 1 else first):  # two bodies pass nothing on
+        front = after_impact_of(car, scratch, first, p, p)
+        rear = after_impact_of(car, scratch, p + 1, last, p + 1)
+        closing = max(scratch[CLOSING, p], 0.0)
+        if rear - front > max(closing, TOUCH_MPS):
+            line[PASSED, p] += (rear - front) * (rear - front) - closing * closing
+
+
 @kernel
 def resolve_impacts(line, car, scratch, now, ahead):
     """Resolve every cluster in which a pair closes, and count its harm; return False if no pair closes.
@@ -174,6 +209,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
             last += 1
         if closes:
             resolve_cluster(line, car, scratch, first, last)
+            note_passed(line, car, scratch, first, last)
         first = last + 1
     for p in range(ahead, pairs):
         scratch[CONTACT_SPEED, p] = 0.0

@@ -4,8 +4,8 @@ Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, f
 In a row of pairs, column p is the pair (body p, body p + 1). The obstacle is always there: without one, it is ``FAR_M``
 ahead, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [11, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
-belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 11, N + 1], ``car`` [n, 10, N + 1].
+Arrays that most functions share: ``line`` [12, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
+belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 12, N + 1], ``car`` [n, 10, N + 1].
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ PUSHED = 7  # push: closing speed that forces have built up and the pair's conta
 DROVE = 8  # of the pair ahead of a vehicle: speed that its commands ask for before the line's first impact (m/s)
 MOVING = 9  # of the pair ahead of a vehicle: square of its speed at the horizon (m2/s2)
 THROWN = 10  # change of its closing speed by impacts since it last touched (m/s)
-LINE_ROWS = 11
+PASSED = 11  # harm of impacts of others that its contact passes on, which is neither first nor total (m2/s2)
+LINE_ROWS = 12
 
 # rows of `car`
 MASS = 0  # t; infinite: the obstacle

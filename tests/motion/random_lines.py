@@ -97,6 +97,11 @@ def push_differences(one: Floats, other: Floats) -> Floats:
     return largest(one, other, [at.PUSHED])
 
 
+def passed_differences(one: Floats, other: Floats) -> Floats:
+    """Return the largest relative difference of each world in what its contacts pass on, [n]."""
+    return largest(one, other, [at.PASSED])
+
+
 def pushes_off(runs: Runs, close: float) -> tuple[Floats, np.ndarray]:
     """Return how far pushes are from those by small steps, and in which worlds these have the same impacts, [n].
 
@@ -133,8 +138,9 @@ def exactly(runs: Runs, k: int) -> Floats:
             gaps, speeds, rationals(command), left, mass, limit, Fraction(float(car[at.RESTITUTION, 0])), obstacle,
             by_forces, frozenset(struck),
         )  # fmt: skip
-        gaps, speeds, hits, obstacle, pushed, by_forces = exact.Run(world).to(Fraction(end - start))
+        gaps, speeds, hits, obstacle, pushed, by_forces, passed = exact.Run(world).to(Fraction(end - start))
         line[at.PUSHED, :-1] += [float(pushed[-1]), *map(float, pushed[:-1])]
+        line[at.PASSED, :-1] += [float(passed[-1]), *map(float, passed[:-1])]
         struck |= {pair for pair, _ in hits}
         for pair, closing in hits:
             harm, p = float(closing) ** 2, pair + 1

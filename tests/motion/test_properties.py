@@ -12,6 +12,7 @@ from tests.motion.random_lines import (
     Runs,
     differences,
     exactly,
+    passed_differences,
     played,
     push_differences,
     pushes_off,
@@ -61,6 +62,7 @@ def test_motion__is_that_of_rational_numbers_where_brakes_act_at_once(N: int, ob
     assert len(rows) > 5 and differences(end[rows], exact).max() <= 1e-9
     assert end[rows, at.COUNT].tolist() == exact[:, at.COUNT].tolist()
     assert push_differences(end[rows], exact).max() <= 1e-12 and exact[:, at.PUSHED].any()
+    assert passed_differences(end[rows], exact).max() <= 1e-9 and exact[:, at.PASSED].any() == (N > 2)
 
 
 @pytest.mark.parametrize("obstacle", [False, True])

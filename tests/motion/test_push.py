@@ -108,3 +108,39 @@ def test_push__adds_up_from_interval_to_interval() -> None:
     half, _, _ = driven(line, car, [-8.0, 0.0], 0.0, 0.5)
     whole, _, _ = driven(half, car, [-4.0, 0.0], 0.5, 1.0)
     assert (half[0, at.PUSHED, 1], whole[0, at.PUSHED, 1]) == (4.0, 6.0)
+
+
+# The line, its restitution, and what contacts pass on (m2/s2), of the obstacle and Vehicle 1 first. All coast.
+PASSED: dict[str, tuple[Any, list[float]]] = {
+    "two that touch strike an obstacle": (  # Vehicle 1 alone bounces with 1 m/s: 11 between it and Vehicle 2
+        lambda gap: lines([gap], [10.0, 10.0], obstacle_gap_m=5.0, restitution=0.1), [0.0, 121.0],
+    ),
+    "three that touch strike an obstacle": (  # the first two alone bounce with 1 m/s: 11 between each
+        lambda gap: lines([gap, 0.0], [10.0] * 3, obstacle_gap_m=5.0, restitution=0.1), [0.0, 121.0, 121.0],
+    ),
+    "one of two that touch is struck": (  # Vehicles 2 and 3 alone: 6 in common, Vehicle 2 has 7; 3 to Vehicle 1
+        lambda gap: lines([gap, 5.0], [4.0, 4.0, 8.0], restitution=0.5), [0.0, 9.0, 0.0],
+    ),
+    "the one between is struck from both sides": (  # each contact takes up its own closing speed, and the other's
+        # change of Vehicle 2: in front 8 - 4 and after the impact behind (8 + 12) / 2 + 2 = 12; behind 12 - 4
+        lambda gap: lines([5.0, 5.0], [4.0, 8.0, 12.0], restitution=1.0), [0.0, 8.0**2 - 4.0**2, 8.0**2 - 4.0**2],
+    ),
+    "two strike each other": (lambda gap: lines([5.0], [4.0, 8.0], restitution=0.5), [0.0, 0.0]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PASSED)
+def test_passed_on__by_hand(name: str) -> None:
+    make, harm = PASSED[name]
+    after, _, _ = driven(*make(0.0), 0.0, 0.0, 1.4)
+    assert after[0, at.PASSED, :-1].tolist() == pytest.approx(harm, abs=1e-9)
+    assert [each == 0.0 for each in after[0, at.PASSED, :-1]] == [each == 0.0 for each in harm]
+
+
+@pytest.mark.parametrize("name", ["two that touch strike an obstacle", "one of two that touch is struck"])
+def test_passed_on__is_what_the_pair_bears_a_little_apart(name: str) -> None:
+    make, harm = PASSED[name]
+    touching, _, _ = driven(*make(0.0), 0.0, 0.0, 1.4)
+    apart, _, _ = driven(*make(1e-7), 0.0, 0.0, 1.4)
+    assert touching[0, at.FIRST, 1] == 0.0 and apart[0, at.PASSED].max() < 1e-3
+    assert apart[0, at.FIRST, 1] == pytest.approx(harm[1], rel=1e-5)

@@ -45,6 +45,7 @@ class Outcome(NamedTuple):
     obstacle: Fraction | None
     pushed: list[Fraction]  # m/s that each pair's contact takes up; the last is the obstacle's
     by_forces: Rationals
+    passed: list[Fraction]  # m2/s2 that each pair's contact passes on
 
 
 class Run:
@@ -59,6 +60,7 @@ class Run:
         self.joined = [False] * self.n
         self.hits: list[tuple[int, Fraction]] = []
         self.pushed = [ZERO] * len(self.g)
+        self.passed = [ZERO] * len(self.g)
         self.struck, self.by_forces = set(line.struck), list(line.by_forces or self.pushed)
 
     def to(self, until: Fraction) -> Outcome:
@@ -67,7 +69,10 @@ class Run:
             self.impacts()
             if self.time >= until:
                 by_forces = tuple(self.by_forces)
-                return Outcome(tuple(self.g[:-1]), tuple(self.v[:-1]), self.hits, self.g[-1], self.pushed, by_forces)
+                obstacle = self.g[-1]
+                return Outcome(
+                    tuple(self.g[:-1]), tuple(self.v[:-1]), self.hits, obstacle, self.pushed, by_forces, self.passed
+                )
             self.step(until)
 
     def step(self, until: Fraction) -> None:
@@ -172,6 +177,8 @@ class Run:
                 return
             before = list(self.v)
             for run in self.runs(alike=False):
+                self.pass_on(run)
+            for run in self.runs(alike=False):
                 self.cluster(run)
             closing = [(p, before[p + 1] - before[p]) for p in self.pairs if self.g[p] == 0]
             for p, speed in closing:
@@ -181,9 +188,21 @@ class Run:
             self.struck |= {p for p, speed in closing if speed > TOUCH_MPS}
             self.hits += [(p, speed) for p, speed in closing if speed > TOUCH_MPS]
 
-    def cluster(self, run: slice) -> None:
+    def pass_on(self, run: slice) -> None:
+        """Add what each contact would take up if its two sides were alone, minus what its own pair closes."""
+        now = list(self.v)
+        for p in range(-1 if self.at_obstacle(run) else run.start, run.stop - 1):
+            self.cluster(slice(run.start, p + 1))
+            front, self.v = self.v[p], list(now)
+            self.cluster(slice(p + 1, run.stop), against=False)
+            rear, self.v = self.v[p + 1], list(now)
+            closing = max(now[p + 1] - now[p], ZERO)
+            if rear - front > max(closing, TOUCH_MPS):
+                self.passed[p] += (rear - front) ** 2 - closing**2
+
+    def cluster(self, run: slice, *, against: bool | None = None) -> None:
         v = self.v[run]
-        against = self.at_obstacle(run)
+        against = self.at_obstacle(run) if against is None else against
         closing = max((b - a for a, b in pairwise([ZERO, *v] if against else v)), default=ZERO)
         if closing <= 0:
             return

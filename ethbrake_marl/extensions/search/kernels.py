@@ -49,7 +49,7 @@ class World(NamedTuple):
     bounds: Floats  # [B, 2] their smallest and largest command (m/s2)
     shares: Floats  # [2, N + 1], as in `Problem`
     numbers: Floats  # [NUMBERS] time step (s), horizon (s), aim, whether step by step
-    weights: Floats  # [2, 5] of the count that is minimised, and of the one that decides ties
+    weights: Floats  # [2, 6] of the count that is minimised, and of the one that decides ties
     random: UInt64s  # [1] state of the random stream
     scratch: Floats  # of the physics
 
