@@ -156,7 +156,7 @@ def search_list(
         problem = problem_of(game, some, bodies)
         given = [] if known is None else [known.stored(problem, count)[1] for count in known.harm]
         given += [driven_profiles(problem, game, some, team) for team in teams]
-        asked = [f"{physics_digest()} {options!r}".encode(), problem.identity.tobytes()]
+        asked = [repr(options).encode(), physics_digest().encode(), problem.identity.tobytes()]
         asked += [array.tobytes() for each in given for array in each]
         file = None if chunks is None else chunks / f"{hashlib.sha256(b''.join(asked)).hexdigest()[:16]}.npz"
         if file is not None and file.exists():
