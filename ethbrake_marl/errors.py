@@ -197,7 +197,7 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """Warning: a trained policy is used in worlds that differ from the worlds of its training."""
+    """Warning: a trained policy or a table of best known harm is from other worlds or other physics."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:

@@ -3,6 +3,7 @@
 ``python docs/studies/best_harm.py --scenario paper-random --episodes 1000 --output paper-random.npz`` searches a list.
 With ``--output``, finished chunks are saved beside the file, and the same command continues after an interruption.
 ``--shipped`` prints proven and best known harm of every shipped table, and the gap between them.
+``--restamp`` renews the digest of the physics in every shipped table whose harms are still the same, bit for bit.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,16 +23,18 @@ import numpy as np
 from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
 from ethbrake_marl.extensions.search.best_harm import search_list
 from ethbrake_marl.extensions.search.pricing import problem_of
-from ethbrake_marl.extensions.search.tables import BestHarmTable, shipped_tables
+from ethbrake_marl.extensions.search.tables import SHIPPED, BestHarmTable, outdated_tables, shipped_tables
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
+from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import make_teams, open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
+from ethbrake_marl.worlds.scenario import Scenario
 
 NO_HARM = 1e-3  # less total harm (m2/s2), an impact at 0.03 m/s, counts as next to none
 
@@ -40,6 +44,7 @@ def main(words: list[str]) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add = parser.add_argument
     add("--shipped", action="store_true", help="print the shipped tables instead")
+    add("--restamp", action="store_true", help="after a change of the physics' code: renew the shipped tables' digests")
     add("--scenario", default="paper-random")
     add("--episodes", type=int, default=10_000, help="worlds of the list")
     add("--seed", type=int, default=7, help="seed of the list")
@@ -52,7 +57,11 @@ def main(words: list[str]) -> None:
     add("--agents", default="", metavar="A,B,...", help="agents that the search also starts from")
     add("--output", type=Path, metavar="FILE.npz", help="the table to write")
     given = parser.parse_args(words)
+    if given.restamp:
+        sys.exit(0 if restamp(SHIPPED) else 1)
     if given.shipped:
+        if outdated := outdated_tables():
+            print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
         print(shipped_bounds(shipped_tables()).markdown())
         return
     table = search(given, " ".join(["docs/studies/best_harm.py", shlex.join(words)]))
@@ -92,6 +101,42 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
     return BestHarmTable(table.identity, table.harm, table.profiles, header)
 
 
+def worlds_of(table: BestHarmTable) -> tuple[Scenario, Game, State]:
+    """Return the shipped scenario that a table's header names, its game, and the table's list of worlds."""
+    scenario, game = open_game(load_scenario(table.header["scenario"]), table.header["vehicles"])
+    return scenario, game, scenario.sample(int(table.header["episodes"]), seed=int(table.header["list_seed"]))
+
+
+def restamp(folder: Path) -> bool:
+    """Write this installation's digest of the physics into the tables of a folder whose harms it gives bit for bit.
+
+    Prints a line for each table. Returns whether it wrote all.
+    """
+    refusals = []
+    for path in sorted(folder.glob("*.npz")):
+        table = BestHarmTable.load(path)
+        refusals.append(difference(table))
+        if not refusals[-1]:
+            replace(table, header={**table.header, "physics": physics_digest()}).save(path)
+        print(f"{path.stem}: {refusals[-1] or f'same bits, physics {physics_digest()}'}")
+    return not any(refusals)
+
+
+def difference(table: BestHarmTable) -> str:
+    """Replay every profile of a table; return in words which harms differ, by any bit. Empty: none."""
+    _, game, alert = worlds_of(table)
+    problem = problem_of(game, alert)
+    if not np.array_equal(problem.identity, table.identity):
+        return "NOT renewed: its worlds are not those of its list"
+    try:
+        again = {count: problem.values(profiles)[count] for count, profiles in table.profiles.items()}
+    except PhysicsError as error:
+        return f"NOT renewed: {error}"
+    changed = {count: int((again[count] != harm).sum()) for count, harm in table.harm.items()}
+    words = ", ".join(f"{number:,} of {alert.n:,} ({count})" for count, number in changed.items() if number)
+    return words and f"NOT renewed: other harms in worlds: {words}; search the list again"
+
+
 # *Contact proven* is not *impact proven*. In the worlds between the two, every command leads to contact, but perhaps
 # not to an impact. Either leaning without an impact is possible there, or the proof is loose. The harm of the best
 # known profiles in these worlds shows which: almost no harm, or much harm.
@@ -125,16 +170,14 @@ def shipped_bounds(tables: Iterable[BestHarmTable]) -> Sheet:
     )  # fmt: skip
     rows = []
     for table in tables:
-        header = table.header
-        scenario, game = open_game(load_scenario(header["scenario"]), header["vehicles"])
-        alert = scenario.sample(int(header["episodes"]), seed=int(header["list_seed"]))
+        scenario, game, alert = worlds_of(table)
         table.check_holds_any(problem_of(game, alert).identity)
         first, total = table.harm["first"], table.harm["total"]
         least, *rates = proven(game, alert, first, total)
         means = [float(np.mean(each)) for each in (first, total)]
         gaps = [None if least is None else 1.0 - least / mean for mean in means]
         rows.append((
-            f"{scenario.name} (seed {header['list_seed']})", f"{alert.n:,}", least, means[0], gaps[0], means[1],
+            f"{scenario.name} (seed {table.header['list_seed']})", f"{alert.n:,}", least, means[0], gaps[0], means[1],
             gaps[1], *rates,
         ))  # fmt: skip
     return Sheet("", columns, rows)

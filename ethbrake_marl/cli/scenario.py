@@ -103,7 +103,7 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
     for name, each in drawn.items():
         yield f"{name:{width}}" + "".join(f" {value:>8.4g}" for value in each.values())
     same = [f"{name} {each['least']:g}" for name, each in ranges.items() if name not in drawn]
-    yield from _folded(f"the same in all worlds: {'; '.join(same) or 'nothing'}", 6)
+    yield from _folded(f"the same in all worlds: {'; '.join(same) or 'nothing'}", 20)
     rejected = trial.drawn.rejected
     yield (
         f"early impacts: {_share(rejected, rejected + n, 'draws')} rejected, {_share(trial.early, n)} kept"

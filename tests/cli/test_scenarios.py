@@ -53,6 +53,15 @@ def test_validate__drives_scripts_and_tells_which_fails_where(ethbrake: Command,
     check_refused(tried("own_fails"), "'own_fails', vehicle_3: act fails: ZeroDivisionError: no gap (scripts.py, line")
 
 
+@pytest.mark.usefixtures("core_alone")
+def test_validate__of_a_wet_line_of_five_tells_all_capacities_on_this_road(ethbrake: Command, tmp_path: Path) -> None:
+    path, shipped = tmp_path / "wet-five.yaml", ethbrake("scenario", "show", "cooperation-2-five").out
+    path.write_text(shipped.replace("name: cooperation-2-five", "name: wet-five\nfriction: 0.4"))
+    told = " ".join(ethbrake("scenario", "validate", path).out.split())
+    assert all(f"{what}_capacity_{i}_mps2 3.924" in told for what in ("braking", "driving") for i in range(1, 6))
+    assert "; friction 0.4 early impacts: none" in told
+
+
 def test_show_and_new__are_the_files_and_force_replaces_one(ethbrake: Command, tmp_path: Path) -> None:
     shipped = {entry["name"]: entry["path"] for entry in told_json(ethbrake("scenario", "list", "--json"))}
     assert ethbrake("scenario", "show", "stress-wide").out == Path(shipped["stress-wide"]).read_text()

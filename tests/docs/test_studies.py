@@ -1,5 +1,6 @@
 """The scripts of docs/studies, and pages that tell what the code does or what was measured: paper, cooperation, ..."""
 
+import dataclasses
 import json
 import re
 from concurrent.futures import Future
@@ -11,6 +12,8 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.extensions.report.style import picture_bytes
+from ethbrake_marl.extensions.search.tables import SHIPPED, BestHarmTable
+from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.names import make_teams
 from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
@@ -36,6 +39,31 @@ def test_drawing__is_the_one_that_is_shown(name: str) -> None:
     assert f"](../figures/model-{name}.svg)" in (DOCS / "internals" / "model.md").read_text("utf-8").replace("\n", " ")
     made = picture_bytes(drawings.DRAWINGS[name](), "made.svg")
     assert made == (DOCS / "figures" / f"model-{name}.svg").read_bytes()
+
+
+best_harm = load("../studies/best_harm")
+
+
+def test_restamp__renews_a_table_only_if_all_its_harms_keep_their_bits(tmp_path, capsys) -> None:
+    file, old = tmp_path / "cooperation-2-five.npz", {"physics": "0123456789abcdef"}
+    shipped = BestHarmTable.load(SHIPPED / file.name)
+    harm = {count: each.copy() for count, each in shipped.harm.items()}
+    harm["total"][7] = np.nextafter(harm["total"][7], 99.0)
+    for changed in (
+        {"header": {**shipped.header, **old}},
+        {"header": {**shipped.header, **old}, "harm": harm},
+        {"header": {**shipped.header, **old, "list_seed": 8}},
+    ):
+        dataclasses.replace(shipped, **changed).save(file)
+        before = file.read_bytes()
+        renewed = best_harm.restamp(tmp_path)
+        assert renewed == ("harm" not in changed and changed["header"]["list_seed"] == 7)
+        assert renewed or file.read_bytes() == before
+        assert not renewed or BestHarmTable.load(file).content() == shipped.content()
+    same, other_harm, other_worlds = capsys.readouterr().out.splitlines()
+    assert same == f"cooperation-2-five: same bits, physics {physics_digest()}"
+    assert other_harm.endswith("NOT renewed: other harms in worlds: 1 of 400 (total); search the list again")
+    assert other_worlds.endswith("NOT renewed: its worlds are not those of its list")
 
 
 def test_equal_time__compares_with_the_first_team() -> None:

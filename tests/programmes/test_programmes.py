@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.printed import rows
 from tests.programmes import ROOT, Told, __main__ as runner, bugs, hostile, libraries
 
@@ -129,8 +130,11 @@ def test_bug__is_planted_in_the_copy_and_taken_out_again(tmp_path, monkeypatch) 
     bug = bugs.planted()[0]
     file, old, new = bug.patches[0]
     asked: list[tuple[bool, list[str]]] = []
+    digest = "import ethbrake_marl.motion.digest as d; print(d.physics_digest())"
 
     def failing(copy: Path, tests: list[str]) -> str:
+        told = subprocess.run([sys.executable, "-c", digest], cwd=copy, capture_output=True, text=True, check=True)
+        assert told.stdout.strip() == physics_digest()  # or tables and proofs would give the bug away
         asked.append((new in (copy / bugs.PACKAGE / file).read_text("utf-8"), tests))
         return ""
 

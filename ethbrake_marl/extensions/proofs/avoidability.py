@@ -35,6 +35,7 @@ from ethbrake_marl.extensions.proofs.line import (
 )
 from ethbrake_marl.extensions.proofs.plans import braking, time_to_limit, walk
 from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.drive import solo
 from ethbrake_marl.motion.forces import stopping_distances
 from ethbrake_marl.motion.impact import TOUCH_MPS
@@ -49,6 +50,7 @@ REASONS = ("", "early", "front", "rear")
 
 REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, VERDICT = range(7)  # columns of a verdict, and their number
 COVERED = ((3, 2), (2, 1), (2, 2))  # number of vehicles, body of the controlled vehicle
+PROVEN_FOR = "4afc99e9cbbec014"  # digest of the physics; docs/internals/model.md says when to renew it
 
 
 class Avoidability(NamedTuple):
@@ -222,8 +224,9 @@ def avoidability(state: State, body: int = 2) -> Avoidability:
     Vehicle 2 of three and for either of two vehicles; all others brake fully from their latencies on. An overlap of at
     most 1e-12 m in the computed motion is a rounding error, not contact.
 
-    Raises ``InvalidInput`` for any other line, if brakes build up, if the front vehicle may brake only after the
-    controlled vehicle may act, if a vehicle moves backward, or if Vehicle 1 could reach an obstacle before any contact.
+    Raises ``InvalidInput`` under other physics than ``PROVEN_FOR``, for any other line, if brakes build up, if the
+    front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if Vehicle 1
+    could reach an obstacle before any contact.
     """
     _check_covered(state, body)
     out, rows = np.empty((state.n, VERDICT)), rows_of(state, body)
@@ -237,11 +240,16 @@ def avoidability(state: State, body: int = 2) -> Avoidability:
 
 
 def _check_covered(state: State, body: int) -> None:
-    """Raise ``InvalidInput`` for worlds that the theorem does not cover.
+    """Raise ``InvalidInput`` for a physics and worlds that the theorem does not cover.
 
     An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring it there, and a
     push begins with an impact.
     """
+    if physics_digest() != PROVEN_FOR:
+        raise InvalidInput(
+            f"avoidability, lower_bound: proven for other physics ({PROVEN_FOR!r}) than this installation's"
+            f" ({physics_digest()!r}), so nothing is claimed here"
+        )
     if (state.vehicles, body) not in COVERED:
         raise InvalidInput(
             f"avoidability: vehicle_{body} of {state.vehicles} vehicles is controlled, but the proof covers only"

@@ -289,8 +289,8 @@ def lower_bound(
             is larger than with None, but holds only for commands that change at decisions, and takes ten times as long.
             None: commands may change at any time.
 
-    Raises ``InvalidInput`` for lines that ``avoidability`` does not cover, for an unknown count, for a time step below
-    ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.
+    Raises ``InvalidInput`` for a physics or lines that ``avoidability`` does not cover, for an unknown count, for a
+    time step below ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.
 
     """
     reason = avoidability(state, body).reason

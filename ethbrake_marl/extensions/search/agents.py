@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,11 +11,11 @@ import numpy as np
 from ethbrake_marl.agents.drive import MODEL, Agent, Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
-from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.extensions.search.best_harm import commands_of, e_v2x_bm_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of
 from ethbrake_marl.extensions.search.search import refine, search_profiles
-from ethbrake_marl.extensions.search.tables import best_known
+from ethbrake_marl.extensions.search.tables import best_known, outdated_tables
 from ethbrake_marl.motion.layout import BRAKING, Floats
 from ethbrake_marl.names import AgentSettings, make_agent
 from ethbrake_marl.registry import Part
@@ -76,6 +77,12 @@ class BestHarm(Planner):
     def __init__(self, scenario: Scenario, count: str = "first", budget: int = BUDGET, name: str = "best_harm") -> None:
         super().__init__(name, scenario, count)
         self.budget = budget
+
+    def check(self, game: Game, body: int) -> None:
+        """Warn (``Unfamiliar``) where the scenario's table is for other physics, so that every world is searched."""
+        outdated = outdated_tables()
+        if game.name in outdated:
+            warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
         """Look the worlds up; search those that are in no table, or all for another objective than the line's harm."""

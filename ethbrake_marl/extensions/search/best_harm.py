@@ -21,6 +21,7 @@ from ethbrake_marl.extensions.search.extremes import extreme_profiles
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, best_of, problem_of
 from ethbrake_marl.extensions.search.search import compact, search_profiles
 from ethbrake_marl.extensions.search.tables import BestHarmTable
+from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
 
 BUDGET = 100_000  # profiles that are simulated in each world, in each count
@@ -70,6 +71,7 @@ def best_harm(
         found.append(_searched(game, alert, problem.counting(count), starts, objective, effort))
     names = [f"vehicle_{body}" for body in problem.bodies]
     header: dict[str, Any] = {"scenario": game.name, "vehicles": names, "budget": budget, "search_seed": seed}
+    header["physics"] = physics_digest()
     header |= {} if objective == "total" else {"objective": objective}
     best = {count: best_of([(values[count], profiles) for profiles, values in found]) for count in counts}
     harms, kept = {count: harm for count, (harm, _) in best.items()}, {count: one for count, (_, one) in best.items()}
@@ -154,7 +156,8 @@ def search_list(
         problem = problem_of(game, some, bodies)
         given = [] if known is None else [known.stored(problem, count)[1] for count in known.harm]
         given += [driven_profiles(problem, game, some, team) for team in teams]
-        asked = [repr(options).encode(), problem.identity.tobytes(), *(a.tobytes() for each in given for a in each)]
+        asked = [repr(options).encode(), physics_digest().encode(), problem.identity.tobytes()]
+        asked += [array.tobytes() for each in given for array in each]
         file = None if chunks is None else chunks / f"{hashlib.sha256(b''.join(asked)).hexdigest()[:16]}.npz"
         if file is not None and file.exists():
             part = BestHarmTable.load(file)

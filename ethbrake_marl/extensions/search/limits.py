@@ -10,7 +10,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.extensions.search.pricing import problem_of
-from ethbrake_marl.extensions.search.tables import best_known as stored, shipped_tables
+from ethbrake_marl.extensions.search.tables import best_known as stored, outdated_tables, shipped_tables
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 
@@ -30,9 +30,13 @@ def least(game: Game, alert: State) -> dict[str, Floats]:
 
 
 def _where_known(scenario: str) -> str:
-    headers = {table.header["scenario"]: table.header for table in shipped_tables()}
+    headers, outdated = {table.header["scenario"]: table.header for table in shipped_tables()}, outdated_tables()
+    if scenario in outdated:
+        return outdated[scenario]
     if scenario not in headers:
-        return f"shipped tables hold the first worlds of seed 7 of {', '.join(headers)}"
+        return (
+            f"shipped tables hold the first worlds of seed 7 of {', '.join(headers) or 'no scenario in this physics'}"
+        )
     header = headers[scenario]
     return (
         f"a shipped table holds the first {header['episodes']:,} worlds of seed {header['list_seed']} of this scenario"

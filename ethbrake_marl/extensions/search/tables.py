@@ -20,6 +20,7 @@ from ethbrake_marl.errors import CorruptBundle, InvalidInput, describe_error
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, UInt64s, best_of
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
 from ethbrake_marl.files.store import write_file
+from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
 
 FORMAT = 2
@@ -37,7 +38,7 @@ class BestHarmTable:
     identity: UInt64s  # [n] hash of each world (``pricing.identities``)
     harm: Mapping[str, Floats]  # count -> [n] m2/s2, or what else the search has minimised
     profiles: Mapping[str, Profiles]  # count -> profiles with this harm
-    header: Mapping[str, Any]  # how it was made: scenario, vehicles, budget, search_seed, ...
+    header: Mapping[str, Any]  # how it was made: scenario, vehicles, physics (its digest), budget, search_seed, ...
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
@@ -108,15 +109,32 @@ class BestHarmTable:
 
 
 @cache
-def shipped_tables() -> tuple[BestHarmTable, ...]:
-    """Return the shipped tables, in the order of their files' names."""
+def _shipped() -> tuple[BestHarmTable, ...]:
     return tuple(BestHarmTable.load(path) for path in sorted(SHIPPED.glob("*.npz")))
+
+
+def shipped_tables() -> tuple[BestHarmTable, ...]:
+    """Return the shipped tables that are for this installation's physics, in the order of their files' names."""
+    return tuple(table for table in _shipped() if table.header.get("physics") == physics_digest())
+
+
+def outdated_tables() -> dict[str, str]:
+    """Return why the other shipped tables are not used: name of the scenario -> one line."""
+    now = physics_digest()
+    others = {table.header["scenario"]: table.header.get("physics") for table in _shipped()}
+    return {
+        scenario: f"the shipped table of best known harm for {scenario} is not used, because it was made for other"
+        f" physics ({then!r}) than this installation's ({now!r})"
+        for scenario, then in others.items()
+        if then != now
+    }
 
 
 def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
     """Return the least harm of each world in the shipped tables, [n] m2/s2, and its profiles, as ``stored`` does."""
     found = [table.stored(problem, count) for table in shipped_tables()]
-    return best_of([each for each in found if np.isfinite(each[0]).any()] or found[:1])
+    nothing = np.full(problem.n, np.inf), problem.coasting()
+    return best_of([each for each in found if np.isfinite(each[0]).any()] or [nothing])
 
 
 def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:

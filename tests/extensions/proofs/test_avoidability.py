@@ -5,7 +5,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.step import advance_worlds
-from ethbrake_marl.extensions.proofs.avoidability import avoidability
+from ethbrake_marl.extensions.proofs.avoidability import PROVEN_FOR, avoidability
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import COUNT, GAP, LATENCY, SPEED, scratch_for
 from tests.extensions.proofs.worlds import opening, paper_line, play, random_commands, wide_worlds, worlds
 from tests.reference.avoidability_lp import avoidable_by_lp
@@ -206,6 +208,26 @@ def changed(array, row, body, value):
     state = worlds([9, 9], [9, 9, 9], 5, [0, 0.5, 0.8])
     getattr(state, array)[0, row, body] = value
     return state
+
+
+def test_proofs__are_for_this_physics():
+    assert physics_digest() == PROVEN_FOR, (
+        f"the code of motion/ has changed: set PROVEN_FOR (extensions/proofs/avoidability.py) to {physics_digest()!r},"
+        " and keep it only if `pytest --all tests/extensions/proofs` and `make programme NAME=proofs` succeed"
+        " (docs/internals/model.md)"
+    )
+
+
+def test_proofs__claim_nothing_under_another_impact_law(other_law):
+    claims = (
+        f"proven for other physics ('{PROVEN_FOR}') than this installation's ('{other_law}'), so nothing is claimed"
+    )
+    for prove in (avoidability, lower_bound):
+        with refused(claims):
+            prove(paper_line([7, 7], [20, 18, 20], [0, 0.5, 0.8]))
+    for measure in ("avoidable", "proven_harm"):
+        with refused(claims):
+            eb.evaluate("paper-random", "coast", episodes=2, seed=77, measures=measure)
 
 
 REFUSED = {

@@ -7,7 +7,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COLUMN, HARM
+from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.extensions.search.agents import Searched
+from ethbrake_marl.training.experiment import usable
 from tests.refused import refused
 
 PAPER = eb.load_scenario("paper-random")
@@ -96,6 +98,37 @@ def test_limits__are_regret_and_share_of_the_possible_reduction() -> None:
     assert share is not None and share.value == pytest.approx(1.0, abs=1e-9)
     assert rows["full_brake"]["share_of_possible_reduction_first"].value == 0.0
     assert "Regret, first-impact" in eb.summarise(result).to_markdown()
+
+
+OUTDATED = "the shipped table of best known harm for paper-random is not used, because it was made for other physics"
+
+
+def test_best_harm__searches_under_another_impact_law_and_says_so(other_law: str) -> None:
+    with pytest.warns(Unfamiliar, match=f"^best_harm:60: searches every world: {OUTDATED}"):
+        (few,) = eb.evaluate(PAPER, "best_harm:60", episodes=5).columns.values()
+    with pytest.warns(Unfamiliar):
+        (more,) = eb.evaluate(PAPER, "best_harm:600", episodes=5).columns.values()
+    assert more["first_impact_harm"].sum() < few["first_impact_harm"].sum()  # of a table both would be the same
+
+
+@pytest.mark.filterwarnings("error::ethbrake_marl.errors.Unfamiliar")
+def test_best_harm__of_this_physics_does_not_warn() -> None:
+    assert eb.evaluate(PAPER, "best_harm", episodes=2).n == 2
+
+
+def test_limits__under_another_impact_law_are_refused_and_left_out_of_reports(other_law: str) -> None:
+    with refused(NOT_SHIPPED.format("paper-random", OUTDATED)):
+        eb.evaluate(PAPER, "coast", episodes=3, measures="limits")
+    with refused("shipped tables hold the first worlds of seed 7 of no scenario in this physics; elsewhere compare"):
+        eb.evaluate("cooperation-3-pair", "coast", episodes=3, measures="limits")
+    told: list[str] = []
+
+    def measured(name: str) -> object:
+        return eb.evaluate(PAPER, "coast", episodes=3, measures=name)
+
+    left = usable("measures", ("pushed_m", "limits"), measured, lambda progress: told.append(progress.note))
+    (why,) = told
+    assert left == ["pushed_m"] and why.startswith("limits is left out: measures limits: ") and OUTDATED in why
 
 
 def drive(scenario: eb.Scenario, agent: str, **options: object) -> Callable[[], object]:

@@ -88,6 +88,16 @@ def test_best_harm__keeps_for_each_count_the_better_of_both_searches() -> None:
         assert (table.harm[count] <= at_other).all() and (table.harm[count] < at_other - 1.0).any()
 
 
+def test_search_list__continues_only_a_search_in_the_same_physics(tmp_path, request) -> None:
+    def searched() -> int:
+        search_list(GAME, WORLDS, chunks=tmp_path / "chunks", budget=30, threads=1)
+        return len([*(tmp_path / "chunks").iterdir()])
+
+    assert [searched(), searched()] == [1, 1]
+    request.getfixturevalue("other_law")
+    assert searched() == 2
+
+
 def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_be_kept(tmp_path) -> None:
     scenario, game = eb.open_game("paper-random-obstacle")
     alert = scenario.sample(8, seed=7)

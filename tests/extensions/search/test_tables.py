@@ -13,7 +13,8 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.pricing import problem_of
-from ethbrake_marl.extensions.search.tables import BestHarmTable, best_known, shipped_tables
+from ethbrake_marl.extensions.search.tables import BestHarmTable, best_known, outdated_tables, shipped_tables
+from ethbrake_marl.motion.digest import physics_digest
 from tests.refused import refused
 
 SCENARIO, GAME = eb.open_game("paper-random")
@@ -47,6 +48,22 @@ def test_shipped__hold_the_first_worlds_of_their_list_with_the_harm_of_their_pro
         assert problem.values(profiles)[count] == pytest.approx(harm, abs=1e-9)
         known, best = best_known(problem, count)
         assert (known <= harm).all() and problem.values(best)[count] == pytest.approx(known, abs=1e-9)
+
+
+def test_shipped__are_for_this_physics_as_new_ones_are(table: BestHarmTable) -> None:
+    renew = (
+        "after a change of motion/ that keeps the bits: python docs/studies/best_harm.py --restamp (internals/model.md)"
+    )
+    assert outdated_tables() == {} and len(shipped_tables()) == len(MEANS), renew
+    assert table.header["physics"] == physics_digest()
+
+
+def test_shipped__are_not_used_under_another_impact_law(other_law: str) -> None:
+    scenario, game = eb.open_game("paper-random")
+    problem = problem_of(game, scenario.sample(5, seed=7))
+    assert shipped_tables() == () and np.isinf(best_known(problem, "first")[0]).all()
+    assert outdated_tables().keys() == MEANS.keys()
+    assert outdated_tables()["paper-random"].endswith(f"than this installation's ({other_law!r})")
 
 
 def test_best_known__of_no_table_is_infinite_and_coasting() -> None:
