@@ -200,6 +200,10 @@ class Unfamiliar(UserWarning):
     """Warning: a trained policy is used in worlds that differ from the worlds of its training."""
 
 
+class FreeImpacts(UserWarning):
+    """Warning: an objective gives an impact no weight, so that to cause the impact costs nothing."""
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
     """Return the error for an unknown name; its message shows a similar name, or all known names.
 

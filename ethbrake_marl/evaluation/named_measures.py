@@ -16,7 +16,7 @@ import numpy as np
 
 from ethbrake_marl.episode.conduct import drove, push
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
+from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, name_of, objectives_of
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
@@ -111,7 +111,7 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     if not isinstance(names, Iterable):
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'injury,sampled_harm'")
     called: list[tuple[str, Measure]] = []
-    for name in dict.fromkeys(names.split(",") if isinstance(names, str) else names):
+    for name in dict.fromkeys(re.split(",(?!then:)", names) if isinstance(names, str) else names):
         called += [(name, each) for each in _called(name) if each not in [measure for _, measure in called]]
     count = Counter(measure.name for _, measure in called)
     return tuple(_in_full(name, measure) if count[measure.name] > 1 else measure for name, measure in called)
@@ -146,7 +146,7 @@ def _called(name: str) -> list[Measure]:
     file, _, own = str(name).rpartition(":")
     if file.endswith(".py"):
         return [_of_file(file, own)]
-    kind = str(name).partition(":")[0]
+    kind = name_of(str(name))
     if kind in OBJECTIVES:
         meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
         return [Measure(name, partial(_objective, name), meaning, "m2/s2")]
