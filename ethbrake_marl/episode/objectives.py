@@ -12,14 +12,14 @@ mass-weighted       ``N sum_j m_j H_j / sum_j m_j``
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``, one weight per vehicle, 0 or from 1e-6 to 1e6
 preference          as ``weighted``, with the weights ``harm_weight`` that the scenario declares
 injury:curve        expected injuries in 1,000 lines (``episode.injury``), from each pair's harm as if by one impact
-first:A,then:B      ``A + B / 1000`` for two other objectives: nearly their lexicographic order
+first:A,then:B      ``1000 A + B`` for two other objectives: nearly their lexicographic order
 ==================  ================================================================================================
 
 All but ``maximin``, ``injury``, registered ones and a ``first`` with one of these are weighted sums of the vehicles'
 harm.
 
-``first:A,then:B`` breaks ties of A. Its order is the lexicographic one wherever A differs by more than a thousandth of
-what B differs by. An objective without it may leave an impact without any weight (``free_pairs``), and then to cause
+``first:A,then:B`` lets B break ties of A. Two actions are in lexicographic order if A differs by more than a thousandth
+of what B differs by. An objective without it may leave an impact without any weight (``free_pairs``), and then to cause
 this impact costs nothing.
 """
 
@@ -45,7 +45,7 @@ from ethbrake_marl.registry import Registry
 
 Declared = str | Sequence[str]  # one objective for all vehicles, or one for each
 
-SLIGHT = 1e-3  # weight of what ``then`` names in ``first:...,then:...``
+FIRST_WEIGHT = 1000.0  # weight of A in ``first:A,then:B``; B keeps the scale for which recipes are tuned
 
 
 class Harm(NamedTuple):
@@ -258,7 +258,7 @@ def _social(harm: Harm, vehicle: int, own: float, others: float) -> Floats:
 
 
 def _joined(first_and_then: Sequence[Floats]) -> Floats:
-    return first_and_then[0] + SLIGHT * first_and_then[1]
+    return FIRST_WEIGHT * first_and_then[0] + first_and_then[1]
 
 
 def register_objective(name: str, function: Callable[[Harm, int], Floats]) -> None:

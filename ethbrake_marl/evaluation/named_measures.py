@@ -111,7 +111,7 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     if not isinstance(names, Iterable):
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'injury,sampled_harm'")
     called: list[tuple[str, Measure]] = []
-    for name in dict.fromkeys(re.split(",(?!then:)", names) if isinstance(names, str) else names):
+    for name in dict.fromkeys(names.split(",") if isinstance(names, str) else names):
         called += [(name, each) for each in _called(name) if each not in [measure for _, measure in called]]
     count = Counter(measure.name for _, measure in called)
     return tuple(_in_full(name, measure) if count[measure.name] > 1 else measure for name, measure in called)

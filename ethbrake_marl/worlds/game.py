@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -76,21 +77,24 @@ def game_of(
 
 
 def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
-    """Warn of an impact that costs a learner nothing. Python shows the same warning only once."""
+    """Warn of an impact that costs a learner nothing."""
     objectives = objectives_of(declared, scenario.vehicles)
     for body in scenario.learners:
         pairs = free_pairs(objectives[body - 1], body - 1, scenario.vehicles, obstacle=scenario.has_obstacle)
         if pairs:
             text = declared if isinstance(declared, str) else declared[body - 1]
             partner = f"vehicle_{pairs[0] + 1}" if pairs[0] else "the obstacle"
-            warnings.warn(
-                FreeImpacts(
-                    f"objective {text}: an impact between vehicle_{max(pairs[0], 1)} and {partner} has no weight, so"
-                    f" vehicle_{body} may cause it; write first:{text},then:total to let the harm of the whole line"
-                    " decide between actions that are equal otherwise"
-                ),
-                stacklevel=1,
+            _warn_once(
+                f"objective {text}: an impact between vehicle_{max(pairs[0], 1)} and {partner} has no weight, so"
+                f" vehicle_{body} may cause it; write first:{text},then:total to let the harm of the whole line decide"
+                " between actions that are equal otherwise"
             )
+
+
+@cache
+def _warn_once(message: str) -> None:
+    """Warn. A training opens its game several times, and Python forgets what it has shown."""
+    warnings.warn(message, FreeImpacts, stacklevel=2)
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:
