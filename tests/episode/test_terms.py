@@ -241,9 +241,7 @@ def test_objective__that_leaves_an_impact_without_weight_warns_once() -> None:
     assert [str(each.message) for each in seen] == [text]
     with pytest.warns(FreeImpacts, match="objective weighted:0,1,1: an impact between vehicle_1 and the obstacle has"):
         open_game(obstacle.replace(objective="weighted:0,1,1"))
-    with pytest.warns(
-        FreeImpacts, match="vehicle_1: an impact between vehicle_2 and vehicle_3 has no weight"
-    ):
+    with pytest.warns(FreeImpacts, match="vehicle_1: an impact between vehicle_2 and vehicle_3 has no weight"):
         open_game(paper.replace(objective=["own", "vehicle_1", "own"]))
 
 
