@@ -200,6 +200,10 @@ class Unfamiliar(UserWarning):
     """Warning: a trained policy or a table of best known harm is from other worlds or other physics."""
 
 
+class FreeImpacts(UserWarning):
+    """Warning: an objective gives an impact no weight, so that to cause the impact costs nothing."""
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
     """Return the error for an unknown name; its message shows a similar name, or all known names.
 

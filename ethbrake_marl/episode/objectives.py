@@ -5,20 +5,28 @@ With the harm ``H_j`` that vehicle j bears (m2/s2), ``H`` of the whole line, and
 ==================  ================================================================================================
 total               ``H``
 own                 ``H_i``
+vehicle_K           ``H_K``
 social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``: social value orientation, 0 to 90 degrees
 maximin             ``max_j H_j``
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``, one weight per vehicle, 0 or from 1e-6 to 1e6
 preference          as ``weighted``, with the weights ``harm_weight`` that the scenario declares
 injury:curve        expected injuries in 1,000 lines (``episode.injury``), from each pair's harm as if by one impact
+first:A,then:B      ``1000 A + B`` for two other objectives: nearly their lexicographic order
 ==================  ================================================================================================
 
-All but ``maximin``, ``injury`` and registered ones are weighted sums of the vehicles' harm.
+All but ``maximin``, ``injury``, registered ones and a ``first`` with one of these are weighted sums of the vehicles'
+harm.
+
+``first:A,then:B`` lets B break ties of A. Two actions are in lexicographic order if A differs by more than a thousandth
+of what B differs by. An objective without it may leave an impact without any weight (``free_pairs``), and then to cause
+this impact costs nothing.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import lru_cache
@@ -32,10 +40,12 @@ from ethbrake_marl.episode.injury import CURVES, injured_by_harm
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.motion.layout import MASS, WEIGHT, Floats
+from ethbrake_marl.motion.layout import CAR_ROWS, MASS, WEIGHT, Floats
 from ethbrake_marl.registry import Registry
 
 Declared = str | Sequence[str]  # one objective for all vehicles, or one for each
+
+FIRST_WEIGHT = 1000.0  # weight of A in ``first:A,then:B``; B keeps the scale for which recipes are tuned
 
 
 class Harm(NamedTuple):
@@ -69,13 +79,18 @@ class Kind(NamedTuple):
 
     form: str  # how it is written; with ":" it takes an argument
     about: str
-    amount: Callable[[Harm, int, tuple[float, ...], str], Floats]  # (harm, vehicle from 0, numbers, curve) -> [n]
-    weights: Callable[[Floats, int, tuple[float, ...]], Floats] | None = None  # (car, vehicle, numbers) -> [n, N]; sums
+    amount: Callable[[Harm, int, Objective], Floats]  # (harm, vehicle from 0, what is written) -> [n]
+    weights: Callable[[Floats, int, Objective], Floats] | None = None  # of sums: (car, vehicle, written) -> [n, N]
     function: Callable[[Harm, int], Floats] | None = None  # of a registered objective
+
+    @property
+    def name(self) -> str:
+        """Name in the registry."""
+        return self.form.partition(":")[0]
 
     def __reduce__(self) -> tuple[Callable[[str], Kind], tuple[str]]:
         """Pickle the name: functions need not be picklable."""
-        return _kind, (self.form.partition(":")[0],)
+        return _kind, (self.name,)
 
 
 class Objective(NamedTuple):
@@ -84,10 +99,16 @@ class Objective(NamedTuple):
     kind: Kind
     numbers: tuple[float, ...] = ()
     curve: str = ""
+    parts: tuple[Objective, ...] = ()  # of first:...,then:...
+
+    @property
+    def is_sum(self) -> bool:
+        """Whether this is a weighted sum of the vehicles' harm."""
+        return self.kind.weights is not None and all(part.is_sum for part in self.parts)
 
     def amount(self, harm: Harm, vehicle: int) -> Floats:
         """Return what ``vehicle`` (from 0) should minimise, [n]."""
-        return self.kind.amount(harm, vehicle, self.numbers, self.curve)
+        return self.kind.amount(harm, vehicle, self)
 
     def weights(self, car: Floats, vehicle: int) -> Floats:
         """Return the weight of each vehicle's harm, [n, N]. Raises ``InvalidInput`` unless this is a weighted sum."""
@@ -96,7 +117,7 @@ class Objective(NamedTuple):
             raise InvalidInput(
                 f"objective {self.kind.form!r}: is not a weighted sum of the vehicles' harm; use one of {known}"
             )
-        weights = self.kind.weights(car, vehicle, self.numbers)
+        weights = self.kind.weights(car, vehicle, self)
         return np.broadcast_to(weights, (len(car), car.shape[2] - 1)).astype(np.float64)
 
 
@@ -107,8 +128,14 @@ def _kind(name: str) -> Kind:
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
     """Return the objective of a text such as ``own``, ``social:45`` or ``weighted:1,4,1``. Raises ``InvalidInput``."""
-    name, colon, argument = text.partition(":")
+    name, (_, colon, argument) = name_of(text), text.partition(":")
     kind = OBJECTIVES[name]
+    if name == "vehicle_K":
+        if text == name:
+            raise InvalidInput("objective 'vehicle_K': must name a vehicle, as in vehicle_3")
+        return Objective(kind, (float(text.removeprefix("vehicle_")),))
+    if name == "first":
+        return Objective(kind, parts=_first_and_then(text, argument))
     if ":" not in kind.form:
         if colon:
             raise InvalidInput(f"objective {text!r}: {name} takes no argument")
@@ -131,6 +158,21 @@ def parse_objective(text: str) -> Objective:
     return Objective(kind, numbers)
 
 
+def _first_and_then(text: str, argument: str) -> tuple[Objective, ...]:
+    written = argument.split(",then:")
+    if len(written) != 2 or not all(written) or any(name_of(part) == "first" for part in written):
+        raise InvalidInput(
+            f"objective {text!r}: first needs one objective, and then another one, as in first:vehicle_3,then:total;"
+            " neither may contain first"
+        )
+    return tuple(parse_objective(part) for part in written)
+
+
+def name_of(text: str) -> str:
+    """Return the name of a kind of objective in a text: of ``social:45`` ``social``, of ``vehicle_3`` ``vehicle_K``."""
+    return re.sub("vehicle_[1-9][0-9]?", "vehicle_K", text) if ":" not in text else text.partition(":")[0]
+
+
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     """Return the objective of each vehicle, front to rear. Raises ``InvalidInput`` for a bad text or a wrong number."""
     each = [declared] * vehicles if isinstance(declared, str) else declared
@@ -146,10 +188,32 @@ def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
         )
     parsed = tuple(parse_objective(text) for text in each)
     for text, objective in zip(each, parsed, strict=True):
-        if text.startswith("weighted:") and len(objective.numbers) != vehicles:
-            names = len(objective.numbers)
-            raise InvalidInput(f"objective {text!r}: has {names} weights; must have {vehicles}, one per vehicle")
+        for part in objective.parts or (objective,):
+            _check_vehicles(text, part, vehicles)
     return parsed
+
+
+def _check_vehicles(text: str, objective: Objective, vehicles: int) -> None:
+    numbers = objective.numbers
+    if objective.kind.name == "weighted" and len(numbers) != vehicles:
+        raise InvalidInput(f"objective {text!r}: has {len(numbers)} weights; must have {vehicles}, one per vehicle")
+    if objective.kind.name == "vehicle_K" and numbers[0] > vehicles:
+        raise InvalidInput(
+            f"objective {text!r}: there is no vehicle_{numbers[0]:.0f}; this scenario has vehicle_1 ..."
+            f" vehicle_{vehicles}"
+        )
+
+
+def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: bool) -> list[int]:
+    """Return the pairs whose impacts cost ``vehicle`` (from 0) nothing: K for Vehicles K and K + 1, 0 for the obstacle.
+
+    In such a pair no vehicle's harm has a weight. Only weights of 0 that somebody wrote count, in ``weighted`` and
+    ``vehicle_K``; that ``own`` is indifferent to others, and ``social:90`` to the vehicle itself, is what they mean.
+    """
+    if objective.kind.name not in ("weighted", "vehicle_K"):
+        return []
+    counts = np.concatenate([[0.0], objective.weights(np.ones((1, CAR_ROWS, vehicles + 1)), vehicle)[0]]) > 0.0
+    return [pair for pair in range(0 if obstacle else 1, vehicles) if not counts[pair] and not counts[pair + 1]]
 
 
 def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: str) -> Floats:
@@ -164,7 +228,7 @@ def amounts(objectives: Sequence[Objective], before: State | None, after: State,
     earlier = pair_amounts(before.line, count)
     since, then = Harm.of(now - earlier, after.car), Harm.of(earlier, after.car)
     columns = [
-        each.amount(since, i) if each.kind.weights else each.amount(whole, i) - each.amount(then, i)
+        each.amount(since, i) if each.is_sum else each.amount(whole, i) - each.amount(then, i)
         for i, each in enumerate(objectives)
     ]
     return np.stack(columns, axis=1)
@@ -189,16 +253,24 @@ def _own(car: Floats, vehicle: int) -> Floats:
     return np.eye(car.shape[2] - 1)[vehicle]
 
 
+def _social(harm: Harm, vehicle: int, own: float, others: float) -> Floats:
+    return own * harm.borne[:, vehicle] + others * (harm.whole - harm.borne[:, vehicle])
+
+
+def _joined(first_and_then: Sequence[Floats]) -> Floats:
+    return FIRST_WEIGHT * first_and_then[0] + first_and_then[1]
+
+
 def register_objective(name: str, function: Callable[[Harm, int], Floats]) -> None:
-    """Register an objective, which scenarios, rewards and ``--objective`` then know. Entry points: ``objectives``.
+    """Register an objective, which scenarios and rewards then know. Entry points: ``objectives``.
 
     ``function(harm, vehicle)`` returns what ``vehicle`` (from 0) should minimise, [n]; its docstring says what that is.
     Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring.
     """
-    form = "a-z, 0-9, - and _, beginning with a letter or digit"
-    meaning = described("objective", name, function, r"[a-z0-9][a-z0-9_-]{0,63}", form)
+    form = "a-z, 0-9, - and _, beginning with a letter or digit, and no name of a vehicle"
+    meaning = described("objective", name, function, r"(?!vehicle_\d+$)[a-z0-9][a-z0-9_-]{0,63}", form)
 
-    def amount(harm: Harm, vehicle: int, numbers: tuple[float, ...], curve: str) -> Floats:
+    def amount(harm: Harm, vehicle: int, written: Objective) -> Floats:
         what = f"objective {name!r} of vehicle_{vehicle + 1}"
         value = called(what, function, (harm, vehicle), harm.whole.shape)
         if not np.isfinite(value).all():
@@ -215,39 +287,49 @@ OBJECTIVES: Registry[Kind] = Registry(
     register_objective,
     {
         "total": Kind(
-            "total", "harm of all vehicles, with equal weights", lambda harm, i, numbers, curve: harm.whole,
-            lambda car, i, numbers: np.ones(car.shape[2] - 1),
+            "total", "harm of all vehicles, with equal weights", lambda harm, i, written: harm.whole,
+            lambda car, i, written: np.ones(car.shape[2] - 1),
         ),
         "own": Kind(
-            "own", "harm that the vehicle itself bears", lambda harm, i, numbers, curve: harm.borne[:, i],
-            lambda car, i, numbers: _own(car, i),
+            "own", "harm that the vehicle itself bears", lambda harm, i, written: harm.borne[:, i],
+            lambda car, i, written: _own(car, i),
         ),
         "social": Kind(
             "social:ANGLE", "social value orientation: own harm at 0 degrees, harm of the others at 90 degrees",
-            lambda harm, i, n, curve: n[0] * harm.borne[:, i] + n[1] * (harm.whole - harm.borne[:, i]),
-            lambda car, i, numbers: np.where(_own(car, i), *numbers),
+            lambda harm, i, written: _social(harm, i, *written.numbers),
+            lambda car, i, written: np.where(_own(car, i), *written.numbers),
         ),
         "maximin": Kind(
-            "maximin", "harm of the vehicle that bears most", lambda harm, i, numbers, curve: harm.borne.max(axis=1)
+            "maximin", "harm of the vehicle that bears most", lambda harm, i, written: harm.borne.max(axis=1)
         ),
         "mass-weighted": Kind(
             "mass-weighted", "harm of all vehicles, weighted by their masses",
-            lambda harm, i, numbers, curve: harm.weighted(harm.car[:, MASS, 1:]),
-            lambda car, i, numbers: _shares(car[:, MASS, 1:]),
+            lambda harm, i, written: harm.weighted(harm.car[:, MASS, 1:]),
+            lambda car, i, written: _shares(car[:, MASS, 1:]),
         ),
         "weighted": Kind(
             "weighted:W1,W2,...", "harm of all vehicles, with one given weight per vehicle",
-            lambda harm, i, numbers, curve: harm.weighted(np.full(harm.borne.shape, numbers)),
-            lambda car, i, numbers: _shares(np.array([numbers])),
+            lambda harm, i, written: harm.weighted(np.full(harm.borne.shape, written.numbers)),
+            lambda car, i, written: _shares(np.array([written.numbers])),
         ),
         "preference": Kind(
             "preference", "harm of all vehicles, with the weights harm_weight of the scenario",
-            lambda harm, i, numbers, curve: harm.weighted(harm.car[:, WEIGHT, 1:]),
-            lambda car, i, numbers: _shares(car[:, WEIGHT, 1:]),
+            lambda harm, i, written: harm.weighted(harm.car[:, WEIGHT, 1:]),
+            lambda car, i, written: _shares(car[:, WEIGHT, 1:]),
         ),
         "injury": Kind(
             "injury:CURVE", "expected injuries in 1,000 lines, by the impact with the largest risk for each vehicle",
-            lambda harm, i, numbers, curve: injured_by_harm(harm.pairs, harm.car, curve),
+            lambda harm, i, written: injured_by_harm(harm.pairs, harm.car, written.curve),
+        ),
+        "vehicle_K": Kind(
+            "vehicle_K", "harm that Vehicle K bears",
+            lambda harm, i, written: harm.borne[:, int(written.numbers[0]) - 1],
+            lambda car, i, written: _own(car, int(written.numbers[0]) - 1),
+        ),
+        "first": Kind(
+            "first:OBJECTIVE,then:OBJECTIVE", "one objective; another one, a thousand times lighter, breaks its ties",
+            lambda harm, i, written: _joined([part.amount(harm, i) for part in written.parts]),
+            lambda car, i, written: _joined([part.weights(car, i) for part in written.parts]),
         ),
     },
 )  # fmt: skip

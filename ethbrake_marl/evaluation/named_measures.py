@@ -16,7 +16,7 @@ import numpy as np
 
 from ethbrake_marl.episode.conduct import drove, push
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
+from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, name_of, objectives_of
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
@@ -146,7 +146,7 @@ def _called(name: str) -> list[Measure]:
     file, _, own = str(name).rpartition(":")
     if file.endswith(".py"):
         return [_of_file(file, own)]
-    kind = str(name).partition(":")[0]
+    kind = name_of(str(name))
     if kind in OBJECTIVES:
         meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
         return [Measure(name, partial(_objective, name), meaning, "m2/s2")]

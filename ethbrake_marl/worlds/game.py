@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.episode.game import Game, Script
+from ethbrake_marl.episode.objectives import Declared, free_pairs, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.worlds.scenario import Scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
@@ -51,6 +55,8 @@ def game_of(
         observation: features of all vehicles, or vehicle -> features; None: the scenario's.
         reward_vector: components of a vector reward (``episode.terms``).
 
+    Warns (``FreeImpacts``) of a learner's objective in which an impact costs nothing.
+
     """
     if observation is not None:
         now = {name: view.names for name, view in zip(scenario.vehicle_names, views_of(scenario), strict=True)}
@@ -61,11 +67,34 @@ def game_of(
     rewarding, rules = Rewarding.of(
         reward, scenario.objective, scenario.vehicles, bodies, (scenario.time_step_s, scenario.horizon_s), reward_vector
     )
+    if rewarding.params.harm:
+        _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))
     game = Game(Pool(scenario), scenario.name, rules, rewarding, views, bodies, scripts)
     for extension in (scenario.members or (scenario,))[0].v2x.extensions:  # members of a mixture have the same
         game = extension.game(game)
     return scenario, game
+
+
+def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
+    """Warn of an impact that costs a learner nothing."""
+    objectives = objectives_of(declared, scenario.vehicles)
+    for body in scenario.learners:
+        pairs = free_pairs(objectives[body - 1], body - 1, scenario.vehicles, obstacle=scenario.has_obstacle)
+        if pairs:
+            text = declared if isinstance(declared, str) else declared[body - 1]
+            partner = f"vehicle_{pairs[0] + 1}" if pairs[0] else "the obstacle"
+            _warn_once(
+                f"objective {text}: an impact between vehicle_{max(pairs[0], 1)} and {partner} has no weight, so"
+                f" vehicle_{body} may cause it; write first:{text},then:total to let the harm of the whole line decide"
+                " between actions that are equal otherwise"
+            )
+
+
+@cache
+def _warn_once(message: str) -> None:
+    """Warn. A training opens its game several times, and Python forgets what it has shown."""
+    warnings.warn(message, FreeImpacts, stacklevel=2)
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:

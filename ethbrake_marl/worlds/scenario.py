@@ -142,6 +142,7 @@ class Scenario(Part):
     objective: str | Annotated[tuple[str, ...], Field(strict=False)] = Field(
         default="total",
         description="whose harm a reward counts: one objective for all vehicles, or a list with one per vehicle",
+        examples=["own", "weighted:1,4,1", "first:vehicle_3,then:total"],
     )
     observation: Observation | None = Field(
         default=None,

@@ -15,6 +15,7 @@ from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, Witho
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import COUNTED, Step
 from ethbrake_marl.episode.terms import potential, register_term
+from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -225,6 +226,43 @@ def test_objective__without_a_weight_of_harm_has_no_effect_and_warns() -> None:
         _, game = open_game(own, reward="paper")
     assert game.rules.harm == 0.0 and "harm" not in game.rewarding.counted
     open_game(own, reward={"harm": 1.0, "risk": 0.1})
+
+
+def test_objective__that_leaves_an_impact_without_weight_warns_once() -> None:
+    paper, obstacle = load_scenario("paper-random"), load_scenario("paper-random-obstacle")
+    text = (
+        "objective weighted:0,0,1: an impact between vehicle_1 and vehicle_2 has no weight, so vehicle_2 may cause it;"
+        " write first:weighted:0,0,1,then:total to let the harm of the whole line decide between actions that are equal"
+        " otherwise"
+    )
+    with pytest.warns(FreeImpacts) as seen:
+        open_game(paper.replace(objective="weighted:0,0,1"))
+        open_game(paper, reward={"harm": 2.0, "objective": "weighted:0,0,1"})
+    assert [str(each.message) for each in seen] == [text]
+    with pytest.warns(FreeImpacts, match="objective weighted:0,1,1: an impact between vehicle_1 and the obstacle has"):
+        open_game(obstacle.replace(objective="weighted:0,1,1"))
+    with pytest.warns(FreeImpacts, match="vehicle_1: an impact between vehicle_2 and vehicle_3 has no weight"):
+        open_game(paper.replace(objective=["own", "vehicle_1", "own"]))
+
+
+@pytest.mark.parametrize(
+    ("name", "objective"),
+    [
+        ("paper-random", "weighted:1,1,0"),  # harm between Vehicles 2 and 3 counts with the share of Vehicle 2
+        ("paper-random", "weighted:0,1,1"),
+        ("paper-random-obstacle", "weighted:1,0,1"),
+        ("paper-random", "first:weighted:0,0,2,then:total"),
+        ("paper-random", ["vehicle_3", "total", "vehicle_1"]),  # only Vehicle 2 learns
+        ("cooperation-4-all", "own"),
+        ("cooperation-4-all", "social:90"),
+        ("paper-random-preference", "preference"),
+    ],
+    ids=str,
+)
+def test_objective__does_not_warn_where_every_impact_counts_or_an_objective_means_to_be_indifferent(
+    name: str, objective: Any
+) -> None:
+    open_game(load_scenario(name).replace(objective=objective))  # a warning is an error in tests
 
 
 def test_named_rewards__are_those_of_the_page() -> None:

@@ -46,6 +46,7 @@ PARTS: dict[str, Callable[[], object]] = {
         "mine", {"preset": "ruarl"}
     ),
     "objective 'Mine': the name must be 1 to": lambda: eb.register_objective("Mine", gives(0.0)),
+    "objective 'vehicle_2': the name must be 1 to": lambda: eb.register_objective("vehicle_2", gives(0.0)),
     "objective 'mine': must be a function": lambda: eb.register_objective("mine", 3),
     "term 'Mine': the name must be 1 to": lambda: eb.register_term("Mine", gives(0.0)),
     "term 'calm_2': the name must be 1 to": lambda: eb.register_term("calm_2", gives(0.0)),

@@ -272,6 +272,23 @@ REFUSED: dict[str, Callable[[], object]] = {
     "scenario 'paper-random': mass_t[0] (vehicle_1) = -1: must be finite": lambda: PAPER.replace(mass_t=[-1, 2, 3]),
     "scenario 'paper-random': objective = frontfirst: unknown objective": lambda: PAPER.replace(objective="frontfirst"),
     "objective 'maximin:3': maximin takes no argument": lambda: PAPER.replace(objective="maximin:3"),
+    "objective 'own:': own takes no argument": lambda: PAPER.replace(objective="own:"),
+    "objective 'vehicle_4': there is no vehicle_4; this scenario has vehicle_1 ... vehicle_3": lambda: PAPER.replace(
+        objective="vehicle_4"
+    ),
+    "objective 'first:own,then:vehicle_4': there is no vehicle_4;": lambda: PAPER.replace(
+        objective=["own", "own", "first:own,then:vehicle_4"]
+    ),
+    "objective 'first:weighted:1,2,then:own': has 2 weights; must have 3": lambda: PAPER.replace(
+        objective="first:weighted:1,2,then:own"
+    ),
+    "objective 'vehicle_K': must name a vehicle, as in vehicle_3": lambda: PAPER.replace(objective="vehicle_K"),
+    "objective = vehicle_0: unknown objective 'vehicle_0'; did you mean 'vehicle_K'?": lambda: PAPER.replace(
+        objective="vehicle_0"
+    ),
+    "objective = \"first:ownn,then:total\": unknown objective 'ownn'; did you mean 'own'?": lambda: PAPER.replace(
+        objective="first:ownn,then:total"
+    ),
     "roles.vehicle_4: unknown vehicle; this scenario has vehicle_1 ... vehicle_3": lambda: PAPER.with_learners(
         ["vehicle_4"]
     ),
@@ -328,6 +345,19 @@ def test_roles__are_frozen(copied: Scenario) -> None:
 def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: str) -> None:
     with refused(f"agent {spec!r}: must be name or name:argument"):
         check_role(spec)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "first", "first:", "first:own", "first:own,total", "first:own,then:", "first:,then:own",
+        "first:own,then:own,then:own", "first:first:own,then:own,then:own", "first:own,then:first", "then:own",
+    ],
+)  # fmt: skip
+def test_first__needs_two_objectives(text: str) -> None:
+    right = f"objective {text!r}: first needs one objective, and then another one, as in first:vehicle_3,then:total"
+    with refused("unknown objective 'then'" if text == "then:own" else right):
+        PAPER.replace(objective=text)
 
 
 @pytest.mark.parametrize("name", ["My Scenario", "-x", "x" * 65, "../x", "x\n"])

@@ -58,7 +58,9 @@ def test_follow__by_hand() -> None:
     assert values["first"] == pytest.approx([200.0, 400.0]) and values["total"][0] == pytest.approx(200.0)
 
 
-@pytest.mark.parametrize("objective", ["maximin", "mass-weighted", "weighted:1,4,1", "social:30", "own"])
+@pytest.mark.parametrize(
+    "objective", ["maximin", "mass-weighted", "weighted:1,4,1", "social:30", "own", "first:vehicle_3,then:total"]
+)
 @pytest.mark.parametrize("count", ["first", "total"])
 def test_value__is_the_objective_of_the_controlled_vehicle(objective: str, count: str) -> None:
     problem, _, last = driven("paper-random-obstacle", objective=objective, count=count)
@@ -121,6 +123,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "vehicles []: must be one or more of 1 to 3, each once": of([]),
     "vehicles [2, 2]: must be one or more of 1 to 3, each once": of([2, 2]),
     "objective 'injury:CURVE': is not a weighted sum": of(None, objective="injury:lr4s"),
+    "objective 'maximin': is not a weighted sum": of(None, objective="first:own,then:maximin"),
     "objective 'own': the 2 controlled vehicles have different objectives": of(None, "cooperation-3-pair", "own"),
 }
 

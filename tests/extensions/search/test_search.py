@@ -47,6 +47,17 @@ def test_search__golden(name: str, objective: str, count: str, harm: list[float]
     assert profiles.ends.shape[1] == 12
 
 
+def test_search__of_one_vehicle_first_then_the_line_spares_both() -> None:
+    harm, line = {}, {}
+    for objective in ("vehicle_3", "first:vehicle_3,then:total"):
+        problem = problem_of(GAME, WORLDS, objective=objective)
+        last = problem.follow(search_profiles(problem, grid(problem), budget=1000)[0])
+        harm[objective], line[objective] = last.borne_harm()[:, 2], last.harm()
+    assert not harm["first:vehicle_3,then:total"].any() and not harm["vehicle_3"].any()
+    hit = line["vehicle_3"] > 0.0
+    assert hit.sum() == 3 and (line["first:vehicle_3,then:total"][hit] < 0.8 * line["vehicle_3"][hit]).all()
+
+
 def test_search__depends_on_the_seed_and_on_no_other_world_or_thread_and_is_never_worse_than_what_it_is_given() -> None:
     profiles, values = search_profiles(PROBLEM, grid(PROBLEM), budget=500)
     few = PROBLEM.take([5, 1])
