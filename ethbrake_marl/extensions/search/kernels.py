@@ -151,7 +151,7 @@ def allowed(command, low, high):
 
 @large
 def draw_command(world, b):
-    """Return a random command (m/s2) of vehicle b, often full braking, full driving, coasting or a neighbour's."""
+    """Return a random command (m/s2) of vehicle b, often full braking or driving, coasting, or the command ahead."""
     random, body, low, high = world.random, world.bodies[b], world.bounds[b, 0], world.bounds[b, 1]
     u = draw(random)
     if u < 0.35:
