@@ -60,7 +60,8 @@ POLICY = Part(
     make_trained, form="policy@PATH", about="the policy of a run or bundle, trained by any algorithm", knows=MESSAGES
 )
 TEAM = Part(make_trained, form="team@RUN", about="the learners of a run, each with its policy", knows=MESSAGES)
-UNIVERSAL = _shipped("universal", "every scenario")
+UNIVERSAL = _shipped("universal", "paper-random, without driving and with an obstacle, honest cost")
+UNIVERSAL_PAPER = _shipped("universal-paper", "every scenario, total harm: it pushes")
 PPO_OBSTACLE = _shipped("ppo-obstacle", "paper-random-obstacle, first-impact harm")
 ROLLOUT_OBSTACLE = _shipped("rollout-obstacle", "paper-random-obstacle, total harm")
 VINE_PREFERENCE = _shipped("vine-preference", "paper-random-preference")

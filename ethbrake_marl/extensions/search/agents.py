@@ -26,7 +26,8 @@ from ethbrake_marl.worlds.scenario import Scenario
 BUDGET = 20_000  # profiles that best_harm simulates in a world that is in no table
 CANDIDATES = 500  # plans that +search simulates
 MOST_CANDIDATES = 1_000_000
-START = "universal"  # policy whose episode a search also starts from
+START = {"honest": "universal"}  # count -> policy whose episode a search also starts from,
+OTHER_START = "universal-paper"  # and that of every other count
 ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
 
 
@@ -71,7 +72,7 @@ class BestHarm(Planner):
     """Drives the best profile that is known: of a shipped table, or of a search.
 
     A search begins with E-V2X-BM. If this vehicle is the only learner, the result is improved once more, or the
-    episode of the policy ``universal`` where that is better; so it does never more harm than either.
+    episode of a shipped policy where that is better; so it does never more harm than either.
     """
 
     def __init__(self, scenario: Scenario, count: str = "first", budget: int = BUDGET, name: str = "best_harm") -> None:
@@ -102,12 +103,13 @@ class BestHarm(Planner):
         best = profiles.stepwise(steps)[:, :, 0]
         if self.scenario.learners != (body,):
             return best, values[self.count]
-        policy = make_agent(START, scenario=self.scenario)
+        start = START.get(self.count, OTHER_START)
+        policy = make_agent(start, scenario=self.scenario)
         assert not isinstance(policy, Team)
-        theirs = commands_of(problem, game, alert, Team(START, {body: policy}))[:, :, 0]
+        theirs = commands_of(problem, game, alert, Team(start, {body: policy}))[:, :, 0]
         better = refine(problem, theirs, budget=1)[1] < values[self.count]
-        start = np.where(better[:, np.newaxis], theirs, best[:, : theirs.shape[1]])
-        best[:, : theirs.shape[1]], harm = refine(problem, start, budget=self.budget)
+        first = np.where(better[:, np.newaxis], theirs, best[:, : theirs.shape[1]])
+        best[:, : theirs.shape[1]], harm = refine(problem, first, budget=self.budget)
         return best, harm
 
 

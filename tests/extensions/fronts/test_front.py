@@ -18,7 +18,7 @@ from tests.evaluation.lines import recorded
 PAPER = eb.load_scenario("paper-random")
 WORLDS = PAPER.sample(20, 7)
 WEIGHTS = np.concatenate([weight_grid(3, 1), np.ones((1, 3)), corners(3)])
-AGENTS = ["e_v2x_bm", "universal", "vine-preference"]
+AGENTS = ["e_v2x_bm", "universal-paper", "vine-preference"]
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +46,7 @@ def test_means__are_those_of_the_first_edition(front: Front) -> None:
     assert front.borne["first"].mean(axis=1)[2].tolist() == pytest.approx(
         [2.686024127617057, 4.486538841192565, 2.133704246149551], abs=5e-3
     )
-    assert front.agents["universal"]["first"].mean() == pytest.approx(2.266979929556572, abs=1e-12)
+    assert front.agents["universal-paper"]["first"].mean() == pytest.approx(2.266979929556572, abs=1e-12)
 
 
 def test_point__is_never_beaten_under_its_weights_by_another_point_a_constant_or_an_agent(front: Front) -> None:
@@ -63,7 +63,7 @@ def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None
     obstacle, row = eb.load_scenario("paper-random-obstacle"), np.array([0.2, 0.8, 0.0])
     found = search_front(obstacle, obstacle.sample(20, 777), [row], budget=30, count="total")
     scenario, game = eb.open_game(obstacle.replace(harm_weight=row.tolist(), objective="preference"))
-    for name in ("universal", "rollout-obstacle"):
+    for name in ("universal", "universal-paper", "rollout-obstacle"):
         last = drive(game, scenario.sample(20, 777), Team(name, {2: eb.make_agent(name)}))
         assert (found.amounts[0] <= weighted(last.borne_harm("total"), row)).all()
 
@@ -80,7 +80,7 @@ def test_agents__beside_the_front_bear_what_an_evaluation_says(spec: str, front:
 def test_agents__that_do_not_observe_the_weights_drive_once() -> None:
     teams = {spec: Team(spec, {2: eb.make_agent(spec, scenario=PAPER)}) for spec in AGENTS}
     assert {spec: observes_weights(team) for spec, team in teams.items()} == {
-        "e_v2x_bm": True, "universal": False, "vine-preference": True,
+        "e_v2x_bm": True, "universal-paper": False, "vine-preference": True,
     }  # fmt: skip
 
 

@@ -85,7 +85,7 @@ def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -
 
 
 def test_policies_inside_a_policy__keep_their_own_weights() -> None:
-    universal = load_shipped("universal")
+    universal = load_shipped("universal-paper")
     members = members_of(universal)
     assert len(members) == 11
     for m, member in enumerate(members, 1):

@@ -33,10 +33,11 @@ def test_planners__golden(name: str, agent: str, episodes: int, count: str, firs
 
 
 @pytest.mark.parametrize("count", COLUMN)
-def test_best_harm__of_no_table_is_never_worse_than_universal_or_e_v2x_bm(count: str) -> None:
-    result = eb.evaluate("paper-random", "universal,e_v2x_bm,best_harm:200", episodes=12, seed=5, harm_count=count)
-    best, universal, constant = (result[name][COLUMN[count]] for name in ("best_harm:200", "universal", "e_v2x_bm"))
-    assert (best <= universal).all() and (best < universal - 0.01).any()
+def test_best_harm__of_no_table_is_never_worse_than_its_start_or_e_v2x_bm(count: str) -> None:
+    start = "universal" if count == "honest" else "universal-paper"
+    result = eb.evaluate("paper-random", f"{start},e_v2x_bm,best_harm:200", episodes=12, seed=5, harm_count=count)
+    best, policy, constant = (result[name][COLUMN[count]] for name in ("best_harm:200", start, "e_v2x_bm"))
+    assert (best <= policy).all() and (best < policy - 0.01).any()
     assert (best <= constant + 1e-9).all()
     assert result["best_harm:200"]["predicted_harm"].tolist() == best.tolist()
 
@@ -80,14 +81,14 @@ def test_planners__minimise_the_objective_of_the_scenario_also_in_worlds_of_a_ta
 
 def test_planners__spare_one_vehicle_first_and_then_the_line() -> None:
     first = PAPER.replace(objective="first:vehicle_3,then:total")
-    result = eb.evaluate(first, "best_harm:200,full_brake,full_brake+search,e_v2x_bm,universal", episodes=10)
+    result = eb.evaluate(first, "best_harm:200,full_brake,full_brake+search,e_v2x_bm,universal-paper", episodes=10)
     goal = {
         agent: 1000.0 * result[agent]["first_impact_harm_3"] + result[agent]["first_impact_harm"] for agent in result
     }
     for agent in ("best_harm:200", "full_brake+search"):
         assert result[agent]["predicted_harm"] == pytest.approx(goal[agent], rel=1e-9)
         assert result[agent]["first_impact_harm"].mean() < result["full_brake"]["first_impact_harm"].mean()
-    assert (goal["best_harm:200"] <= goal["universal"] + 1e-9).all()
+    assert (goal["best_harm:200"] <= goal["universal-paper"] + 1e-9).all()
     assert (goal["best_harm:200"] <= goal["e_v2x_bm"] + 1e-9).all()
 
 
