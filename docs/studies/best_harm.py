@@ -48,7 +48,11 @@ def main(words: list[str]) -> None:
     add("--scenario", default="paper-random")
     add("--episodes", type=int, default=10_000, help="worlds of the list")
     add("--seed", type=int, default=7, help="seed of the list")
-    add("--harm-count", choices=[*COUNTS], help="count to minimise; default: both harms")
+    add(
+        "--harm-count",
+        choices=[*COUNTS],
+        help="count to minimise; default: both harms. Other counts of --start stay as they are",
+    )
     add("--vehicles", metavar="A,B,...", help="vehicles to control together; default: the learners")
     add("--budget", type=int, default=100_000, help="candidate profiles per world and count")
     add("--search-seed", type=int, default=0)
@@ -98,7 +102,11 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
     )  # fmt: skip
     header = {**table.header, "episodes": given.episodes, "list_seed": given.seed, "command": command}
     header |= {} if known is None else {"after": known.header}
-    return BestHarmTable(table.identity, table.harm, table.profiles, header)
+    harm, profiles = dict(table.harm), dict(table.profiles)
+    for count in known.harm if known is not None else ():
+        if count not in harm:  # stays as it was
+            harm[count], profiles[count] = known.stored(problem_of(game, alert), count)
+    return BestHarmTable(table.identity, harm, profiles, header)
 
 
 def worlds_of(table: BestHarmTable) -> tuple[Scenario, Game, State]:

@@ -174,7 +174,7 @@ def draw_profile(world, drawing, ends, commands):
     """
     random, bounds, last = world.random, world.bounds, int(world.clock[LAST])
     if drawing[KIND] == PLAN:
-        low, high = bounds[0, 0], bounds[0, 1]
+        low = bounds[0, 0]
         first = draw_below(random, drawing[ATTENTION])
         ends[0], ends[1], ends[2] = first, first + 1 + draw_below(random, drawing[LONGEST_WHILE]), last
         commands[1, 0], commands[2, 0] = draw_command(world, 0), low

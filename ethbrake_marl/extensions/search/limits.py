@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, count_of
@@ -16,10 +16,14 @@ from ethbrake_marl.registry import Part
 
 
 def least(game: Game, alert: State) -> dict[str, Floats]:
-    """Return the least harm known, count -> [n] m2/s2. Raises ``InvalidInput`` if a world is in no shipped table."""
+    """Return the least known of each count, count -> [n] m2/s2; counts beside harm only if it is known in all worlds.
+
+    Raises ``InvalidInput`` if the least harm of a world is in no shipped table.
+    """
     problem = problem_of(game, alert)
-    known = {count: stored(problem, count)[0] for count in HARM}
-    missing = int(np.isinf(list(known.values())).any(axis=0).sum())
+    known = {count: stored(problem, count)[0] for count in COUNTS}
+    known = {count: each for count, each in known.items() if count in HARM or np.isfinite(each).all()}
+    missing = int(np.isinf([known[count] for count in HARM]).any(axis=0).sum())
     if missing:
         raise InvalidInput(
             f"measures limits: scenario {game.name!r}: the least harm of {missing:,} of these"
@@ -45,12 +49,16 @@ def _where_known(scenario: str) -> str:
 
 
 def best_known(game: Game, alert: State, last: State) -> Given:
-    """Least harm known in the same world: of a search that knows the whole world, or of an agent."""
+    """Least harm (honest: least honest cost) known in the same world: of a search that knows the whole world, or of an
+    agent.
+    """
     return least(game, alert)
 
 
 def regret(game: Game, alert: State, last: State) -> Given:
-    """Harm minus the least harm known in the same world. Below 0: the agent did even less."""
+    """Harm minus the least harm known in the same world; honest: the same of the honest cost. Below 0: the agent did
+    even less.
+    """
     return {count: last.harm(count) - harm for count, harm in least(game, alert).items()}
 
 
