@@ -125,7 +125,7 @@ def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(compare
     assert one.get_xydata() == pytest.approx(np.array([[gap[0], harm[0]]]))
     honest = compared_by("paper-random", "full_brake,coast", 1, "honest").result
     *_, cost = harm_against_total_gap(honest).axes
-    assert cost.get_title() == "Honest cost (m²/s²)"
+    assert cost.get_title(loc="left") == "Honest cost (m²/s²)"
     assert cost.lines[1].get_ydata() == pytest.approx(honest["coast"]["honest_cost"])
 
 
