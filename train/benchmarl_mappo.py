@@ -1,7 +1,7 @@
 """BenchMARL's MAPPO on a level of cooperation. Needs the extra `marl` (`.venv/bin/pip install '.[marl]'`).
 
     python train/benchmarl_mappo.py --scenario cooperation-3-pair --steps 200000 --output runs/mappo
-    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@runs/mappo
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,team@runs/mappo --set rules=honest
 
 `ethbrake train --set scheme=centralised` trains the same kind of team (one shared actor, a critic on the state of the
 line) without the extra, and with checkpoints and evaluations. This file is for users of BenchMARL.
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.policies.network import NetworkSpec
@@ -26,8 +27,10 @@ from ethbrake_marl.training.recipe import PpoRecipe
 from ethbrake_marl.training.training import Training
 
 
-def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> None:
+def train(scenario: str, recipe: str, steps: int, seed: int, output: Path, harm_count: str | None = None) -> None:
     """Train MAPPO with the hyperparameters of a PPO recipe, and save the shared actor as `output`/policy.
+
+    `harm_count` is what the reward counts; None: as in the recipe.
 
     The learning rate keeps its initial value, because BenchMARL has no schedule. There are no checkpoints and no
     evaluations during the training. Raises `InvalidInput` if the recipe is not for PPO or nobody learns, `MissingExtra`
@@ -36,6 +39,8 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path) -> No
     plan = eb.load_recipe(recipe)
     if not isinstance(plan, PpoRecipe):
         raise InvalidInput(f"recipe {plan.name!r}: is for {plan.algorithm.upper()}; MAPPO needs one for PPO")
+    if harm_count is not None:
+        plan = plan.replace(reward={**plan.reward.model_dump(mode="json"), "harm_count": harm_count})
     training = Training.of(plan, scenario, total_steps=steps, seed=seed, scheme="centralised")
     with naming_extras():
         import benchmarl  # noqa: F401  # only here: an extra
@@ -129,10 +134,11 @@ if __name__ == "__main__":
     parser.add_argument("--recipe", default="cooperation-ppo", help="a shipped PPO recipe, or a YAML file")
     parser.add_argument("--steps", type=int, default=200_000, help="decisions of all learners together")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--harm-count", choices=COUNTS, help="what the reward counts (default: as in the recipe)")
     parser.add_argument("--output", type=Path, default=Path("runs/mappo"), help="new folder")
     given = parser.parse_args()
     try:
-        train(given.scenario, given.recipe, given.steps, given.seed, given.output)
+        train(given.scenario, given.recipe, given.steps, given.seed, given.output, given.harm_count)
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
     print(f"trained: ethbrake evaluate --scenario {given.scenario} --agents full_brake,team@{given.output}")

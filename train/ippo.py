@@ -1,7 +1,7 @@
 """Independent PPO (IPPO) for several learners, in PettingZoo and torch. Read it from top to bottom.
 
     python train/ippo.py --scenario cooperation-3-pair --output runs/ippo
-    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/ippo
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/ippo --set rules=honest
 
 Each learner has its own actor, critic and optimiser, and the other learners are part of its environment. All learners
 learn at the same time, from the same episodes. In `train/mappo.py` one critic observes the whole line instead. Letters:
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import IN_WORDS
 from ethbrake_marl.errors import EthBrakeError, check_whole_number
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.training.own_team import save_team
@@ -36,7 +37,9 @@ class Settings:
     steps: int = 1_500_000  # decisions of all learners together
     seed: int = 0
     output: Path = Path("runs/ippo")  # a new folder
-    harm_count: str = "first"  # what the reward counts: "first" impacts, "total" harm or "honest" cost
+    harm_count: str = (
+        "honest"  # what the reward counts: "honest" cost, "first" impacts (the paper) or "total" harm
+    )
     copies: int = 64  # parallel copies of the environment
     rollout: int = 64  # time steps of each copy between two updates
     epochs: int = 4
@@ -100,11 +103,11 @@ class Copies:
         numbers = range(settings.seed * settings.copies, (settings.seed + 1) * settings.copies)
         self.envs = [eb.parallel_env(settings.scenario, agents="learners", reward=reward) for _ in numbers]
         self.seen = [env.reset(seed=k)[0] for k, env in zip(numbers, self.envs, strict=True)]
-        self.harm = "world_first_impact_harm" if settings.harm_count == "first" else "world_total_harm"
+        self.costs = np.zeros(settings.copies)  # what the reward has counted of each running episode, m2/s2
 
     @torch.no_grad()
     def collect(self, learners: dict[str, Learner], settings: Settings) -> tuple[dict[str, Rollout], list[float]]:
-        """Return a rollout per learner, and the harm of each episode that ended."""
+        """Return a rollout per learner, and what the reward counted of each episode that ended."""
         rollouts = {name: Rollout(self.seen[0][name].size, settings) for name in learners}
         harms: list[float] = []
         for t in range(settings.rollout):
@@ -116,7 +119,10 @@ class Copies:
             for name, own in rollouts.items():
                 own.rewards[t] = torch.tensor([rewards[name] for _, rewards, *_ in after])
                 own.ended[t] = torch.tensor([not env.agents for env in self.envs])
-            harms += [each[4][name][self.harm] for env, each in zip(self.envs, after, strict=True) if not env.agents]
+            self.costs += [each[4][name]["cost"] for each in after]
+            over = np.array([not env.agents for env in self.envs])
+            harms += self.costs[over].tolist()
+            self.costs[over] = 0.0
             self.seen = [each[0] if env.agents else env.reset()[0] for env, each in zip(self.envs, after, strict=True)]
         for name, own in rollouts.items():
             own.seen[-1] = self.observations(name)
@@ -177,7 +183,8 @@ def train(settings: Settings, folder: Path) -> None:
             learner.optimiser.param_groups[0]["lr"] = settings.learning_rate * (1.0 - k / updates)
             update(learner, rollouts[name], settings)
         if harms:
-            print(f"{(k + 1) * decisions:,} decisions: mean harm of an episode {np.mean(harms):.2f}", flush=True)
+            what = IN_WORDS[settings.harm_count]
+            print(f"{(k + 1) * decisions:,} decisions: mean {what} of an episode {np.mean(harms):.2f}", flush=True)
     save_team(folder, learners, copies.envs[0], seed=settings.seed, steps=updates * decisions)
 
 
@@ -195,4 +202,5 @@ if __name__ == "__main__":
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
     agents = quote(f"full_brake,e_v2x_bm,team@{settings.output}")
-    print(f"ethbrake evaluate --scenario {quote(settings.scenario)} --agents {agents}")
+    count = f"--set harm_count={settings.harm_count}"
+    print(f"ethbrake evaluate --scenario {quote(settings.scenario)} --agents {agents} {count}")

@@ -1,7 +1,7 @@
 """Multi-agent PPO (MAPPO) for several learners, in PettingZoo and torch. Read it from top to bottom.
 
     python train/mappo.py --scenario cooperation-3-pair --output runs/mappo
-    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/mappo
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,e_v2x_bm,team@runs/mappo --set rules=honest
 
 Each learner has its own actor, which observes what its vehicle knows. One critic observes the full state of the line,
 `state()`, and predicts the return of each learner; it is used only in training. Everything else is as in
@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.distributions import Normal
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import IN_WORDS
 from ethbrake_marl.errors import EthBrakeError, check_whole_number
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.training.own_team import save_team
@@ -36,7 +37,9 @@ class Settings:
     steps: int = 1_000_000  # decisions of all learners together
     seed: int = 0
     output: Path = Path("runs/mappo")  # a new folder
-    harm_count: str = "first"  # what the reward counts: "first" impacts, "total" harm or "honest" cost
+    harm_count: str = (
+        "honest"  # what the reward counts: "honest" cost, "first" impacts (the paper) or "total" harm
+    )
     copies: int = 64  # parallel copies of the environment
     rollout: int = 64  # time steps of each copy between two updates
     epochs: int = 4
@@ -96,11 +99,11 @@ class Copies:
         numbers = range(settings.seed * settings.copies, (settings.seed + 1) * settings.copies)
         self.envs = [eb.parallel_env(settings.scenario, agents="learners", reward=reward) for _ in numbers]
         self.seen = [env.reset(seed=k)[0] for k, env in zip(numbers, self.envs, strict=True)]
-        self.harm = "world_first_impact_harm" if settings.harm_count == "first" else "world_total_harm"
+        self.costs = np.zeros(settings.copies)  # what the reward has counted of each running episode, m2/s2
 
     @torch.no_grad()
     def collect(self, actors: dict[str, Actor], steps: int) -> tuple[Rollout, list[float]]:
-        """Return a rollout, and the harm of each episode that ended."""
+        """Return a rollout, and what the reward counted of each episode that ended."""
         seen: dict[str, list[Tensor]] = {name: [] for name in actors}
         states, actions, rewards, ended, harms = [self.states()], [], [], [], []
         for _ in range(steps):
@@ -111,7 +114,10 @@ class Copies:
             after = [env.step(each) for env, each in zip(self.envs, clipped, strict=True)]
             rewards.append(torch.tensor([list(each.values()) for _, each, *_ in after]))
             ended.append(torch.tensor([[float(not env.agents)] for env in self.envs]))
-            harms += [each[4][name][self.harm] for env, each in zip(self.envs, after, strict=True) if not env.agents]
+            self.costs += [each[4][name]["cost"] for each in after]
+            over = np.array([not env.agents for env in self.envs])
+            harms += self.costs[over].tolist()
+            self.costs[over] = 0.0
             self.seen = [each[0] if env.agents else env.reset()[0] for env, each in zip(self.envs, after, strict=True)]
             states.append(self.states())
         stacked = {name: torch.stack(rows) for name, rows in seen.items()}
@@ -181,7 +187,8 @@ def train(settings: Settings, folder: Path) -> None:
         team.optimiser.param_groups[0]["lr"] = settings.learning_rate * (1.0 - k / updates)
         team.update(rollout, settings)
         if harms:
-            print(f"{(k + 1) * decisions:,} decisions: mean harm of an episode {np.mean(harms):.2f}", flush=True)
+            what = IN_WORDS[settings.harm_count]
+            print(f"{(k + 1) * decisions:,} decisions: mean {what} of an episode {np.mean(harms):.2f}", flush=True)
     save_team(folder, team.actors, copies.envs[0], seed=settings.seed, steps=updates * decisions)
 
 
@@ -199,4 +206,5 @@ if __name__ == "__main__":
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
     agents = quote(f"full_brake,e_v2x_bm,team@{settings.output}")
-    print(f"ethbrake evaluate --scenario {quote(settings.scenario)} --agents {agents}")
+    count = f"--set harm_count={settings.harm_count}"
+    print(f"ethbrake evaluate --scenario {quote(settings.scenario)} --agents {agents} {count}")

@@ -1,14 +1,14 @@
 """A policy with a memory (GRU), shared by all learners, for late and lost messages. Read it from top to bottom.
 
     ethbrake scenario new lossy --based-on cooperation-3-pair     # then: v2x: {preset: blocked, persistence: periodic}
-    python train/recurrent.py --scenario lossy.yaml --output runs/gru
-    ethbrake evaluate --scenario lossy.yaml --agents full_brake,train/recurrent.py:make_agent:runs/gru
+    python train/recurrent.py --scenario lossy.yaml --output gru
+    ethbrake evaluate --scenario lossy.yaml --agents full_brake,train/recurrent.py:make_agent:gru --set rules=honest
 
 Information about other vehicles grows old between two messages. A memory can use earlier observations, too. The
 training is a plain policy gradient on whole episodes, on arrays of all learners (docs/environments.md).
 ``--memoryless`` trains the same policy without a memory, for comparison. In these trainings the memory did not help, so
-the ages of the messages seem to be enough. First-impact harm on 2,000 worlds of
-seed 7 (one thread, AMD EPYC, 2026-11-24):
+the ages of the messages seem to be enough. First-impact harm after ``--harm-count first``, on 2,000 worlds of seed 7
+(one thread, AMD EPYC, 2026-11-24):
 
     agent                                              with memory     without memory
     after ``--updates 500``                            23.32           22.66
@@ -29,6 +29,7 @@ from safetensors.numpy import save_file
 from torch import Tensor, nn
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
 from ethbrake_marl.files.store import new_folder
 
 # 1. Default observation, if the scenario has none: also the age of the news, and the vehicle's place in the line.
@@ -57,9 +58,9 @@ class Recurrent(nn.Module):
 
 
 def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespace) -> Recurrent:
-    """Return the trained network. Print its harm every ten updates."""
+    """Return the trained network. Print what the reward counts every ten updates."""
     torch.manual_seed(args.seed)
-    _, game = eb.open_game(scenario, observation=observation)
+    _, game = eb.open_game(scenario, observation=observation, reward={"harm_count": args.harm_count})
     learners = game.rules.learners
     n, shape = args.worlds, (args.worlds, len(learners))
     network = Recurrent(len(eb.View(observation).names), not args.memoryless)
@@ -85,7 +86,8 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
         nn.utils.clip_grad_norm_(network.parameters(), 0.5)
         optimiser.step()
         if update % 10 == 9:
-            print(f"update {update + 1}: harm {state.harm('first').mean():.2f} m2/s2", flush=True)
+            mean = state.harm(args.harm_count).mean()
+            print(f"update {update + 1}: {IN_WORDS[args.harm_count]} {mean:.2f} m2/s2", flush=True)
     return network
 
 
@@ -122,6 +124,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=200)
     parser.add_argument("--worlds", type=int, default=256)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--harm-count", choices=COUNTS, default="honest", help="what the reward counts")
     parser.add_argument("--memoryless", action="store_true")
     args = parser.parse_args()
     scenario = eb.load_scenario(args.scenario)

@@ -1,7 +1,7 @@
 """Several learners share one policy: PettingZoo, SuperSuit and Stable-Baselines3's PPO. Read it from top to bottom.
 
     python train/supersuit_ppo.py --scenario cooperation-3-pair --steps 200000 --output runs/supersuit
-    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,ppo@runs/supersuit
+    ethbrake evaluate --scenario cooperation-3-pair --agents full_brake,ppo@runs/supersuit --set rules=honest
 
 `ethbrake train --set scheme=shared` trains the same policy many times faster, and can resume after a crash. This file
 is for programs that use PettingZoo. SuperSuit 3.11 has four pitfalls; comments with the word "trap" say how each is
@@ -22,6 +22,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.policies.network import NetworkSpec
@@ -31,7 +32,13 @@ from ethbrake_marl.training.training import Training
 
 # 1. What to train: as in train/ppo.yaml, with smaller networks.
 
-REWARD = {"harm": 0.05, "terminal": 0.02, "shaping": 0.05, "shaping_discount": 0.995}
+REWARD: dict[str, Any] = {
+    "harm": 0.05,
+    "harm_count": "honest",
+    "terminal": 0.02,
+    "shaping": 0.05,
+    "shaping_discount": 0.995,
+}
 HIDDEN = [64, 64]
 COPIES, STEPS_PER_ROLLOUT = 32, 64  # parallel worlds; decisions of each learner between two updates
 
@@ -112,10 +119,10 @@ class SeededAndTruncated(VecEnvWrapper):
         return [getattr(self.venv, attr_name)] * self.num_envs
 
 
-def make_worlds(scenario: eb.Scenario) -> SeededAndTruncated:
+def make_worlds(scenario: eb.Scenario, reward: dict[str, Any] = REWARD) -> SeededAndTruncated:
     """Return `COPIES` worlds of a scenario as rows for Stable-Baselines3: row k * L + l is learner l of L in copy k."""
     names = [scenario.vehicle_names[body - 1] for body in scenario.learners]
-    learners = LearnersOnly(eb.parallel_env(scenario=scenario, reward=REWARD), names)
+    learners = LearnersOnly(eb.parallel_env(scenario=scenario, reward=reward), names)
     rows = supersuit.pettingzoo_env_to_vec_env_v1(learners)
     # num_cpus=0: all copies in this process (trap: with more processes, SuperSuit uses seeds twice).
     copies = supersuit.concat_vec_envs_v1(rows, COPIES, num_cpus=0, base_class="stable_baselines3")
@@ -125,7 +132,7 @@ def make_worlds(scenario: eb.Scenario) -> SeededAndTruncated:
 # 4. Training. The policy is saved as a bundle, which `ethbrake evaluate` loads as ppo@FOLDER.
 
 
-def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
+def train(scenario: eb.Scenario, steps: int, seed: int, output: Path, reward: dict[str, Any] = REWARD) -> None:
     """Train PPO for `steps` decisions of all learners together, and save its policy as `output`/policy.
 
     Raises `InvalidInput` for wrong steps or seeds and for a scenario without a learner, `AlreadyExists` if `output`
@@ -133,13 +140,13 @@ def train(scenario: eb.Scenario, steps: int, seed: int, output: Path) -> None:
     """
     Training.of("ppo", scenario, total_steps=steps, seed=seed)
     with new_folder(output) as folder:
-        learn(scenario, steps, seed).save(folder / "policy")
+        learn(scenario, steps, seed, reward).save(folder / "policy")
 
 
-def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
+def learn(scenario: eb.Scenario, steps: int, seed: int, reward: dict[str, Any] = REWARD) -> Policy:
     """Return the policy that PPO has learned after `steps` decisions."""
     torch.set_num_threads(1)
-    worlds = VecMonitor(make_worlds(scenario))
+    worlds = VecMonitor(make_worlds(scenario, reward))
     model = PPO(
         "MlpPolicy",
         worlds,
@@ -154,7 +161,7 @@ def learn(scenario: eb.Scenario, steps: int, seed: int) -> Policy:
         device="cpu",
     )
     model.learn(steps)
-    scenario, game = eb.open_game(scenario, reward=REWARD)
+    scenario, game = eb.open_game(scenario, reward=reward)
     view = game.views[scenario.learners[0]]
     network = NetworkSpec(
         observation_size=len(view.names),
@@ -181,10 +188,12 @@ if __name__ == "__main__":
     parser.add_argument("--scenario", default="cooperation-3-pair", help="a shipped scenario, or a YAML file")
     parser.add_argument("--steps", type=int, default=200_000, help="decisions of all learners together")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--harm-count", choices=COUNTS, default=REWARD["harm_count"], help="what the reward counts")
     parser.add_argument("--output", type=Path, default=Path("runs/supersuit"), help="new folder")
     given = parser.parse_args()
     try:
-        train(eb.load_scenario(given.scenario), given.steps, given.seed, given.output)
+        reward = {**REWARD, "harm_count": given.harm_count}
+        train(eb.load_scenario(given.scenario), given.steps, given.seed, given.output, reward)
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")
     print(

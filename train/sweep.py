@@ -5,7 +5,8 @@
 
 Each training run has a folder of its own in ``--output``; ``results.csv`` has a row for each of them. After an
 interruption, start the same command again: finished training runs are skipped, and unfinished ones go on from their
-last checkpoint. The table does not depend on ``--jobs``, on ``--ray`` or on interruptions.
+last checkpoint. The table does not depend on ``--jobs``, on ``--ray`` or on interruptions. Recipes such as `ppo`
+minimise the honest cost, and first-impact harm with ``--set rules=paper``.
 
 On a Ray cluster, every computer needs the same packages, and must see ``--output`` under the same path. Everybody who
 can reach the ports of the cluster can run code on it with your rights, so open them to nobody else.

@@ -77,7 +77,9 @@ def train(folder: Path, name: str, objective: str, recipe: str, seed: int) -> No
     torch.set_num_threads(1)
     if not folder.exists():
         scenario = eb.load_scenario(name).replace(objective=objective)
-        eb.train(eb.load_recipe(recipe), scenario, folder, scheme=SCHEMES[recipe], seed=seed, on_progress=None)
+        plan = eb.load_recipe(recipe)
+        plan = plan.replace(reward={**plan.reward.model_dump(mode="json"), "harm_count": "first"})
+        eb.train(plan, scenario, folder, scheme=SCHEMES[recipe], seed=seed, on_progress=None)
 
 
 def drive(folders: Sequence[Path], name: str, worlds: int) -> Floats:

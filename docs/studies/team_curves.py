@@ -128,7 +128,7 @@ def script(name: str) -> Any:
 def run_script(name: str, clock: Clock, seed: int, folder: Path) -> None:
     """Train with ``train/NAME.py``. A subclass of its ``Copies`` calls the clock before every rollout."""
     module, scenario = script(name), clock.scenario
-    settings = module.Settings(scenario=scenario, steps=clock.steps, seed=seed)
+    settings = module.Settings(scenario=scenario, steps=clock.steps, seed=seed, harm_count="first")
     decisions = settings.copies * settings.rollout * len(scenario.learners)
 
     class Watched(module.Copies):  # type: ignore[misc, name-defined]
@@ -152,6 +152,12 @@ def run_script(name: str, clock: Clock, seed: int, folder: Path) -> None:
     clock.look(-(-clock.steps // decisions) * decisions, lambda: load_team(folder, scenario))
 
 
+def recipe_of(name: str) -> eb.TrainingRecipe:
+    """Return the recipe, which minimises first-impact harm here."""
+    recipe = eb.load_recipe(name)
+    return recipe.replace(reward={**recipe.reward.model_dump(mode="json"), "harm_count": "first"})
+
+
 def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
     """Train BenchMARL's MAPPO with the hyperparameters of the recipe `cooperation-ppo`.
 
@@ -161,7 +167,7 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
     from torch.random import fork_rng
 
     module, scenario = script("benchmarl_mappo"), clock.scenario
-    recipe = eb.load_recipe("cooperation-ppo").replace(scheme="centralised", total_steps=clock.steps, seed=seed)
+    recipe = recipe_of("cooperation-ppo").replace(scheme="centralised", total_steps=clock.steps, seed=seed)
     decisions = recipe.n_envs * recipe.rounds * len(scenario.learners)
 
     def team() -> eb.Team:
@@ -188,7 +194,7 @@ def run_benchmarl(clock: Clock, seed: int, folder: Path) -> None:
 
 def run_recipe(name: str, clock: Clock, seed: int, folder: Path) -> None:
     """Train with one of our recipes; all learners share one policy."""
-    recipe = eb.load_recipe(name)
+    recipe = recipe_of(name)
     often = max(clock.steps // (recipe.n_envs * recipe.rounds) // 100, 1)
     measured = {**recipe.evaluation.model_dump(), "every_updates": often}
     recipe = recipe.replace(observation=SEEN, total_steps=clock.steps, seed=seed, scheme="shared", evaluation=measured)

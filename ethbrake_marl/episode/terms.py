@@ -128,13 +128,17 @@ def risk(params: Any, before: State, step: Step, after: State) -> Floats:
 def potential(rules: Rules, state: State) -> Floats:
     """Return minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
 
-    Each learner tries nine shares of its capacity, front to rear (several learners: twice); all others brake fully.
+    Each learner tries nine shares of its capacity, front to rear (several learners: twice); all others brake fully. The
+    harm is what the reward counts. Nothing follows the end of an episode, whose last step has counted what still moves.
     """
     learners = rules.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
     further = state.line.copy()
     further[:, ROWS] = 0.0
-    return -descend(state._replace(line=further), learners, BRAKING_SHARES, rounds, rules.horizon_s, rules.counting)[1]
+    state = state._replace(line=further)
+    _, least = descend(state, learners, BRAKING_SHARES, rounds, rules.horizon_s, rules.counting)
+    least[state.ended] = 0.0
+    return -least
 
 
 class Shaping(NamedTuple):

@@ -36,7 +36,7 @@ class Compared(NamedTuple):
         """Let the teams drive; the other arguments are those of ``evaluate``. The honest count also shows the push."""
         names = measures.split(",") if isinstance(measures, str) and measures else [*measures]
         if harm_count == "honest":
-            names.append("pushed_mps")
+            names.insert(0, "pushed_mps")
         result = evaluate(scenario, teams, harm_count=harm_count, measures=names, **more)
         return cls(scenario, teams, result, summarise(result), harm_count)
 

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.store import check_folder, hold_lock, remove_unfinished
@@ -16,7 +17,7 @@ from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import resume, train
 from ethbrake_marl.training.training import Training
 
-MEASURED = ("first_impact_harm", "total_harm", "collision_rate")
+MEASURED = (*COLUMN.values(), "collision_rate")
 
 
 @contextmanager

@@ -135,22 +135,26 @@ def test_cost__of_all_steps_is_the_harm_that_the_reward_counts(reward: str, coun
 # ---------------------------------------------------------------- shaping
 
 
-@pytest.mark.parametrize("discount", [1.0, 0.9])
-def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(discount: float) -> None:
-    reward = {"harm": 0.0, "shaping": 1.0, "shaping_discount": discount}
+@pytest.mark.parametrize(
+    ("discount", "count", "strongest"), [(1.0, "first", 0.0), (0.9, "first", 0.0), (1.0, "honest", 1.0)]
+)
+def test_shaping__sums_to_minus_the_first_potential_whatever_is_done(
+    discount: float, count: str, strongest: float
+) -> None:
+    """Under the honest count also where vehicles still move at the horizon."""
+    reward = {"harm": 0.0, "harm_count": count, "shaping": 1.0, "shaping_discount": discount}
     scenario, game = open_game("paper-random", reward=reward)
     state = game.reset(scenario.sample(50, 7))
     tried = state.car[:, BRAKING, [2]] * -np.linspace(0.0, 1.0, 9)
-    least = hold(state, -state.car[:, BRAKING], [2], tried[:, :, np.newaxis], scenario.horizon_s, "first")[0].min(
-        axis=1
-    )
+    least = hold(state, -state.car[:, BRAKING], [2], tried[:, :, np.newaxis], scenario.horizon_s, count)[0].min(axis=1)
     rng, total, factor = np.random.default_rng(5), np.zeros(50), 1.0
     while not state.ended.all():
-        state, step = game.step(state, rng.uniform(-1.0, 0.0, (50, 1)))
+        state, step = game.step(state, rng.uniform(-1.0, strongest, (50, 1)))
         total += factor * step.reward[:, 1]
         factor *= discount
         assert (step.reward[:, [0, 2]] == 0.0).all()
     assert (least > 0).sum() > 20 and total == near(least, abs=1e-9)
+    assert state.at_rest.all() == (strongest == 0.0)
 
 
 def test_potential__counts_only_what_is_still_to_come() -> None:

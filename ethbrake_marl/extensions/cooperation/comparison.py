@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.extensions.cooperation.ablation import Measured
 from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.motion.layout import Floats
@@ -18,8 +18,8 @@ TOLERANCE = 1e-6  # m2/s2; a vehicle counts as worse off if its harm rises by mo
 Json = dict[str, Any]
 
 
-def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Return the comparison as plain data.
+def compare(measured: Sequence[Measured], searched: int, counts: Sequence[str]) -> Json:
+    """Return the comparison as plain data, in several counts.
 
     - ``levels``: results of each level and algorithm;
     - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
@@ -30,7 +30,9 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
     steps = []
     for algorithm in dict.fromkeys(each.algorithm for each in measured if each.algorithm is not None):
         own = {each.level.name: each for each in measured if each.algorithm in (None, algorithm)}
-        steps += [_change(own[each.level.before], each, algorithm) for each in own.values() if each.level.before]
+        steps += [
+            _change(own[each.level.before], each, algorithm, counts) for each in own.values() if each.level.before
+        ]
     goals = [
         (each, *(own["goal"].mean() for own in (each.reached, each.braking))) for each in measured if each.algorithm
     ]
@@ -41,7 +43,8 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
     ]
     return {
         "kind": "ablate",
-        "levels": [_level(each, searched) for each in measured],
+        "counts": [*counts],
+        "levels": [_level(each, searched, counts) for each in measured],
         "steps": steps,
         "undertrained": [f"Not trained enough to say anything: {'; '.join(named)}."] if named else [],
     }
@@ -53,7 +56,7 @@ def place_of(one: Measured) -> Json:
     return {"level": one.level.name} | ({} if swept is None else {"swept_number": swept.number})
 
 
-def _level(one: Measured, searched: int) -> Json:
+def _level(one: Measured, searched: int, counts: Sequence[str]) -> Json:
     """Return the results of one level with one algorithm, as means over seeds and worlds."""
     scenario = one.level.scenario
     mean = partial(mean_over_seeds, clusters=one.clusters)
@@ -68,7 +71,7 @@ def _level(one: Measured, searched: int) -> Json:
         "worlds": one.reached["collided"].shape[1],
         "collision_rate": mean(one.reached["collided"]).to_json(),
     }
-    for count, column in HARM.items():
+    for count, column in ((count, COLUMN[count]) for count in counts):
         reached, braking = one.reached[column], one.braking[column]
         entry[count] = {
             "full_brake": mean(braking).to_json(),
@@ -83,7 +86,7 @@ def _level(one: Measured, searched: int) -> Json:
 def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
     """Return the results in the first worlds, in which the joint optimum was searched."""
     first = None if one.clusters is None else one.clusters[:searched]
-    reached, braking = one.reached[HARM[count]][:, :searched], one.braking[HARM[count]][:, :searched]
+    reached, braking = one.reached[COLUMN[count]][:, :searched], one.braking[COLUMN[count]][:, :searched]
     best = None if one.best is None else one.best[count]
     mean = partial(mean_over_seeds, clusters=first)
     share = None if best is None else share_over_seeds(reached, braking, best, first)
@@ -97,7 +100,7 @@ def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
     }
 
 
-def _change(before: Measured, after: Measured, algorithm: str) -> Json:
+def _change(before: Measured, after: Measured, algorithm: str, counts: Sequence[str]) -> Json:
     """Return the change of harm between two levels, of the line and of each vehicle.
 
     Seed k of one level is compared with seed k of the other, or with its only seed.
@@ -106,7 +109,7 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     for word, one in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}
     mean = partial(mean_over_seeds, clusters=after.clusters)
-    for count, column in HARM.items():
+    for count, column in ((count, COLUMN[count]) for count in counts):
         new, old = (np.stack(_borne(each, column), axis=2) for each in (after, before))
         worse = new > old + TOLERANCE
         entry[count] = {

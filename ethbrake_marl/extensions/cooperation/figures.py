@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.extensions.report.style import GREY, TITLES, finish, in_our_style, new_panels, plain, series_style
 from ethbrake_marl.files.sheet import Estimate
 
@@ -23,7 +22,7 @@ Json = dict[str, Any]
 
 @in_our_style
 def ablation_figure(results: Json, caption: str) -> Figure:
-    """Draw both harms at each level, or at each value of a sweep, with 95 % intervals and a dot for each seed.
+    """Draw each count at each level, or at each value of a sweep, with 95 % intervals and a dot for each seed.
 
     All means are over the worlds in which the joint optimum was searched.
     """
@@ -31,9 +30,10 @@ def ablation_figure(results: Json, caption: str) -> Figure:
     names = list(dict.fromkeys(level["level"] for level in levels))
     at = {level["level"]: level.get("swept_number", names.index(level["level"])) for level in levels}
     unit = (max(at.values()) - min(at.values())) / (len(at) - 1)  # mean distance between neighbours
-    width = 2.0 * max(PANEL_IN, LEVEL_IN * len(at))
-    figure, panels = new_panels((min(width, WIDEST_IN), HEIGHT_IN), columns=2)
-    for axes, count in zip(panels, HARM, strict=True):
+    counts = results["counts"]
+    width = len(counts) * min(max(PANEL_IN, LEVEL_IN * len(at)), WIDEST_IN / 2)
+    figure, panels = new_panels((width, HEIGHT_IN), columns=len(counts))
+    for axes, count in zip(panels, counts, strict=True):
         points = [(at[level["level"]], level["algorithm"], level[count]["searched"]) for level in levels]
         _draw_bounds(axes, points, 0.3 * unit)
         for number, algorithm in enumerate(results["settings"]["recipes"]):

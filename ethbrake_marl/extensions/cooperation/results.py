@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.episode.counts import HARM, IN_WORDS
+from ethbrake_marl.episode.counts import COLUMN, IN_WORDS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, Measured
@@ -34,11 +34,11 @@ def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, 
             "date": datetime.now(UTC).date().isoformat(),
         },
         "conditions": f"{conditions(plan, plan.episodes)} {machine}.",
-        **compare(measured, plan.search_episodes),
+        **compare(measured, plan.search_episodes, plan.counts),
     }
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
-    write_output(csv_file, levels_csv(measured, plan.search_episodes).encode(), force=True)
+    write_output(csv_file, levels_csv(measured, plan.search_episodes, plan.counts).encode(), force=True)
     write_picture(picture, ablation_figure(results, conditions(plan, plan.search_episodes)), force=True)
     return results, [json_file, csv_file, picture]
 
@@ -62,7 +62,7 @@ def conditions(plan: Ablation, number: int) -> str:
     )
 
 
-def levels_csv(measured: Sequence[Measured], searched: int) -> str:
+def levels_csv(measured: Sequence[Measured], searched: int, counts: Sequence[str]) -> str:
     """Return CSV text with one row per level, algorithm and seed: means over worlds of all columns of an evaluation.
 
     The columns ``searched_*`` are means over the first ``searched`` worlds.
@@ -72,7 +72,7 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
         for seed in range(len(one.reached["collided"])):
             row: Json = {**place_of(one), "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
             row |= {name: float(values[seed].mean()) for name, values in one.reached.items()}
-            for count, name in HARM.items():
+            for count, name in ((count, COLUMN[count]) for count in counts):
                 row |= {
                     f"full_brake_{name}": float(one.braking[name].mean()),
                     f"searched_{name}": float(one.reached[name][seed, :searched].mean()),
@@ -87,7 +87,7 @@ Columns = list[tuple[Column, str]]
 
 
 def tables(results: Json) -> list[Sheet]:
-    """Return the tables for the terminal, for each count of harm."""
+    """Return the tables for the terminal, for each count."""
     swept, levels = results["settings"]["swept"], results["levels"]
     several = len(results["settings"]["recipes"]) > 1
     algorithm: Columns = [(Column("Algorithm", text=True), "algorithm")] if several else []
@@ -98,7 +98,7 @@ def tables(results: Json) -> list[Sheet]:
     worlds = count_of(levels[0]["first"]["searched"]["worlds"], "world")
     known = [level for level in levels if level["first"]["searched"]["best_known"] is not None]
     sheets = []
-    for count, harm in ((count, IN_WORDS[count]) for count in HARM):
+    for count, harm in ((count, IN_WORDS[count]) for count in results["counts"]):
         sheets += [
             sheet(f"Levels, {harm}", levels, [
                 *about, *algorithm, (share("Collisions"), "collision_rate"),

@@ -15,6 +15,7 @@ import numpy as np
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.episode.step import beside_harm
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import FORCE, GAP, HIT, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
@@ -55,7 +56,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
         gained[rows] += discount * step.reward[:, learners - 1]
         over = after.ended
         if only_harm and number >= at_least:
-            over |= stands_for_good(now, after)
+            over |= stands_for_good(now, after, game.rules.counting)
         if over.any():
             ended.append(rows[over])
             last.append(after.take(over))
@@ -64,24 +65,27 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
     return gained, State.join(last).take(np.argsort(np.concatenate(ended)))
 
 
-def stands_for_good(before: State, after: State) -> Bools:
+def stands_for_good(before: State, after: State, count: Floats) -> Bools:
     """Return where all vehicles stand, and a policy that only looks at its observation never moves one again, [n].
 
-    There nothing has changed in this step, and nobody waits for a latency or for news. It is never sure with scripts or
-    messages that have a memory.
+    There nothing has changed in this step, and nobody waits for a latency or for news. ``count`` are the weights of
+    what counts (``episode.counts``): a vehicle that presses against a standing one can still push. It is never sure
+    with scripts or messages that have a memory.
     """
     out = np.zeros(after.n, np.bool_)
     if not after.memories:
-        find_standing(before.line, after.line, after.car, after.know, before.clock, out)
+        find_standing(before.line, after.line, after.car, after.know, before.clock, count, out)
     return out
 
 
 @large
-def find_standing(before: Floats, line: Floats, car: Floats, know: Floats, clock: Floats, out: Bools) -> None:
+def find_standing(
+    before: Floats, line: Floats, car: Floats, know: Floats, clock: Floats, count: Floats, out: Bools
+) -> None:
     """Set ``out`` [n] where worlds stand for good; ``before`` and ``clock`` are those of the step before."""
     bodies = line.shape[2]
     for k in range(len(out)):
-        stands, time = True, clock[k, TIME]
+        stands, time = beside_harm(before[k], count) == beside_harm(line[k], count), clock[k, TIME]
         for i in range(bodies):
             stands = stands and before[k, SPEED, i] == 0.0 and line[k, SPEED, i] == 0.0
         if stands:

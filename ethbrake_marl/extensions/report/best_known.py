@@ -34,7 +34,9 @@ class BestKnown(NamedTuple):
     def in_words(self) -> str:
         """What is known of the worlds as a whole."""
         first, total = (float(self.harm[count].mean()) for count in HARM)
-        words = f"Mean best known harm of these worlds: {first:.2f} first-impact, {total:.2f} total."
+        words = (
+            f"Mean best known harm of these worlds, where pushing is free: {first:.2f} first-impact, {total:.2f} total."
+        )
         if self.avoidable is None:
             return words
         never = 100.0 * (1.0 - float(self.avoidable.mean()))

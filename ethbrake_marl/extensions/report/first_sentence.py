@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Literal
 
-from ethbrake_marl.episode.counts import COLUMN
+from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.summary import BASELINE
 from ethbrake_marl.evaluation.summary_row import SummaryRow
@@ -32,11 +32,16 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
     best = "" if known is None or count not in known.harm else f"; best known {known.harm[count].mean():.2f}"
     does, of_harm, what = WORDS[count]
     if before is None or row is before:
-        return f"{name} {does} {value(row, harm)} m²/s²{of_harm and ' of'}{of_harm} per emergency ({what}{best})."
+        total = f"; total harm: {value(row, HARM['total'])}" if count == "honest" else ""
+        return (
+            f"{name} {does} {value(row, harm)} m²/s²{of_harm and ' of'}{of_harm} per emergency ({what}{total}{best})."
+        )
     change, decrease = change_of(row, harm), row[f"harm_decrease_{count}"]
     much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
     words = f"about as much{of_harm} as" if change == "as much" else f"{much}{change}{of_harm} than"
     numbers = f"{what}: {value(row, harm)} m²/s² per emergency instead of {value(before, harm)}{best}"
+    if count == "honest":
+        numbers += f"; total harm: {value(row, HARM['total'])} instead of {value(before, HARM['total'])}"
     fails = []
     for title, other in tests.items():
         there = {each.agent: each for each in other.table}

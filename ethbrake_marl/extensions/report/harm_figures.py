@@ -86,8 +86,11 @@ def harm_above(result: Result) -> Figure:
 def harm_against_total_gap(result: Result) -> Figure:
     """Draw each agent's mean harm, with 95 % intervals, against the sum of the gaps at the alert.
 
-    The worlds are grouped by the sum, in ``BINS`` intervals of equal width.
+    The worlds are grouped by the sum, in ``BINS`` intervals of equal width. A third panel has the honest cost if agents
+    minimise it.
     """
+    minimised = result.about.get("agent_settings", {}).get("harm_count", "first")
+    counts = ({**HARM, minimised: COLUMN[minimised]}).items()
     names = [name for name in result.worlds if name.startswith("gap_")]
     gap, by = np.sum([result.worlds[name] for name in names], axis=0), result.clusters
     part = np.minimum(((gap - gap.min()) / (np.ptp(gap) or 1.0) * BINS).astype(np.int64), BINS - 1)
@@ -100,7 +103,7 @@ def harm_against_total_gap(result: Result) -> Figure:
             }
             for agent, columns in result.columns.items()
         }
-        for count, harm in HARM.items()
+        for count, harm in counts
     }
     sums = " + ".join(f"d{p + 1}" for p in range(len(names))) if len(names) <= 3 else f"d1 + … + d{len(names)}"
     note = f"Mean over worlds with similar gaps; bands: 95 % intervals. {line(result)}."

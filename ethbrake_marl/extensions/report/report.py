@@ -112,6 +112,8 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
         columns |= {"Best known, first": known.harm["first"], "Best known, total": known.harm["total"]}
         if known.avoidable is not None:
             columns["Contact"] = np.where(known.avoidable, "avoidable", "unavoidable")
+    if compared.harm_count not in HARM:
+        columns[IN_WORDS[compared.harm_count].capitalize()] = result[focus][COLUMN[compared.harm_count]]
     columns["Impacts"] = result[focus]["impacts"]
     rows = []
     for k in worst_rows(result, focus).tolist():

@@ -145,11 +145,13 @@ def page_of(
     training, recipe, name = trained.training, trained.training.recipe, compared.scenario.name
     steps = next(iter(trained.policies.values())).manifest.steps
     reward = recipe.reward.model_dump(exclude_defaults=True)
+    if reward.keys() <= {"harm_count"}:
+        reward = {"minus the": IN_WORDS[recipe.reward.harm_count]}
     facts = {
         "Training": f"{recipe.title or recipe.name}: {trained.steps:,} steps of {recipe.total_steps:,}"
         f" ({trained.status}), {trained.wall_s:.0f} s",
         "Seeds": f"training {recipe.seed}, evaluation list {compared.result.about['seed']}",
-        "Reward": ", ".join(f"{key} {value}" for key, value in reward.items()) or f"minus the {IN_WORDS['first']}",
+        "Reward": ", ".join(f"{key} {value}" for key, value in reward.items()),
         "Objective": training.objective,
         "Agents minimise": IN_WORDS[compared.harm_count],
         "Whole run": f"{time.monotonic() - experiment.started:.0f} s",

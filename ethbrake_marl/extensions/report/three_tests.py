@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from ethbrake_marl.episode.counts import COLUMN, HARM
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.extensions.report.best_known import BestKnown
-from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.files.sheet import Estimate, Sheet
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.mixture import WORDS
 from ethbrake_marl.worlds.scenario import Scenario
 
 TESTS = {
-    "paper-random": "Main test, the paper's rules: Vehicle 2 may drive, there is no obstacle ahead of Vehicle 1, and"
-    " pushing Vehicle 1 does no harm in either count.",
+    "paper-random": "Main test: Vehicle 2 may drive, and there is no obstacle ahead of Vehicle 1. Neither first-impact"
+    " nor total harm includes pushing Vehicle 1; the honest cost does.",
     "paper-random-brake-only": "Brake-only test: the same worlds, but Vehicle 2 may only brake and coast, so it cannot"
     " push with its motor.",
     "paper-random-obstacle": "Obstacle test: the same worlds with an obstacle 1.7 m beyond the place where Vehicle 1"
@@ -40,27 +40,24 @@ def other_tests(scenario: Scenario) -> list[Scenario]:
 
 def title_of(name: str) -> str:
     """Return the title of a test: ``Obstacle test``."""
-    return TESTS[name].partition(":")[0].partition(",")[0]
+    return TESTS[name].partition(":")[0]
 
 
 def brief(compared: Compared, others: Mapping[str, Compared]) -> Sheet:
-    """Return a short table: collision rate and both harms, and both harms in the other tests, name -> results.
+    """Return a short table: collision rate, both harms and, if agents minimise it, the honest cost with the push.
 
-    If agents minimise the honest cost, there is also the cost and the push, and only the cost in the other tests.
+    Below it, the same means in the other tests, name -> results.
     """
-    table, honest = compared.table, compared.harm_count == "honest"
-    keys, words = ([COLUMN["honest"]], "honest") if honest else ([*HARM.values()], "first, total")
+    table = compared.table
     whole = table.terminal()
     short = whole.only(k for k, name in enumerate(whole.names) if k == 0 or name in KEPT)
-    columns, rows = list(short.columns), [list(row) for row in short.rows]
-    line = f"{caption(table.parameters)}. Harm: mean over the worlds in m²/s², with the 95 % interval below."
+    rows, line = list(short.rows), "Harm: mean over the worlds in m²/s², with the 95 % interval below."
     known = BestKnown.of(compared.result)
-    notes = [line, *table.notes(), *([] if known is None else [known.in_words])]
+    notes = [f"{caption(table.parameters)}. {line}", *table.notes(), *([] if known is None else [known.in_words])]
     for test, other in others.items():
-        by_agent = {row.agent: row for row in other.table}
-        columns.append(Column(f"{title_of(test).removesuffix(' test')}:\n{words}"))
-        for cells, row in zip(rows, (by_agent.get(row.agent) for row in table), strict=True):
-            harms = [] if row is None else [row[key] for key in keys]
-            cells.append(", ".join(f"{each.value:.2f}" for each in harms if each is not None) or None)
-        notes.append(" ".join([TESTS[test], f"{count_of(other.result.n, 'world')}.", *other.table.notes()]))
-    return replace(short, columns=columns, rows=rows, note="\n".join(notes))
+        rows.append(f"{title_of(test)}: {count_of(other.result.n, 'world')}")
+        for row in other.table:
+            means = [row[name] for name in short.names[1:]]
+            rows.append((row.marked, *(each and Estimate(each.value, None) for each in means)))
+        notes.append(" ".join([TESTS[test], *other.table.notes()]))
+    return replace(short, rows=rows, note="\n".join(notes), keep=None)

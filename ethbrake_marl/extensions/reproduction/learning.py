@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import RULES
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.curves import curves_figure, over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
@@ -102,7 +103,8 @@ def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
     recipe = eb.load_recipe(plan.recipe)
     changes = {"log_every_updates": plan.every_updates} if hasattr(recipe, "log_every_updates") else {}
     measured = {**recipe.evaluation.model_dump(), "every_updates": plan.every_updates}
-    recipe = recipe.replace(evaluation=measured, **changes)
+    reward = {**recipe.reward.model_dump(mode="json"), "harm_count": RULES["paper"]}
+    recipe = recipe.replace(evaluation=measured, reward=reward, **changes)
     result = eb.train(recipe, plan.scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
     return result.status == "finished"
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.extensions.cooperation.ablation import Measured
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.levels import Level
@@ -41,7 +42,7 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
     after = measured(
         "cooperation-1-front", [[1, 2, 3], [0, 2, 0], [1, 2, 0], [0, 0, 0]], "ppo", None, before.level.name
     )
-    (step,) = compare([before, after], 4)["steps"]
+    (step,) = compare([before, after], 4, [*HARM])["steps"]
     assert (step["from"], step["to"], step["algorithm"]) == ("cooperation-0-sensors", "cooperation-1-front", "ppo")
     for count in ("first", "total"):
         change = step[count]
@@ -53,18 +54,18 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
 
 def test_level__share_of_the_reduction_and_too_little_training_by_hand() -> None:
     one = measured("cooperation-1-front", [[1, 2, 0], [0, 2, 0]], "ppo", [[0, 6, 0], [0, 5, 0]])
-    found = compare([one], 2)
+    found = compare([one], 2, [*HARM])
     share = found["levels"][0]["first"]["searched"]["share_of_possible_reduction"]
     assert share["value"] == pytest.approx((5.5 - 2.5) / (5.5 - 1.0)) and found["undertrained"] == []
     worse = measured("cooperation-1-front", [[0, 6, 0], [0, 5, 0]], "ppo", [[1, 2, 0], [0, 2, 0]])
-    (sentence,) = compare([worse], 2)["undertrained"]
+    (sentence,) = compare([worse], 2, [*HARM])["undertrained"]
     assert "cooperation-1-front (ppo) with 5.50 (2.50 with full braking)" in sentence
 
 
 def test_csv__has_a_row_for_each_seed() -> None:
     one = measured("cooperation-1-front", [[1, 2, 3], [0, 2, 0]], "ppo")
     both = one._replace(reached={name: np.concatenate([each, 2 * each]) for name, each in one.reached.items()})
-    row, other = csv.DictReader(levels_csv([both], 1).splitlines())
+    row, other = csv.DictReader(levels_csv([both], 1, [*HARM]).splitlines())
     assert (row["level"], row["seed"], row["first_impact_harm"]) == ("cooperation-1-front", "0", "4.0")
     assert (other["seed"], other["first_impact_harm"], other["searched_total_harm"]) == ("1", "8.0", "12.0")
     assert (row["searched_total_harm"], row["total_harm_3"], row["searched_best_known_total_harm"]) == (
@@ -114,7 +115,7 @@ def test_ablation__trains_compares_and_goes_on(
     ethbrake: Command, empty_folder: Path, tiny_recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     draw_nothing(monkeypatch)
-    small = "--seeds 2 --steps 128 --episodes 12 --search-episodes 2 --set horizon_s=7"
+    small = "--seeds 2 --steps 128 --episodes 12 --search-episodes 2 --set horizon_s=7 --set rules=honest"
     line = f"study ablate --levels cooperation-0-sensors,cooperation-2-paper,cooperation-3-pair --recipes {tiny_recipe}"
     assert ethbrake(*line.split(), *small.split(), "--output", "out").status == 0
     out, found = Path("out"), json.loads(Path("out/ablation.json").read_text())
@@ -122,13 +123,16 @@ def test_ablation__trains_compares_and_goes_on(
     folders = [f"cooperation-{name}-seed{k}" for name in ("2-paper-tiny", "3-pair-tiny-shared") for k in (0, 1)]
     assert sorted(path.name for path in out.glob("trainings/*")) == folders
     config = json.loads((out / "trainings" / folders[0] / "config.json").read_text())
-    assert config["settings"] == ["horizon_s=7"] and config["recipe"]["scheme"] is None
+    assert config["settings"] == ["horizon_s=7", "rules=honest"] and config["recipe"]["scheme"] is None
     pair = json.loads((out / "trainings" / folders[2] / "config.json").read_text())["recipe"]
     assert (config["recipe"]["total_steps"], pair["total_steps"]) == (128, 256)
+    assert found["counts"] == ["first", "total", "honest"] and "rewarded for honest cost" in found["conditions"]
     for level in found["levels"][1:]:
-        searched = level["first"]["searched"]
         assert level["seeds"] == 2
-        assert searched["best_known"]["value"] <= searched["harm"]["value"]
+        for count in found["counts"]:
+            searched = level[count]["searched"]
+            assert searched["best_known"]["value"] <= searched["harm"]["value"]
+        assert level["honest"]["harm"]["value"] > level["total"]["harm"]["value"]
         assert len(level["policy_sha256"]) == 2 and level["policy_sha256"][0] != level["policy_sha256"][1]
     assert found["levels"][1]["first"]["full_brake"] == found["levels"][2]["first"]["full_brake"]
     assert "first 2 worlds" in found["conditions"] and "2 seeds, 128 decisions" in found["conditions"]

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners import branches
 from ethbrake_marl.extensions.learners.branches import Moment, play_on, stands_for_good
 from ethbrake_marl.motion.layout import FORCE
 
 TEAM = ["vehicle_2", "vehicle_3"]
+FIRST = COUNTS["first"]
 
 
 def act(seen: np.ndarray) -> np.ndarray:
@@ -53,9 +55,25 @@ def test_branch__ends_where_nothing_can_change_any_more(monkeypatch: pytest.Monk
         return play_on(game, state, decide, 1.0)[0], sum(asked)
 
     early, few = pressed()
-    monkeypatch.setattr(branches, "stands_for_good", lambda before, after: np.zeros(after.n, bool))
+    monkeypatch.setattr(branches, "stands_for_good", lambda before, after, count: np.zeros(after.n, bool))
     whole, many = pressed()
     assert np.array_equal(early, whole) and few < 0.8 * many
+
+
+def test_branch__under_the_honest_count_goes_on_while_a_standing_line_is_pushed() -> None:
+    """Vehicle 2 brakes for 2.5 s and then presses on, but Vehicle 1 holds it."""
+    game, state = begun(30, ["vehicle_2"], reward="honest")
+
+    def action(number: int, rows: int) -> np.ndarray:
+        return np.full((rows, 1), -1.0 if number < 25 else 0.3)
+
+    gained, _ = play_on(game, state, lambda now: action(now.number, len(now.rows)), 1.0)
+    rewards, number = np.zeros(30), 0
+    while not state.ended.all():
+        state, step = game.step(state, action(number, 30))
+        rewards += step.reward[:, 1]
+        number += 1
+    assert gained[:, 0].tolist() == rewards.tolist() and (state.harm("honest") > state.harm("total") + 50.0).any()
 
 
 def test_nothing_stands_for_good__while_somebody_waits_or_has_a_memory() -> None:
@@ -64,11 +82,11 @@ def test_nothing_stands_for_good__while_somebody_waits_or_has_a_memory() -> None
         before, (state, _) = state, game.step(state, -np.ones((2, 1)))
     after = state._replace(line=before.line.copy())
     before.line[:, :2] = after.line[:, :2] = 0.0
-    assert stands_for_good(before, after).all()
+    assert stands_for_good(before, after, FIRST).all()
     waiting = after.know.copy()
     waiting[0, 2, 1] = 7.9
-    assert stands_for_good(before, after._replace(know=waiting)).tolist() == [False, True]
+    assert stands_for_good(before, after._replace(know=waiting), FIRST).tolist() == [False, True]
     pressing = after.line.copy()
     pressing[1, FORCE, 2] = 1e-3
-    assert stands_for_good(before, after._replace(line=pressing)).tolist() == [True, False]
-    assert not stands_for_good(before, after._replace(memories={3: None})).any()
+    assert stands_for_good(before, after._replace(line=pressing), FIRST).tolist() == [True, False]
+    assert not stands_for_good(before, after._replace(memories={3: None}), FIRST).any()

@@ -123,6 +123,10 @@ def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(compare
     assert first.get_xlabel() == "Total gap at the alert, d1 + d2 (m)" and first.get_ylim()[0] == 0.0
     one = harm_against_total_gap(compared.result.take([0])).axes[0].lines[0]
     assert one.get_xydata() == pytest.approx(np.array([[gap[0], harm[0]]]))
+    honest = compared_by("paper-random", "full_brake,coast", 1, "honest").result
+    *_, cost = harm_against_total_gap(honest).axes
+    assert cost.get_title(loc="left") == "Honest cost (m²/s²)"
+    assert cost.lines[1].get_ydata() == pytest.approx(honest["coast"]["honest_cost"])
 
 
 def test_curves__are_means_with_bands_and_lines() -> None:

@@ -51,13 +51,14 @@ def test_first_sentence__compares_with_full_braking() -> None:
 def test_first_sentence__of_the_honest_cost() -> None:
     mine = with_best_known(compared_by("paper-random", "full_brake,ppo", 60, "honest"))
     after, before = (mine.result[agent]["honest_cost"].mean() for agent in ("ppo", "full_brake"))
+    total, much = (mine.result[agent]["total_harm"].mean() for agent in ("ppo", "full_brake"))
     assert after > before + 20.0  # it pushes
     assert first_sentence(mine, "ppo", {}) == (
         f"ppo costs {100 * (after / before - 1):.0f} % more than full braking (honest cost: {after:.2f} m²/s² per"
-        f" emergency instead of {before:.2f})."
+        f" emergency instead of {before:.2f}; total harm: {total:.2f} instead of {much:.2f})."
     )
     assert first_sentence(mine, "full_brake", {}) == (
-        f"Full braking costs {before:.2f} m²/s² per emergency (honest cost)."
+        f"Full braking costs {before:.2f} m²/s² per emergency (honest cost; total harm: {much:.2f})."
     )
 
 

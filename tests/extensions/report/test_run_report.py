@@ -74,7 +74,7 @@ def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(
 
 
 def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> None:
-    recipe = TINY.replace(total_steps=256, scheme="shared")
+    recipe = TINY.replace(total_steps=256, scheme="shared", reward={"harm": 1.0})
     scenario = eb.load_scenario("cooperation-3-pair")
     compared = run_experiment(recipe, scenario, tmp_path / "run", episodes=12)[0].compared
     first, total, added = learners_sheets(compared)
@@ -119,26 +119,24 @@ def test_three_tests__are_each_others_and_of_the_shipped_scenarios_only() -> Non
     assert is_papers_test(eb.load_scenario("paper-random-early")) and not is_papers_test(changed)
 
 
-def test_brief__has_both_harms_of_each_test() -> None:
-    main = compared_by("paper-random", "full_brake,coast,constant:3", 30)
-    other = compared_by("paper-random-obstacle", "full_brake,coast", 30)
+@pytest.mark.parametrize("count", ["first", "honest"])
+def test_brief__has_both_harms_of_each_test_and_the_honest_cost_with_the_push(count: str) -> None:
+    main = compared_by("paper-random", "full_brake,coast,constant:3", 30, count)
+    other = compared_by("paper-random-obstacle", "full_brake,coast", 30, count)
     sheet = brief(main, {"paper-random-obstacle": other})
-    assert sheet.columns[-1].heading == "Obstacle:\nfirst, total"
-    for row, agent in zip(sheet.rows, main.teams, strict=True):
-        own = other.result.columns.get(agent)
-        harms = own and f"{own['first_impact_harm'].mean():.2f}, {own['total_harm'].mean():.2f}"
-        assert row[-1] == harms and len(row) == 5
-    assert "1.7 m beyond the place where Vehicle 1 stops by itself" in sheet.note and "30 worlds." in sheet.note
-
-
-def test_brief__of_the_honest_cost_has_it_in_each_test() -> None:
-    main, other = (compared_by(f"paper-random{end}", "full_brake,coast", 30, "honest") for end in ("", "-obstacle"))
-    sheet = brief(main, {"paper-random-obstacle": other})
-    names = ["collision_rate", "first_impact_harm", "total_harm", "honest_cost", "pushed_mps"]
-    assert [column.name for column in sheet.columns[1:-1]] == names
-    assert sheet.columns[-1].heading == "Obstacle:\nhonest"
-    means = [f"{own['honest_cost'].mean():.2f}" for own in other.result.columns.values()]
-    assert [row[-1] for row in sheet.rows] == means
+    names = ["collision_rate", "first_impact_harm", "total_harm"]
+    names += ["honest_cost", "pushed_mps"] if count == "honest" else []
+    assert sheet.names[1:] == names and sheet.keep is None
+    own, heading, below = sheet.rows[:3], sheet.rows[3], sheet.rows[4:]
+    assert heading == "Obstacle test: 30 worlds"
+    for rows, result in ((own, main.result), (below, other.result)):
+        assert [row[0].partition("\n")[0].removesuffix(" ‡") for row in rows] == [*result.columns]
+        for row, columns in zip(rows, result.columns.values(), strict=True):
+            means = [columns["collided" if name == "collision_rate" else name].mean() for name in names]
+            assert [cell.value for cell in row[1:]] == pytest.approx(means)
+    assert own[0][2].interval is not None and below[0][2].interval is None
+    assert "1.7 m beyond the place where Vehicle 1 stops by itself" in sheet.note
+    assert "total harm includes pushing Vehicle 1; the honest cost does" in TESTS["paper-random"]
 
 
 def test_paper_rows__are_consistent_and_shown_as_printed() -> None:

@@ -56,6 +56,16 @@ def test_page__never_scrolls_sideways_and_is_no_giant(open_page: Open, name: str
     assert path.stat().st_size <= MOST_BYTES
 
 
+def test_first_table__shows_the_push_without_scrolling(open_page: Open, tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    Report("t", compared_by("paper-random", "full_brake,e_v2x_bm:pairwise", 60, "honest"), "s", {}).write(path)
+    page = open_page(path.as_uri(), width=1_100)
+    for width in (1_100, 900):  # beside the figure, below it
+        page.set_viewport_size({"width": width, "height": 900})
+        room, needed = page.evaluate("(e => [e.clientWidth, e.scrollWidth])(document.querySelector('.beside .wide'))")
+        assert needed <= room, width
+
+
 def test_pages__hostile_texts_run_nothing_and_load_nothing(open_page: Open, tmp_path: Path) -> None:
     path = tmp_path / "hostile.html"
     path.write_text(whole_page("nothing"), "utf-8")
