@@ -9,7 +9,8 @@ honest  harm of every impact, also where a contact passes it on, and what no imp
         then hit something that stands
 ======  ================================================================================================================
 
-All are in m2/s2, and none ever falls in an episode. ``honest`` adds a price to harm so that pushing never pays: without
+All are in m2/s2, and none ever falls in an episode. The two vehicles of a pair share what counts of it by their masses,
+but each vehicle bears the price of its own driving and motion alone (``own_amount``). ``honest`` adds a price to harm so that pushing never pays: without
 it the best braking pushes Vehicle 1 away (docs/findings.md).
 """
 
@@ -67,6 +68,12 @@ def pair_amount(line, p, weights):
 
 
 @kernel
+def own_amount(line, p, weights):
+    """Return the part of ``pair_amount`` that the vehicle behind bears alone (m2/s2): for its driving and motion."""
+    return weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
+
+
+@kernel
 def amount_so_far(line, weights):
     """Return what counts of one world so far (m2/s2), added up from the obstacle to the rear: the only order used."""
     amount = 0.0
@@ -81,3 +88,9 @@ def pair_amounts(line: Floats, count: Count) -> Floats:
     harm = first * line[:, FIRST] + total * line[:, TOTAL]
     beside = push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING]
     return harm + (passed * line[:, PASSED] + beside)
+
+
+def own_amounts(line: Floats, count: Count) -> Floats:
+    """Return the part of ``pair_amounts`` that the vehicle behind bears alone, [n, N + 1] m2/s2."""
+    drove, moving = weights_of(count)[4:]
+    return np.asarray(drove * line[:, DROVE] + moving * line[:, MOVING])
