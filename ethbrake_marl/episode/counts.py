@@ -9,9 +9,9 @@ honest  harm of every impact, also where a contact passes it on, and what no imp
         then hit something that stands
 ======  ================================================================================================================
 
-All are in m2/s2, and none ever falls in an episode. The two vehicles of a pair share what counts of it by their masses,
-but each vehicle bears the price of its own driving and motion alone (``own_amount``). ``honest`` adds a price to harm so that pushing never pays: without
-it the best braking pushes Vehicle 1 away (docs/findings.md).
+All are in m2/s2, and none ever falls in an episode. ``honest`` adds a price to harm so that pushing never pays: without
+it the best braking pushes Vehicle 1 away (docs/findings.md). The two vehicles of a pair share harm and push by their
+masses; each vehicle bears the price of its own driving and motion alone.
 """
 
 from __future__ import annotations
@@ -46,12 +46,6 @@ def check_count(what: str, count: object) -> None:
     """Raise ``InvalidInput`` unless this is the name of a count."""
     if count not in COUNTS:
         raise InvalidInput(f"{what} = {count!r}: must be 'first', 'total' or 'honest'")
-
-
-def check_harm(what: str, count: object) -> None:
-    """Raise ``InvalidInput`` unless this is the name of a count of harm alone."""
-    if count not in HARM:
-        raise InvalidInput(f"{what} = {count!r}: must be 'first' or 'total'")
 
 
 def other_count(count: Count) -> str:

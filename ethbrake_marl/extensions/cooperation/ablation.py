@@ -14,7 +14,6 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import FULL_BRAKE
-from ethbrake_marl.episode.counts import check_harm
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, amounts, objectives_of
 from ethbrake_marl.episode.state import State
@@ -59,8 +58,6 @@ class Ablation:
         names = [recipe.name for recipe in self.recipes]
         if len(set(names)) < len(names):
             raise InvalidInput(f"recipes {', '.join(names)}: two recipes have the same name; all names must differ")
-        for recipe in self.recipes:
-            check_harm(f"recipe {recipe.name}: reward.harm_count", recipe.reward.harm_count)
         if self.search_episodes > self.episodes:
             raise InvalidInput(
                 f"search-episodes = {self.search_episodes}: must be at most the number of worlds, episodes ="

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.extensions.cooperation.ablation import Measured
 from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.motion.layout import Floats
@@ -68,7 +68,7 @@ def _level(one: Measured, searched: int) -> Json:
         "worlds": one.reached["collided"].shape[1],
         "collision_rate": mean(one.reached["collided"]).to_json(),
     }
-    for count, column in HARM.items():
+    for count, column in COLUMN.items():
         reached, braking = one.reached[column], one.braking[column]
         entry[count] = {
             "full_brake": mean(braking).to_json(),
@@ -83,7 +83,7 @@ def _level(one: Measured, searched: int) -> Json:
 def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
     """Return the results in the first worlds, in which the joint optimum was searched."""
     first = None if one.clusters is None else one.clusters[:searched]
-    reached, braking = one.reached[HARM[count]][:, :searched], one.braking[HARM[count]][:, :searched]
+    reached, braking = one.reached[COLUMN[count]][:, :searched], one.braking[COLUMN[count]][:, :searched]
     best = None if one.best is None else one.best[count]
     mean = partial(mean_over_seeds, clusters=first)
     share = None if best is None else share_over_seeds(reached, braking, best, first)
@@ -106,7 +106,7 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     for word, one in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}
     mean = partial(mean_over_seeds, clusters=after.clusters)
-    for count, column in HARM.items():
+    for count, column in COLUMN.items():
         new, old = (np.stack(_borne(each, column), axis=2) for each in (after, before))
         worse = new > old + TOLERANCE
         entry[count] = {

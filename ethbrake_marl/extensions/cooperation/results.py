@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.episode.counts import HARM, IN_WORDS
+from ethbrake_marl.episode.counts import COLUMN, IN_WORDS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, Measured
@@ -72,7 +72,7 @@ def levels_csv(measured: Sequence[Measured], searched: int) -> str:
         for seed in range(len(one.reached["collided"])):
             row: Json = {**place_of(one), "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
             row |= {name: float(values[seed].mean()) for name, values in one.reached.items()}
-            for count, name in HARM.items():
+            for count, name in COLUMN.items():
                 row |= {
                     f"full_brake_{name}": float(one.braking[name].mean()),
                     f"searched_{name}": float(one.reached[name][seed, :searched].mean()),
@@ -98,7 +98,7 @@ def tables(results: Json) -> list[Sheet]:
     worlds = count_of(levels[0]["first"]["searched"]["worlds"], "world")
     known = [level for level in levels if level["first"]["searched"]["best_known"] is not None]
     sheets = []
-    for count, harm in ((count, IN_WORDS[count]) for count in HARM):
+    for count, harm in ((count, IN_WORDS[count]) for count in COLUMN):
         sheets += [
             sheet(f"Levels, {harm}", levels, [
                 *about, *algorithm, (share("Collisions"), "collision_rate"),

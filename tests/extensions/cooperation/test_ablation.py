@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.extensions.cooperation.ablation import Measured
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.levels import Level
@@ -22,14 +23,14 @@ from tests.fixtures.pictures import draw_nothing
 def columns(vehicles: list[list[float]]) -> dict[str, np.ndarray]:
     """One seed, in as many worlds as there are rows of harm of three vehicles."""
     each = np.array([vehicles], np.float64)
-    borne = {f"{name}_{i + 1}": each[:, :, i] for name in ("first_impact_harm", "total_harm") for i in range(3)}
-    line = dict.fromkeys(("first_impact_harm", "total_harm", "goal"), each.sum(axis=2))
+    borne = {f"{name}_{i + 1}": each[:, :, i] for name in COLUMN.values() for i in range(3)}
+    line = dict.fromkeys((*COLUMN.values(), "goal"), each.sum(axis=2))
     return {**borne, **line, "collided": each.any(axis=2)}
 
 
 def measured(level: str, vehicles: list[list[float]], algorithm: str | None, braking=None, before=None) -> Measured:
     scenario = eb.load_scenario(level)
-    best = dict.fromkeys(("first", "total"), np.ones((1, len(vehicles))))
+    best = dict.fromkeys(COLUMN, np.ones((1, len(vehicles))))
     worlds = scenario.sample(1, 0)
     return Measured(
         Level(level, scenario, before), algorithm, columns(vehicles), columns(braking or vehicles), worlds, best
@@ -43,7 +44,7 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
     )
     (step,) = compare([before, after], 4)["steps"]
     assert (step["from"], step["to"], step["algorithm"]) == ("cooperation-0-sensors", "cooperation-1-front", "ppo")
-    for count in ("first", "total"):
+    for count in COLUMN:
         change = step[count]
         assert change["difference"]["value"] == pytest.approx((0 - 4 + 1 + 0) / 4)
         assert [each["value"] for each in change["vehicles"]] == pytest.approx([-0.25, -1.25, 0.75])
@@ -114,7 +115,7 @@ def test_ablation__trains_compares_and_goes_on(
     ethbrake: Command, empty_folder: Path, tiny_recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     draw_nothing(monkeypatch)
-    small = "--seeds 2 --steps 128 --episodes 12 --search-episodes 2 --set horizon_s=7"
+    small = "--seeds 2 --steps 128 --episodes 12 --search-episodes 2 --set horizon_s=7 --set rules=honest"
     line = f"study ablate --levels cooperation-0-sensors,cooperation-2-paper,cooperation-3-pair --recipes {tiny_recipe}"
     assert ethbrake(*line.split(), *small.split(), "--output", "out").status == 0
     out, found = Path("out"), json.loads(Path("out/ablation.json").read_text())
@@ -122,15 +123,18 @@ def test_ablation__trains_compares_and_goes_on(
     folders = [f"cooperation-{name}-seed{k}" for name in ("2-paper-tiny", "3-pair-tiny-shared") for k in (0, 1)]
     assert sorted(path.name for path in out.glob("trainings/*")) == folders
     config = json.loads((out / "trainings" / folders[0] / "config.json").read_text())
-    assert config["settings"] == ["horizon_s=7"] and config["recipe"]["scheme"] is None
+    assert config["settings"] == ["horizon_s=7", "rules=honest"] and config["recipe"]["scheme"] is None
     pair = json.loads((out / "trainings" / folders[2] / "config.json").read_text())["recipe"]
     assert (config["recipe"]["total_steps"], pair["total_steps"]) == (128, 256)
     for level in found["levels"][1:]:
-        searched = level["first"]["searched"]
         assert level["seeds"] == 2
-        assert searched["best_known"]["value"] <= searched["harm"]["value"]
+        for count in ("first", "total", "honest"):
+            searched = level[count]["searched"]
+            assert searched["best_known"]["value"] <= searched["harm"]["value"]
+        assert level["honest"]["searched"]["best_known"]["value"] >= level["total"]["searched"]["best_known"]["value"]
         assert len(level["policy_sha256"]) == 2 and level["policy_sha256"][0] != level["policy_sha256"][1]
     assert found["levels"][1]["first"]["full_brake"] == found["levels"][2]["first"]["full_brake"]
+    assert "(rewarded for honest cost)" in found["conditions"]
     assert "first 2 worlds" in found["conditions"] and "2 seeds, 128 decisions" in found["conditions"]
     again = ethbrake(*line.split(), *small.split(), "--output", "out", "--json")
     assert again.status == 0 and json.loads(again.out)["levels"] == found["levels"]

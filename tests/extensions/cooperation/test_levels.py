@@ -64,7 +64,6 @@ REFUSED = {
         "no level has a learner"
     ),
     "--episodes 10 --search-episodes 11": "search-episodes = 11",
-    "--set rules=honest": "recipe ppo: reward.harm_count = 'honest': must be 'first' or 'total'",
     "--recipes ppo,ppo": "two recipes have the same name",
 }
 

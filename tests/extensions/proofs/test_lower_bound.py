@@ -81,7 +81,9 @@ def test_early__impacts_before_the_latency_are_certain():
     bound = lower_bound(state)
     assert avoidability(state).reason_name[0] == "early" and bound.early[0] == pytest.approx(4)
     assert bound.front_pair[0] == 0  # hit: a further impact of this pair does not count first
-    assert lower_bound(state, count="total").early[0] == pytest.approx(4)
+    total, honest = (lower_bound(state, count=count) for count in ("total", "honest"))
+    assert total.early[0] == pytest.approx(4) and total.harm[0] > bound.harm[0]
+    assert honest.harm.tolist() == total.harm.tolist()  # the honest cost is never below total harm
 
 
 # Recorded from version 0.5: the first worlds of seed 7, for commands at any time and at decisions.
@@ -343,7 +345,7 @@ def test_who_stands_at_the_leader__is_struck_together_with_it(time_step_s, mass,
 
 THREE = worlds([7, 7], [20, 18, 20], [6, 7, 6], [0, 0.5, 0.8])
 REFUSED = {
-    "lower_bound: count = 'worst': must be 'first' or 'total'": dict(count="worst"),
+    "lower_bound: count = 'worst': must be 'first', 'total' or 'honest'": dict(count="worst"),
     "lower_bound: horizon_s = 0.2: must be a finite number of at least 0.5": dict(horizon_s=0.2),
     "lower_bound: horizon_s = inf: must be a finite number of at least 0.5": dict(horizon_s=math.inf),
     "lower_bound: horizon_s = '8': must be a finite number": dict(horizon_s="8"),
