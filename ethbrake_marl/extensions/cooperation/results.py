@@ -56,9 +56,9 @@ def conditions(plan: Ablation, number: int) -> str:
     optimum = f"{count_of(plan.search_episodes, 'world')}, {plan.budget:,} candidates per world and count."
     return (
         f"{recipes}; {count_of(plan.seeds, 'seed')}, {plan.steps_per_learner:,} decisions of each learner, rounded up"
-        f" to whole updates. Harms are means per world in m²/s² on {same}{first}{count_of(number, 'world')} of seed"
-        f" {SEED}{drawn}; 95 % intervals for {others}. Joint optimum: the least harm known that the learners can do,"
-        f" in the first {optimum}"
+        " to whole updates. Harm and honest cost are means per world in m²/s² on"
+        f" {same}{first}{count_of(number, 'world')} of seed {SEED}{drawn}; 95 % intervals for {others}. Joint optimum:"
+        f" the least harm or cost known that the learners can cause, in the first {optimum}"
     )
 
 

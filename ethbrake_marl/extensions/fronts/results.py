@@ -157,4 +157,4 @@ def hypervolume_sheet(results: Json) -> Sheet:
         for name, volume in each["of"].items()
     ]
     columns: list[Column | str] = ["Reference", "Of", Column("Hypervolume"), share]
-    return Sheet("Hypervolume of the mean harm (m2/s2)^N", columns, rows, gap=2)
+    return Sheet(f"Hypervolume of the mean {IN_WORDS[results['harm_count']]}, (m2/s2)^N", columns, rows, gap=2)
