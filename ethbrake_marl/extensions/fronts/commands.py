@@ -51,10 +51,9 @@ def front_command(
     """Show how sparing one vehicle changes the harm of the others.
 
     For each choice of weights, a search looks in every world for the commands with the least weighted honest cost (with
-    --set rules=paper first-impact harm, with --set harm_count=total total harm). The command
-    compares the results with full braking, with maximin (commands that minimise the largest harm of a vehicle) and, if
-    there is one learner, with agents. The default choices of weights are a grid, equal weights, and, for each vehicle,
-    weight 1 for this vehicle and a tiny weight for all others. The command writes front.json and front.png.
+    --set rules=paper: first-impact harm). Beside them stand full braking, maximin (the least that the largest cost of a
+    vehicle can be) and, if there is one learner, agents. The default weights are a grid, equal weights, and, for each
+    vehicle, 1 with a tiny weight for all others. The command writes front.json and front.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
