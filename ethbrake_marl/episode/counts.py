@@ -10,7 +10,8 @@ honest  harm of every impact, also where a contact passes it on, and what no imp
 ======  ================================================================================================================
 
 All are in m2/s2, and none ever falls in an episode. ``honest`` adds a price to harm so that pushing never pays: without
-it the best braking pushes Vehicle 1 away (docs/findings.md).
+it the best braking pushes Vehicle 1 away (docs/findings.md). The two vehicles of a pair share harm and push by their
+masses; each vehicle bears the price of its own driving and motion alone.
 """
 
 from __future__ import annotations
@@ -47,12 +48,6 @@ def check_count(what: str, count: object) -> None:
         raise InvalidInput(f"{what} = {count!r}: must be 'first', 'total' or 'honest'")
 
 
-def check_harm(what: str, count: object) -> None:
-    """Raise ``InvalidInput`` unless this is the name of a count of harm alone."""
-    if count not in HARM:
-        raise InvalidInput(f"{what} = {count!r}: must be 'first' or 'total'")
-
-
 def other_count(count: Count) -> str:
     """Return the count that decides ties."""
     return "total" if isinstance(count, str) and count == "first" else "first"
@@ -64,6 +59,12 @@ def pair_amount(line, p, weights):
     harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
     beside = weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
     return harm + (weights[2] * line[PASSED, p] + beside)
+
+
+@kernel
+def own_amount(line, p, weights):
+    """Return the part of ``pair_amount`` that the vehicle behind bears alone (m2/s2): for its driving and motion."""
+    return weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
 
 
 @kernel
@@ -81,3 +82,9 @@ def pair_amounts(line: Floats, count: Count) -> Floats:
     harm = first * line[:, FIRST] + total * line[:, TOTAL]
     beside = push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING]
     return harm + (passed * line[:, PASSED] + beside)
+
+
+def own_amounts(line: Floats, count: Count) -> Floats:
+    """Return the part of ``pair_amounts`` that the vehicle behind bears alone, [n, N + 1] m2/s2."""
+    drove, moving = weights_of(count)[4:]
+    return np.asarray(drove * line[:, DROVE] + moving * line[:, MOVING])

@@ -34,7 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import pair_amounts
+from ethbrake_marl.episode.counts import own_amounts, pair_amounts
 from ethbrake_marl.episode.functions import called, described
 from ethbrake_marl.episode.injury import CURVES, injured_by_harm
 from ethbrake_marl.episode.state import State, split_harm
@@ -57,13 +57,13 @@ class Harm(NamedTuple):
     car: Floats  # [n, CAR_ROWS, N + 1] parameters (`motion.layout`)
 
     @classmethod
-    def of(cls, pairs: Floats, car: Floats) -> Harm:
-        """Return the harm whose pairs have ``pairs`` [n, N + 1] m2/s2."""
+    def of(cls, pairs: Floats, own: Floats, car: Floats) -> Harm:
+        """Return the harm whose pairs have ``pairs``, of which the vehicle behind bears ``own`` alone, [n, N + 1]."""
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             whole = whole + pairs[:, p]
-        split_harm(pairs, car[:, MASS], borne)
-        return cls(pairs, borne, whole, car)
+        split_harm(pairs - own, car[:, MASS], borne)
+        return cls(pairs, borne + own[:, :-1], whole, car)
 
     def weighted(self, weights: Floats) -> Floats:
         """Return ``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for the ``weights`` [n, N]; sums from front to rear."""
@@ -221,12 +221,13 @@ def amounts(objectives: Sequence[Objective], before: State | None, after: State,
 
     A weighted sum is taken of the harm since then; any other amount is the amount after minus the amount before.
     """
-    now = pair_amounts(after.line, count)
-    whole = Harm.of(now, after.car)
+    now, own = pair_amounts(after.line, count), own_amounts(after.line, count)
+    whole = Harm.of(now, own, after.car)
     if before is None:
         return np.stack([each.amount(whole, i) for i, each in enumerate(objectives)], axis=1)
-    earlier = pair_amounts(before.line, count)
-    since, then = Harm.of(now - earlier, after.car), Harm.of(earlier, after.car)
+    earlier, earlier_own = pair_amounts(before.line, count), own_amounts(before.line, count)
+    since = Harm.of(now - earlier, own - earlier_own, after.car)
+    then = Harm.of(earlier, earlier_own, after.car)
     columns = [
         each.amount(since, i) if each.is_sum else each.amount(whole, i) - each.amount(then, i)
         for i, each in enumerate(objectives)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import Count, amount_so_far, pair_amounts, weights_of
+from ethbrake_marl.episode.counts import Count, amount_so_far, own_amounts, pair_amounts, weights_of
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import (
     BRAKING,
@@ -187,9 +187,9 @@ class State(NamedTuple):
 
     def borne_harm(self, count: Count = "first") -> Floats:
         """Return the harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
-        out = np.empty((self.n, self.vehicles))
-        split_harm(pair_amounts(self.line, count), self.car[:, MASS], out)
-        return out
+        own, out = own_amounts(self.line, count), np.empty((self.n, self.vehicles))
+        split_harm(pair_amounts(self.line, count) - own, self.car[:, MASS], out)
+        return out + own[:, :-1]
 
 
 def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import ROWS, pair_amounts
+from ethbrake_marl.episode.counts import ROWS, own_amounts, pair_amounts
 from ethbrake_marl.episode.functions import called, check_finite, described
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.play import descend
@@ -171,15 +171,16 @@ def component(name: str, count: str) -> TermFunction:
 
 
 def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
-    return 0.0 - Harm.of(_grown(count, before, after), after.car).borne[:, vehicle]
+    pairs, own = (_grown(amounts_of, count, before, after) for amounts_of in (pair_amounts, own_amounts))
+    return 0.0 - Harm.of(pairs, own, after.car).borne[:, vehicle]
 
 
 def _of_pair(pair: int, count: str, before: State, step: Step, after: State) -> Floats:
-    return 0.0 - _grown(count, before, after)[:, pair]
+    return 0.0 - _grown(pair_amounts, count, before, after)[:, pair]
 
 
-def _grown(count: str, before: State, after: State) -> Floats:
-    return pair_amounts(after.line, count) - pair_amounts(before.line, count)
+def _grown(amounts_of: Callable[..., Floats], count: str, before: State, after: State) -> Floats:
+    return amounts_of(after.line, count) - amounts_of(before.line, count)
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:

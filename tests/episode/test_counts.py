@@ -9,6 +9,7 @@ import pytest
 
 from ethbrake_marl.episode.counts import COUNTS, ROWS, pair_amounts
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.play import hold, played, price
 from ethbrake_marl.episode.reward import RewardParams, reward_params
 from ethbrake_marl.episode.state import State
@@ -30,18 +31,24 @@ SCENARIOS = ["paper-random", "paper-random-obstacle", "paper-random-buildup", "c
 def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_horizon() -> None:
     # Coasting, Vehicle 2 hits with 6 m/s at 1 s: 18.5 m/s in common. Vehicle 1 of 1 t brakes with 6 m/s2 against the
     # 3 t behind it for 0.3 s: a push of 1.8 m/s, and 18.5 - 0.3 x 1.5 = 18.05 m/s of both at the horizon.
-    _, game = open_game(CRASH, reward="honest")
-    state, counted = game.reset(game.draw(1, 0, 0)), 0.0
+    # Of the impact and the push Vehicle 1 bears 3/4; each vehicle bears the price of its own motion.
+    _, game = open_game(CRASH, reward="honest", reward_vector="vehicles")
+    state, counted, borne = game.reset(game.draw(1, 0, 0)), 0.0, np.zeros(2)
     while not state.ended[0]:
         assert not state.line[:, MOVING].any()
         state, step = game.step(state, np.zeros((1, 1)))
         counted += step.counted[0]
+        assert step.vector is not None
+        borne -= step.vector[0, 0]
         assert step.reward[0].tolist() == [-step.counted[0]] * 2
     assert state.line[0, PUSHED].tolist() == near([0.0, 1.8, 0.0])
     assert state.line[0, MOVING].tolist() == near([18.05**2, 18.05**2, 0.0])
     assert (state.harm("first"), state.harm("total")) == (near([36.0]), near([36.0]))
     assert counted == near(36.0 + 10 * 1.8 + 2 * 18.05**2)
     assert state.harm("honest").tolist() == near([counted])
+    expected = [0.75 * (36.0 + 10 * 1.8) + 18.05**2, 0.25 * (36.0 + 10 * 1.8) + 18.05**2]
+    assert state.borne_harm("honest")[0].tolist() == near(expected) and borne.tolist() == near(expected)
+    assert amounts(objectives_of("own", 2), None, state, "honest")[0].tolist() == near(expected)
 
 
 def test_honest__adds_nothing_to_a_line_that_brakes_to_rest_and_prices_driving_there() -> None:
@@ -51,6 +58,7 @@ def test_honest__adds_nothing_to_a_line_that_brakes_to_rest_and_prices_driving_t
     assert last.at_rest.tolist() == [True] and cost.tolist() == [0.0] and not last.line[:, MOVING].any()
     last, cost = played(game, alert, np.array([[[0.5], [0.5], [-1.0]]]), "honest")  # 3 m/s2 for 0.2 s
     assert last.harm("total").tolist() == [0.0] and cost.tolist() == near([10 * 0.6])
+    assert last.borne_harm("honest")[0].tolist() == [0.0, cost[0]]
 
 
 def test_push__of_a_pressed_pair_costs_10_m2_s2_for_each_m_per_s() -> None:

@@ -14,7 +14,6 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import FULL_BRAKE
-from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, amounts, objectives_of
 from ethbrake_marl.episode.state import State
@@ -52,7 +51,7 @@ class Ablation:
     steps_per_learner: int  # decisions of each learner in a training
     episodes: int  # worlds in which levels are compared, of the seed ``SEED``
     search_episodes: int  # of these worlds, counted from the first, in which the joint optimum is searched
-    budget: int  # profiles that the search tries per world and count
+    budget: int  # profiles that the search tries per world and count of harm
     noted: tuple[str, ...] = ()  # settings of scenarios and recipes, for ``config.json``
 
     def __post_init__(self) -> None:
@@ -73,11 +72,6 @@ class Ablation:
     def algorithms(self) -> tuple[str, ...]:
         """Names of the compared algorithms, each in the form ``RECIPE-SCHEME``."""
         return tuple(f"{recipe.name}-{recipe.scheme}" for recipe in self.recipes)
-
-    @property
-    def counts(self) -> tuple[str, ...]:
-        """Counts that are compared: both harms, and what else a recipe minimises."""
-        return tuple(dict.fromkeys([*HARM, *(recipe.reward.harm_count for recipe in self.recipes)]))
 
     def jobs(self) -> Iterator[tuple[Level, str, Job]]:
         """Yield each training, seed by seed, with its level and algorithm."""

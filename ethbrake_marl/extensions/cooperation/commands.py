@@ -58,8 +58,10 @@ def ablate_command(
 ) -> None:
     """Compare several levels of cooperation in the same worlds.
 
-    The command trains policies at all levels, compares the levels, and writes ablation.json, ablation.csv and the
-    figure ablation.png. After an interruption, repeat the command to continue.
+    The command trains policies at all levels, compares the levels by both harms and the honest cost, and writes
+    ablation.json, ablation.csv and the figure ablation.png. After an interruption, repeat the command to continue.
+
+    The policies minimise what the recipe counts; with --set rules=paper first-impact harm.
 
     With --sweep, the levels are copies of one scenario in which one key has different values.
     """

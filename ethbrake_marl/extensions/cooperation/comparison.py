@@ -18,8 +18,8 @@ TOLERANCE = 1e-6  # m2/s2; a vehicle counts as worse off if its harm rises by mo
 Json = dict[str, Any]
 
 
-def compare(measured: Sequence[Measured], searched: int, counts: Sequence[str]) -> Json:
-    """Return the comparison as plain data, in several counts.
+def compare(measured: Sequence[Measured], searched: int) -> Json:
+    """Return the comparison as plain data.
 
     - ``levels``: results of each level and algorithm;
     - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
@@ -30,9 +30,7 @@ def compare(measured: Sequence[Measured], searched: int, counts: Sequence[str]) 
     steps = []
     for algorithm in dict.fromkeys(each.algorithm for each in measured if each.algorithm is not None):
         own = {each.level.name: each for each in measured if each.algorithm in (None, algorithm)}
-        steps += [
-            _change(own[each.level.before], each, algorithm, counts) for each in own.values() if each.level.before
-        ]
+        steps += [_change(own[each.level.before], each, algorithm) for each in own.values() if each.level.before]
     goals = [
         (each, *(own["goal"].mean() for own in (each.reached, each.braking))) for each in measured if each.algorithm
     ]
@@ -43,8 +41,7 @@ def compare(measured: Sequence[Measured], searched: int, counts: Sequence[str]) 
     ]
     return {
         "kind": "ablate",
-        "counts": [*counts],
-        "levels": [_level(each, searched, counts) for each in measured],
+        "levels": [_level(each, searched) for each in measured],
         "steps": steps,
         "undertrained": [f"Not trained enough to say anything: {'; '.join(named)}."] if named else [],
     }
@@ -56,7 +53,7 @@ def place_of(one: Measured) -> Json:
     return {"level": one.level.name} | ({} if swept is None else {"swept_number": swept.number})
 
 
-def _level(one: Measured, searched: int, counts: Sequence[str]) -> Json:
+def _level(one: Measured, searched: int) -> Json:
     """Return the results of one level with one algorithm, as means over seeds and worlds."""
     scenario = one.level.scenario
     mean = partial(mean_over_seeds, clusters=one.clusters)
@@ -71,7 +68,7 @@ def _level(one: Measured, searched: int, counts: Sequence[str]) -> Json:
         "worlds": one.reached["collided"].shape[1],
         "collision_rate": mean(one.reached["collided"]).to_json(),
     }
-    for count, column in ((count, COLUMN[count]) for count in counts):
+    for count, column in COLUMN.items():
         reached, braking = one.reached[column], one.braking[column]
         entry[count] = {
             "full_brake": mean(braking).to_json(),
@@ -100,7 +97,7 @@ def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
     }
 
 
-def _change(before: Measured, after: Measured, algorithm: str, counts: Sequence[str]) -> Json:
+def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     """Return the change of harm between two levels, of the line and of each vehicle.
 
     Seed k of one level is compared with seed k of the other, or with its only seed.
@@ -109,7 +106,7 @@ def _change(before: Measured, after: Measured, algorithm: str, counts: Sequence[
     for word, one in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}
     mean = partial(mean_over_seeds, clusters=after.clusters)
-    for count, column in ((count, COLUMN[count]) for count in counts):
+    for count, column in COLUMN.items():
         new, old = (np.stack(_borne(each, column), axis=2) for each in (after, before))
         worse = new > old + TOLERANCE
         entry[count] = {

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import check_harm
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared
 from ethbrake_marl.episode.state import NUMBER, State
@@ -80,7 +79,7 @@ def find_equilibria(
         scenario: of the worlds, with at least one learner.
         worlds: worlds at the alert.
         objective: of each learner: one for all, such as ``own``, or one for each vehicle; None: the scenario's.
-        count: harm of the ``first`` impact of each pair, or ``total``.
+        count: what counts as harm: ``first``, ``total`` or ``honest`` (``episode.counts``).
         budget: number of plans that a learner tries in its turn, in each world.
         rounds: largest number of rounds.
 
@@ -90,7 +89,6 @@ def find_equilibria(
     """
     check_whole_number("rounds", rounds, 1)
     check_whole_number("budget", budget, 1)
-    check_harm("count", count)
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r} has no learner; give at least one vehicle the role learner")
     game, declared = open_game(scenario)[1], scenario.objective if objective is None else objective

@@ -11,18 +11,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.extensions.report.style import GREY, TITLES, finish, in_our_style, new_panels, plain, series_style
 from ethbrake_marl.files.sheet import Estimate
 
 LINEAR = 0.1  # m2/s2; axes are linear below this harm and logarithmic above it, because harm varies by a factor of 100
-LEVEL_IN, PANEL_IN, WIDEST_IN, HEIGHT_IN = 1.05, 3.4, 10.5, 4.8  # a level, least panel, figure
+LEVEL_IN, NARROWEST_IN, WIDEST_IN = 1.05, 5.0, 10.5  # width of a level, and of the figure
+PANEL_IN = 2.8  # height of a panel
 
 Json = dict[str, Any]
 
 
 @in_our_style
 def ablation_figure(results: Json, caption: str) -> Figure:
-    """Draw each count at each level, or at each value of a sweep, with 95 % intervals and a dot for each seed.
+    """Draw both harms and the honest cost at each level or swept value, with 95 % intervals and a dot for each seed.
 
     All means are over the worlds in which the joint optimum was searched.
     """
@@ -30,10 +32,9 @@ def ablation_figure(results: Json, caption: str) -> Figure:
     names = list(dict.fromkeys(level["level"] for level in levels))
     at = {level["level"]: level.get("swept_number", names.index(level["level"])) for level in levels}
     unit = (max(at.values()) - min(at.values())) / (len(at) - 1)  # mean distance between neighbours
-    counts = results["counts"]
-    width = len(counts) * min(max(PANEL_IN, LEVEL_IN * len(at)), WIDEST_IN / 2)
-    figure, panels = new_panels((width, HEIGHT_IN), columns=len(counts))
-    for axes, count in zip(panels, counts, strict=True):
+    width = min(max(LEVEL_IN * len(at), NARROWEST_IN), WIDEST_IN)
+    figure, panels = new_panels((width, PANEL_IN * len(COLUMN)), rows=len(COLUMN))
+    for axes, count in zip(panels, COLUMN, strict=True):
         points = [(at[level["level"]], level["algorithm"], level[count]["searched"]) for level in levels]
         _draw_bounds(axes, points, 0.3 * unit)
         for number, algorithm in enumerate(results["settings"]["recipes"]):

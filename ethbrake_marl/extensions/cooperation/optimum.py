@@ -1,4 +1,4 @@
-"""Joint optimum of a level: in each world, the least harm known that its learners can do together.
+"""Joint optimum of a level: in each world, the least harm or cost known that its learners can cause together.
 
 It depends on worlds, learners and scripts, but not on what the learners know or minimise, so levels that differ only in
 that share one search. The best commands of one level count for every other level whose learners can give the same ones.
@@ -53,19 +53,15 @@ def with_optima(plan: Ablation, measured: Sequence[Measured], threads: int, tell
                 say = partial(_tell, tell, f"joint optimum of {name}")
                 folder = plan.folder / "optimum" / name
                 tables[identity] = search_list(
-                    game,
-                    worlds,
-                    chunks=folder,
-                    on_progress=say,
-                    budget=plan.budget,
-                    counts=plan.counts,
-                    threads=threads,
+                    game, worlds, chunks=folder, on_progress=say, counts=[*COLUMN], budget=plan.budget, threads=threads
                 )
             teams = [each.reached for each in measured if each.level.name == name]
-            driven = {count: [row[: worlds.n] for own in teams for row in own[COLUMN[count]]] for count in plan.counts}
+            driven = {
+                count: [row[: worlds.n] for own in teams for row in own[column]] for count, column in COLUMN.items()
+            }
             answers[name] = Answer(scenario, game, worlds, tables[identity], driven)
     best = {
-        name: {count: least_known(answer, answers.values(), count)[np.newaxis] for count in plan.counts}
+        name: {count: least_known(answer, answers.values(), count)[np.newaxis] for count in COLUMN}
         for name, answer in answers.items()
     }
     return [each._replace(best=best.get(each.level.name)) for each in measured]

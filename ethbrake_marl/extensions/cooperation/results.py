@@ -34,11 +34,11 @@ def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, 
             "date": datetime.now(UTC).date().isoformat(),
         },
         "conditions": f"{conditions(plan, plan.episodes)} {machine}.",
-        **compare(measured, plan.search_episodes, plan.counts),
+        **compare(measured, plan.search_episodes),
     }
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
-    write_output(csv_file, levels_csv(measured, plan.search_episodes, plan.counts).encode(), force=True)
+    write_output(csv_file, levels_csv(measured, plan.search_episodes).encode(), force=True)
     write_picture(picture, ablation_figure(results, conditions(plan, plan.search_episodes)), force=True)
     return results, [json_file, csv_file, picture]
 
@@ -56,13 +56,13 @@ def conditions(plan: Ablation, number: int) -> str:
     optimum = f"{count_of(plan.search_episodes, 'world')}, {plan.budget:,} candidates per world and count."
     return (
         f"{recipes}; {count_of(plan.seeds, 'seed')}, {plan.steps_per_learner:,} decisions of each learner, rounded up"
-        f" to whole updates. Harms are means per world in m²/s² on {same}{first}{count_of(number, 'world')} of seed"
-        f" {SEED}{drawn}; 95 % intervals for {others}. Joint optimum: the least harm known that the learners can do,"
-        f" in the first {optimum}"
+        " to whole updates. Harm and honest cost are means per world in m²/s² on"
+        f" {same}{first}{count_of(number, 'world')} of seed {SEED}{drawn}; 95 % intervals for {others}. Joint optimum:"
+        f" the least harm or cost known that the learners can cause, in the first {optimum}"
     )
 
 
-def levels_csv(measured: Sequence[Measured], searched: int, counts: Sequence[str]) -> str:
+def levels_csv(measured: Sequence[Measured], searched: int) -> str:
     """Return CSV text with one row per level, algorithm and seed: means over worlds of all columns of an evaluation.
 
     The columns ``searched_*`` are means over the first ``searched`` worlds.
@@ -72,7 +72,7 @@ def levels_csv(measured: Sequence[Measured], searched: int, counts: Sequence[str
         for seed in range(len(one.reached["collided"])):
             row: Json = {**place_of(one), "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
             row |= {name: float(values[seed].mean()) for name, values in one.reached.items()}
-            for count, name in ((count, COLUMN[count]) for count in counts):
+            for count, name in COLUMN.items():
                 row |= {
                     f"full_brake_{name}": float(one.braking[name].mean()),
                     f"searched_{name}": float(one.reached[name][seed, :searched].mean()),
@@ -87,7 +87,7 @@ Columns = list[tuple[Column, str]]
 
 
 def tables(results: Json) -> list[Sheet]:
-    """Return the tables for the terminal, for each count."""
+    """Return the tables for the terminal, for each count of harm."""
     swept, levels = results["settings"]["swept"], results["levels"]
     several = len(results["settings"]["recipes"]) > 1
     algorithm: Columns = [(Column("Algorithm", text=True), "algorithm")] if several else []
@@ -98,7 +98,7 @@ def tables(results: Json) -> list[Sheet]:
     worlds = count_of(levels[0]["first"]["searched"]["worlds"], "world")
     known = [level for level in levels if level["first"]["searched"]["best_known"] is not None]
     sheets = []
-    for count, harm in ((count, IN_WORDS[count]) for count in results["counts"]):
+    for count, harm in ((count, IN_WORDS[count]) for count in COLUMN):
         sheets += [
             sheet(f"Levels, {harm}", levels, [
                 *about, *algorithm, (share("Collisions"), "collision_rate"),

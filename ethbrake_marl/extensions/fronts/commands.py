@@ -50,16 +50,16 @@ def front_command(
 ) -> None:
     """Show how sparing one vehicle changes the harm of the others.
 
-    For each choice of weights, a search looks in every world for the commands with the least weighted harm. The command
-    compares the results with full braking, with maximin (commands that minimise the largest harm of a vehicle) and, if
-    there is one learner, with agents. The default choices of weights are a grid, equal weights, and, for each vehicle,
-    weight 1 for this vehicle and a tiny weight for all others. The command writes front.json and front.png.
+    For each choice of weights, a search looks in every world for the commands with the least weighted honest cost (with
+    --set rules=paper: first-impact harm). Beside them stand full braking, maximin (the least that the largest cost of a
+    vehicle can be) and, if there is one learner, agents. The default weights are a grid, equal weights, and, for each
+    vehicle, 1 with a tiny weight for all others. The command writes front.json and front.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
 
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.episode.counts import check_harm
+        from ethbrake_marl.episode.counts import check_count
         from ethbrake_marl.extensions.fronts.figures import front_figure
         from ethbrake_marl.extensions.fronts.front import least_largest, search_front
         from ethbrake_marl.extensions.fronts.results import front_results, front_sheet, full_braking, hypervolume_sheet
@@ -70,8 +70,8 @@ def front_command(
         from ethbrake_marl.names import split_specs
 
         changes = read_settings(settings, of_command=("harm_count",))
-        chosen, count = changes.change_scenario(scenario), changes.command.get("harm_count", "first")
-        check_harm("harm_count", count)
+        chosen, count = changes.change_scenario(scenario), changes.command.get("harm_count", "honest")
+        check_count("harm_count", count)
         rows: Any
         if weights is None:
             N = chosen.vehicles

@@ -9,7 +9,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.extensions.report.style import finish, in_our_style, label_text, new_panels, plain, series_style
+from ethbrake_marl.extensions.report.style import (
+    TITLES,
+    finish,
+    in_our_style,
+    label_text,
+    new_panels,
+    plain,
+    series_style,
+)
 
 SIZE_IN = (5.6, 4.6)  # narrow enough for a phone
 
@@ -18,7 +26,7 @@ Json = dict[str, Any]
 
 @in_our_style
 def front_figure(results: Json) -> Figure:
-    """Draw the mean harm of the line (horizontally) against the mean harm of the vehicle that bears most (vertically).
+    """Draw the mean of what is weighted for the line against that for the vehicle that bears most (vertically).
 
     The figure has one point for each choice of weights. ``results`` is the content of ``front.json``.
     """
@@ -36,8 +44,7 @@ def front_figure(results: Json) -> Figure:
             axis.set_major_formatter(FuncFormatter(plain))
             axis.set_minor_formatter(FuncFormatter(plain))
     axes.tick_params(which="minor", labelsize=7)
-    impacts = {"first": "first impacts", "total": "all impacts"}[count]
-    axes.set(xlabel=f"Harm of the line, {impacts} (m²/s²)", ylabel="Harm of the vehicle that bears most (m²/s²)")
+    axes.set(xlabel=f"Line: {TITLES[count].lower()}", ylabel=f"Vehicle that bears most: {TITLES[count].lower()}")
     worlds = count_of(results["episodes"], "world")
     caption = f"{results['scenario']}, {worlds}; one point for each of {len(results['points'])} choices of the weights."
     return finish(figure, caption, axes, columns=2, fontsize=8)

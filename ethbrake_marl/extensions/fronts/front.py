@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.agents.drive import Team
-from ethbrake_marl.episode.counts import HARM, check_harm
+from ethbrake_marl.episode.counts import COUNTS, check_count
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_one_learner
@@ -40,7 +40,7 @@ class Front(NamedTuple):
     """The harm of each vehicle in n worlds, with the best commands for each of W choices of weights."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
-    harm_count: str  # count of harm that is weighted, ``first`` or ``total``
+    harm_count: str  # count that is weighted (``episode.counts``)
     borne: Borne  # [W, n, N] m2/s2 by count
     agents: Mapping[str, Borne]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
 
@@ -68,7 +68,7 @@ def search_front(
     worlds: State,
     weights: Sequence[Sequence[float]] | Floats,
     *,
-    count: str = "first",
+    count: str = "honest",
     budget: int = BUDGET,
     threads: int = 1,
     agents: Sequence[str] = (),
@@ -84,14 +84,14 @@ def search_front(
     >>> from ethbrake_marl.extensions.fronts.front import search_front
     >>> scenario = eb.load_scenario("paper-random")
     >>> front = search_front(scenario, scenario.sample(2, 7), [[1, 1, 1], [1, 0, 0]], budget=60)
-    >>> bool((front.borne["first"][1, :, 0] <= front.borne["first"][0, :, 0]).all())
+    >>> bool((front.borne["honest"][1, :, 0] <= front.borne["honest"][0, :, 0]).all())
     True
 
     Args:
         scenario: of the worlds; its learners are controlled.
         worlds: n worlds at the alert.
         weights: weights of the vehicles' harm, [W, N].
-        count: harm of the ``first`` impact of each pair, or ``total``.
+        count: what is weighted: ``first``, ``total`` or ``honest`` (``episode.counts``).
         budget: number of profiles that are tried for each world and choice of weights.
         threads: of the search.
         agents: names of agents for the one learner. For each choice of weights they drive every world, with these
@@ -102,7 +102,7 @@ def search_front(
     with a column for each vehicle, and for a row that cannot be a ``harm_weight``.
 
     """
-    check_harm("count", count)
+    check_count("count", count)
     weights = weight_table(weights.tolist() if isinstance(weights, np.ndarray) else weights)
     if weights.shape[1] != scenario.vehicles:
         raise InvalidInput(
@@ -138,7 +138,7 @@ def search_front(
 
 
 def _joined(parts: Sequence[Borne]) -> Borne:
-    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in HARM}
+    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in COUNTS}
 
 
 def _tried(
@@ -161,7 +161,7 @@ def _tried(
             else:
                 profiles = driven_profiles(problem, game, worlds._replace(car=car), team)
                 driven[name].append(pool.add(profiles))
-    return {name: {count: np.stack([one[count] for one in each]) for count in HARM} for name, each in driven.items()}
+    return {name: {count: np.stack([one[count] for one in each]) for count in COUNTS} for name, each in driven.items()}
 
 
 def observes_weights(team: Team) -> bool:
@@ -190,7 +190,7 @@ class Pool:
     def __init__(self, problem: Problem, count: str) -> None:
         self.problem, self.count = problem, count
         self.profiles: list[Profiles] = []
-        self.borne: dict[str, list[Floats]] = {each: [] for each in HARM}
+        self.borne: dict[str, list[Floats]] = {each: [] for each in COUNTS}
 
     def add(self, profiles: Profiles) -> Borne:
         """Add one profile for each world; return each vehicle's harm, [n, N] m2/s2 by count."""
@@ -231,7 +231,7 @@ def least_largest(scenario: Scenario, worlds: State, front: Front, *, budget: in
         some = worlds.take(slice(first, first + CHUNK))
         table = best_harm(game, some, counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin")
         last = problem_of(game, some).follow(table.profiles[front.harm_count])
-        parts.append({count: last.borne_harm(count)[np.newaxis] for count in HARM})
-    every = {count: np.concatenate([_joined(parts)[count], front.borne[count]]) for count in HARM}
+        parts.append({count: last.borne_harm(count)[np.newaxis] for count in COUNTS})
+    every = {count: np.concatenate([_joined(parts)[count], front.borne[count]]) for count in COUNTS}
     chosen = every[front.harm_count].max(axis=2).argmin(axis=0)
     return {count: borne[chosen, np.arange(worlds.n)] for count, borne in every.items()}

@@ -10,7 +10,7 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.agents.scripts import FULL_BRAKE
-from ethbrake_marl.episode.counts import HARM, IN_WORDS
+from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
 from ethbrake_marl.evaluation.captions import by_recording
 from ethbrake_marl.evaluation.identity import about_scenario, versions, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
@@ -70,7 +70,7 @@ def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
         amounts = weighted(harm, weights)
         points.append({
             "weights": weights.tolist(),
-            "vehicles": _vehicles({count: borne[count][k] for count in HARM}, by),
+            "vehicles": _vehicles({count: borne[count][k] for count in COUNTS}, by),
             "amount": mean(amounts, by).to_json(),
             "sum": mean(harm.sum(axis=1), by).to_json(),
             "above": difference(amounts, least, by).to_json(),
@@ -80,7 +80,7 @@ def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
 
 
 def _vehicles(borne: Borne, by: Clusters) -> dict[str, list[Json]]:
-    return {count: [mean(each, by).to_json() for each in borne[count].T] for count in HARM}
+    return {count: [mean(each, by).to_json() for each in borne[count].T] for count in COUNTS}
 
 
 def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
@@ -112,18 +112,19 @@ def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
     """Return the harm of each vehicle if the learners brake fully from the alert on, [n, N] m2/s2 by count."""
     game = open_game(scenario)[1]
     last = drive(game, drawn.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
-    return {count: last.borne_harm(count) for count in HARM}
+    return {count: last.borne_harm(count) for count in COUNTS}
 
 
 def front_sheet(results: Json) -> Sheet:
     """Return a table with one row for each choice of weights, and for each result beside the front.
 
-    A row has the mean harm of each vehicle; that of a choice of weights also the ``ratio`` of each agent.
+    A row has the mean of what is weighted for each vehicle, and the mean of every count for the line; that of a choice
+    of weights also the ``ratio`` of each agent.
     """
     count, agents = results["harm_count"], results["agents"]
 
     def row(name: str, vehicles: Mapping[str, list[Json]], *ratios: float | None) -> tuple[str | float | None, ...]:
-        means = {each: [harm["value"] for harm in vehicles[each]] for each in HARM}
+        means = {each: [harm["value"] for harm in vehicles[each]] for each in COUNTS}
         return (name, *means[count], *map(sum, means.values()), *ratios)
 
     rows = [
@@ -136,11 +137,12 @@ def front_sheet(results: Json) -> Sheet:
     columns = [
         Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(results["vehicles"]))),
         Column("Sum, first impacts", short="First"), Column("Sum, all impacts", short="All"),
+        Column("Sum, honest cost", short="Honest"),
         *(Column(name, digits=3, short=re.sub("(?<=[/+])", "\n", name)) for name in agents),
     ]  # fmt: skip
     note = (
-        f"Mean {IN_WORDS[count]} of each vehicle, and mean first-impact and total"
-        " harm of the line, m2/s2. Agents: weighted harm of the agent divided by the weighted harm of the front"
+        f"Mean {IN_WORDS[count]} of each vehicle, and mean first-impact harm, total harm and honest cost of the line,"
+        f" m2/s2. Agents: weighted {IN_WORDS[count]} of the agent divided by that of the front"
         f"{by_recording(results.get('recordings', 0))}."
     )
     return Sheet(f"Front of {results['scenario']}, {results['episodes']:,} worlds", columns, rows, note, gap=2)
@@ -155,4 +157,4 @@ def hypervolume_sheet(results: Json) -> Sheet:
         for name, volume in each["of"].items()
     ]
     columns: list[Column | str] = ["Reference", "Of", Column("Hypervolume"), share]
-    return Sheet("Hypervolume of the mean harm (m2/s2)^N", columns, rows, gap=2)
+    return Sheet(f"Hypervolume of the mean {IN_WORDS[results['harm_count']]}, (m2/s2)^N", columns, rows, gap=2)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import check_harm
+from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
@@ -283,7 +283,8 @@ def lower_bound(
     Args:
         state: the n episodes now.
         body: the controlled vehicle (1: Vehicle 1); all others brake fully.
-        count: ``first`` (of each pair only the first impact) or ``total``.
+        count: ``first`` (of each pair only the first impact), ``total``, or ``honest``, which has the bound of
+            ``total`` because the honest cost is never below total harm.
         horizon_s: time until which harm counts, s after the alert.
         time_step_s: time between two decisions (s), the first when the vehicle may act, as for every agent. The bound
             is larger than with None, but holds only for commands that change at decisions, and takes ten times as long.
@@ -296,6 +297,7 @@ def lower_bound(
     reason = avoidability(state, body).reason
     start = state.time_s + rows_of(state, body)[:, ONSET_F]
     _check_asked(state, start, count, horizon_s, time_step_s)
+    count = "total" if count == "honest" else count
     full = np.pad(-state.braking_capacity_mps2, ((0, 0), (1, 0)))
     now = advanced(state._replace(wanted=full), start)  # until then all brake fully
     counts = (now.speeds_mps[:, 1:] >= 0.0) & (now.speeds_mps[:, :-1] >= 0.0) & ((count == "total") | ~now.pair_hit)
@@ -318,7 +320,7 @@ def lower_bound(
 
 
 def _check_asked(state: State, start: Floats, count: str, horizon_s: float, time_step_s: float | None) -> None:
-    check_harm("lower_bound: count", count)
+    check_count("lower_bound: count", count)
     if not (isinstance(horizon_s, int | float) and (start <= horizon_s).all() and horizon_s < math.inf):
         raise InvalidInput(
             f"lower_bound: horizon_s = {horizon_s!r}: must be a finite number of at least {start.max():g} (s): by then"

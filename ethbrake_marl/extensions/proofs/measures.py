@@ -27,7 +27,7 @@ _known: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: 
 
 
 def proven_harm(game: Game, alert: State, last: State) -> Given:
-    """Lower bound on the harm, in either count, of all commands that change at decisions; ``impact``: it is above 0."""
+    """Lower bound on the harm or honest cost of all commands that change at decisions; ``impact``: it is above 0."""
     body, rules = _controlled(game, alert), game.rules
     asked = np.array([body, rules.horizon_s, rules.time_step_s]).tobytes() + alert.line.tobytes() + alert.car.tobytes()
     if asked not in _known:

@@ -47,7 +47,7 @@ class World(NamedTuple):
     wanted: Floats  # [N + 1] commands of all bodies (m/s2); overwritten
     bodies: Ints  # [B] vehicles that are controlled
     bounds: Floats  # [B, 2] their smallest and largest command (m/s2)
-    shares: Floats  # [2, N + 1], as in `Problem`
+    shares: Floats  # [3, N + 1], as in `Problem`
     numbers: Floats  # [NUMBERS] time step (s), horizon (s), aim, whether step by step
     weights: Floats  # [2, 6] of the count that is minimised, and of the one that decides ties
     random: UInt64s  # [1] state of the random stream

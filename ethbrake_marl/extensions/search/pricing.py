@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, weights_of
+from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, own_amount, pair_amount, weights_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
 from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State
@@ -128,7 +128,7 @@ class Problem(NamedTuple):
     horizon_s: float
     harm_count: str  # what is minimised (`episode.counts`)
     aim: float  # WHOLE, WEIGHTED or LARGEST
-    shares: Floats  # [n, 2, N + 1] of each pair: weight of its harm in that of its front vehicle; of its rear vehicle
+    shares: Floats  # [n, 3, N + 1] weights of what a pair's front and rear vehicle share, and of the rear's own amount
     identity: UInt64s  # [n] hash of everything that decides the harm of a profile (``identities``)
 
     @property
@@ -211,8 +211,9 @@ class Problem(NamedTuple):
         mass = self.state.car[:, MASS]
         weights = np.pad(np.broadcast_to(weights, (self.n, mass.shape[1] - 1)), ((0, 0), (1, 0)))
         front = mass[:, 1:] / (mass[:, :-1] + mass[:, 1:])  # 0 of the obstacle, whose mass is infinite
-        shares = np.zeros((self.n, 2, mass.shape[1]))
+        shares = np.zeros((self.n, 3, mass.shape[1]))
         shares[:, 0, :-1], shares[:, 1, :-1] = weights[:, :-1] * front, weights[:, 1:] * (1.0 - front)
+        shares[:, 2, :-1] = weights[:, 1:]
         return self._replace(shares=shares, aim=LARGEST if largest else WEIGHTED)
 
     def check(self, profiles: Profiles) -> None:
@@ -277,7 +278,7 @@ def problem_of(
     dt, horizon = game.rules.time_step_s, game.rules.horizon_s
     decide = chosen if deciders is None else np.array(deciders, np.int64)
     state = first_decision(alert._replace(wanted=wanted, memories={}), decide, dt, horizon)
-    shares = np.zeros((alert.n, 2, wanted.shape[1]))
+    shares = np.zeros((alert.n, 3, wanted.shape[1]))
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST]]]
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack([*times, np.full((alert.n, 1), horizon)]))
     return aimed(Problem(chosen, state, dt, horizon, count, WHOLE, shares, identity), objective)
@@ -338,9 +339,10 @@ def worth(line, shares, weights, aim):
     for i in range(line.shape[1]):
         borne = from_ahead
         if i < line.shape[1] - 1:
-            amount = pair_amount(line, i, weights)
-            borne += shares[0, i] * amount
-            from_ahead = shares[1, i] * amount
+            own = own_amount(line, i, weights)
+            shared = pair_amount(line, i, weights) - own
+            borne += shares[0, i] * shared
+            from_ahead = shares[1, i] * shared + shares[2, i] * own
         value = max(value, borne) if aim == LARGEST else value + borne
     return value
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.extensions.cooperation.ablation import Measured
 from ethbrake_marl.extensions.cooperation.comparison import compare
 from ethbrake_marl.extensions.cooperation.levels import Level
@@ -23,14 +23,14 @@ from tests.fixtures.pictures import draw_nothing
 def columns(vehicles: list[list[float]]) -> dict[str, np.ndarray]:
     """One seed, in as many worlds as there are rows of harm of three vehicles."""
     each = np.array([vehicles], np.float64)
-    borne = {f"{name}_{i + 1}": each[:, :, i] for name in ("first_impact_harm", "total_harm") for i in range(3)}
-    line = dict.fromkeys(("first_impact_harm", "total_harm", "goal"), each.sum(axis=2))
+    borne = {f"{name}_{i + 1}": each[:, :, i] for name in COLUMN.values() for i in range(3)}
+    line = dict.fromkeys((*COLUMN.values(), "goal"), each.sum(axis=2))
     return {**borne, **line, "collided": each.any(axis=2)}
 
 
 def measured(level: str, vehicles: list[list[float]], algorithm: str | None, braking=None, before=None) -> Measured:
     scenario = eb.load_scenario(level)
-    best = dict.fromkeys(("first", "total"), np.ones((1, len(vehicles))))
+    best = dict.fromkeys(COLUMN, np.ones((1, len(vehicles))))
     worlds = scenario.sample(1, 0)
     return Measured(
         Level(level, scenario, before), algorithm, columns(vehicles), columns(braking or vehicles), worlds, best
@@ -42,9 +42,9 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
     after = measured(
         "cooperation-1-front", [[1, 2, 3], [0, 2, 0], [1, 2, 0], [0, 0, 0]], "ppo", None, before.level.name
     )
-    (step,) = compare([before, after], 4, [*HARM])["steps"]
+    (step,) = compare([before, after], 4)["steps"]
     assert (step["from"], step["to"], step["algorithm"]) == ("cooperation-0-sensors", "cooperation-1-front", "ppo")
-    for count in ("first", "total"):
+    for count in COLUMN:
         change = step[count]
         assert change["difference"]["value"] == pytest.approx((0 - 4 + 1 + 0) / 4)
         assert [each["value"] for each in change["vehicles"]] == pytest.approx([-0.25, -1.25, 0.75])
@@ -54,18 +54,18 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
 
 def test_level__share_of_the_reduction_and_too_little_training_by_hand() -> None:
     one = measured("cooperation-1-front", [[1, 2, 0], [0, 2, 0]], "ppo", [[0, 6, 0], [0, 5, 0]])
-    found = compare([one], 2, [*HARM])
+    found = compare([one], 2)
     share = found["levels"][0]["first"]["searched"]["share_of_possible_reduction"]
     assert share["value"] == pytest.approx((5.5 - 2.5) / (5.5 - 1.0)) and found["undertrained"] == []
     worse = measured("cooperation-1-front", [[0, 6, 0], [0, 5, 0]], "ppo", [[1, 2, 0], [0, 2, 0]])
-    (sentence,) = compare([worse], 2, [*HARM])["undertrained"]
+    (sentence,) = compare([worse], 2)["undertrained"]
     assert "cooperation-1-front (ppo) with 5.50 (2.50 with full braking)" in sentence
 
 
 def test_csv__has_a_row_for_each_seed() -> None:
     one = measured("cooperation-1-front", [[1, 2, 3], [0, 2, 0]], "ppo")
     both = one._replace(reached={name: np.concatenate([each, 2 * each]) for name, each in one.reached.items()})
-    row, other = csv.DictReader(levels_csv([both], 1, [*HARM]).splitlines())
+    row, other = csv.DictReader(levels_csv([both], 1).splitlines())
     assert (row["level"], row["seed"], row["first_impact_harm"]) == ("cooperation-1-front", "0", "4.0")
     assert (other["seed"], other["first_impact_harm"], other["searched_total_harm"]) == ("1", "8.0", "12.0")
     assert (row["searched_total_harm"], row["total_harm_3"], row["searched_best_known_total_harm"]) == (
@@ -126,15 +126,15 @@ def test_ablation__trains_compares_and_goes_on(
     assert config["settings"] == ["horizon_s=7", "rules=honest"] and config["recipe"]["scheme"] is None
     pair = json.loads((out / "trainings" / folders[2] / "config.json").read_text())["recipe"]
     assert (config["recipe"]["total_steps"], pair["total_steps"]) == (128, 256)
-    assert found["counts"] == ["first", "total", "honest"] and "rewarded for honest cost" in found["conditions"]
     for level in found["levels"][1:]:
         assert level["seeds"] == 2
-        for count in found["counts"]:
+        for count in ("first", "total", "honest"):
             searched = level[count]["searched"]
             assert searched["best_known"]["value"] <= searched["harm"]["value"]
-        assert level["honest"]["harm"]["value"] > level["total"]["harm"]["value"]
+        assert level["honest"]["searched"]["best_known"]["value"] >= level["total"]["searched"]["best_known"]["value"]
         assert len(level["policy_sha256"]) == 2 and level["policy_sha256"][0] != level["policy_sha256"][1]
     assert found["levels"][1]["first"]["full_brake"] == found["levels"][2]["first"]["full_brake"]
+    assert "(rewarded for honest cost)" in found["conditions"]
     assert "first 2 worlds" in found["conditions"] and "2 seeds, 128 decisions" in found["conditions"]
     again = ethbrake(*line.split(), *small.split(), "--output", "out", "--json")
     assert again.status == 0 and json.loads(again.out)["levels"] == found["levels"]

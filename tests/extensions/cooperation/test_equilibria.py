@@ -73,14 +73,15 @@ def test_what_converged__no_learner_improves_by_constants_or_two_commands(name: 
         assert beaten_by(scenario, worlds, end, objective)[end.converged].max() <= 0.02
 
 
-def test_turn__minimises_the_objective_of_its_learner_alone() -> None:
+@pytest.mark.parametrize("count", ["first", "honest"])
+def test_turn__minimises_the_objective_of_its_learner_alone(count: str) -> None:
     scenario, game = eb.open_game("cooperation-3-pair")
     worlds = scenario.sample(5, 3)
     for body, other in ((2, 3), (3, 2)):
-        problem = turn_of(game, worlds, body, ["total", "own", "maximin"], "first")
+        problem = turn_of(game, worlds, body, ["total", "own", "maximin"], count)
         assert problem.bodies.tolist() == [body, other]
-        last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 0]))
-        borne = last.borne_harm("first")
+        last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
+        borne = last.borne_harm(count)
         expected = borne[:, 1] if body == 2 else borne.max(axis=1)
         assert problem.value(last) == pytest.approx(expected)
 
@@ -97,6 +98,16 @@ def test_ends__never_beat_the_joint_optimum_and_do_not_depend_on_other_worlds() 
     assert (joint <= best).all()
     for end in ends.values():
         assert (end.borne.sum(axis=1) >= joint).all()
+
+
+def test_honest_cost__counts_in_equilibria_and_in_the_joint_optimum() -> None:
+    scenario, worlds = two_vehicles(6.0, "learner")
+    ends = find_equilibria(scenario, worlds, count="honest", budget=300)
+    problem = problem_of(eb.open_game(scenario)[1], worlds)
+    for end in ends.values():
+        assert end.borne.tolist() == problem.follow(end.profiles).borne_harm("honest").tolist()
+    joint = best_joint_harm(scenario, worlds, ends.values(), budget=300, count="honest")
+    assert joint.sum() <= min(end.borne.sum() for end in ends.values())
 
 
 def ends_of(*borne: list[list[float]], converged: list[list[bool]]) -> dict[str, Equilibrium]:

@@ -11,7 +11,7 @@ from tests.fixtures.commands import Command, Refuse, told_json
 SMALL = "--episodes 20 --steps 1 --budget 100"
 
 
-def test_front__writes_json_and_a_figure_and_prints_both_counts(ethbrake: Command, empty_folder: Path) -> None:
+def test_front__writes_json_and_a_figure_and_prints_every_count(ethbrake: Command, empty_folder: Path) -> None:
     answer = ethbrake(*f"study front {SMALL} --agents e_v2x_bm --output out".split())
     assert answer.status == 0, answer.err
     found = json.loads(Path("out/front.json").read_text())
@@ -20,10 +20,11 @@ def test_front__writes_json_and_a_figure_and_prints_both_counts(ethbrake: Comman
         len(found["points"]) == len(found["agents"]["e_v2x_bm"]) == 7
     )  # corners, equal weights, corners that break ties
     assert found["agents"]["e_v2x_bm"][1]["ratio"] >= 1.0
+    assert found["harm_count"] == "honest" and [*found["points"][0]["vehicles"]] == ["first", "total", "honest"]
     assert {each["reference"] for each in found["hypervolume"]} == {"full braking", "largest harm of each vehicle"}
     with Image.open("out/front.png") as picture:
         assert picture.width > 700
-    for words in ("0,1,0", "full_brake", "maximin", "First", "All", "e_v2x_bm", "Hypervolume"):
+    for words in ("0,1,0", "full_brake", "maximin", "First", "All", "Honest", "e_v2x_bm", "Hypervolume"):
         assert words in answer.out
 
 
@@ -45,8 +46,7 @@ def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, 
         ("--scenario cooperation-4-all --agents full_brake,coast", ("agents can drive only one learner",)),
         ("--steps 50", ("1,326 choices of weights", "at most 1,000")),
         ("--set roles.vehicle_2=full_brake", ("has no learner",)),
-        ("--set harm_count=last", ("must be 'first' or 'total'",)),
-        ("--set rules=honest", ("harm_count = 'honest': must be 'first' or 'total'",)),
+        ("--set harm_count=last", ("harm_count = 'last': must be 'first', 'total' or 'honest'",)),
     ],
 )
 def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple[str, ...]) -> None:
@@ -55,9 +55,10 @@ def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple
 
 @pytest.mark.filterwarnings("error")
 def test_front__without_any_harm_has_a_figure_and_no_warning(ethbrake: Command, empty_folder: Path) -> None:
-    line = "study front --weights 1,1,1 --episodes 3 --budget 50 --agents coast --output out"
+    line = "study front --weights 1,1,1 --episodes 3 --budget 50 --agents coast --set rules=paper --output out"
     answer = ethbrake(*line.split(), "--set", "gaps_m=1000")
     assert answer.status == 0 and Path("out/front.png").is_file(), answer.err
+    assert json.loads(Path("out/front.json").read_text())["harm_count"] == "first"
 
 
 def test_front__does_not_replace_results(ethbrake: Command, empty_folder: Path) -> None:

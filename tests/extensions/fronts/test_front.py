@@ -5,6 +5,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.drive import Team, drive
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import difference, mean
 from ethbrake_marl.extensions.fronts.front import Front, least_largest, observes_weights, search_front, weighted
@@ -23,7 +24,7 @@ AGENTS = ["e_v2x_bm", "universal-paper", "vine-preference"]
 
 @pytest.fixture(scope="module")
 def front() -> Front:
-    return search_front(PAPER, WORLDS, WEIGHTS, budget=300, agents=AGENTS)
+    return search_front(PAPER, WORLDS, WEIGHTS, count="first", budget=300, agents=AGENTS)
 
 
 def preferring(row: np.ndarray) -> eb.Scenario:
@@ -73,7 +74,7 @@ def test_agents__beside_the_front_bear_what_an_evaluation_says(spec: str, front:
     scenario, game = eb.open_game(preferring(WEIGHTS[4]))
     agent = eb.make_agent(spec, scenario=scenario)
     last = drive(game, scenario.sample(20, 7), Team(spec, {2: agent}))
-    for count in ("first", "total"):
+    for count in COUNTS:
         assert front.agents[spec][count][4].tolist() == last.borne_harm(count).tolist()
 
 
@@ -89,6 +90,15 @@ def test_equal_weights__are_as_good_as_the_tables(front: Front) -> None:
     assert (front.borne["first"][3].sum(axis=1) <= known + 1e-9).all()
 
 
+def test_honest_cost__is_the_default_and_leaves_less_of_it_than_the_papers_rules(front: Front) -> None:
+    mine = search_front(PAPER, WORLDS.take(np.arange(6)), WEIGHTS[[3]], budget=300, agents=["universal"])
+    cost, papers, universal = (each["honest"][0].sum(axis=1) for each in (
+        mine.borne, {"honest": front.borne["honest"][[3], :6]}, mine.agents["universal"]
+    ))  # fmt: skip
+    assert mine.harm_count == "honest" and (cost <= universal).all() and cost.mean() < 0.9 * papers.mean()
+    assert (mine.amounts[0] == pytest.approx(cost)) and (mine.borne["total"][0].sum(axis=1) <= cost + 1e-9).all()
+
+
 def test_corner__decides_between_equals_by_the_others(front: Front) -> None:
     alone, first = front.borne["first"][0], front.borne["first"][-1]  # Vehicle 3's harm alone, and first
     assert alone[:, 2].mean() == pytest.approx(first[:, 2].mean(), abs=0.01) and first.sum() <= alone.sum() + 1e-9
@@ -98,7 +108,7 @@ def test_front__does_not_depend_on_the_other_worlds_or_threads(front: Front, mon
     monkeypatch.setattr("ethbrake_marl.extensions.fronts.front.CHUNK", 2)
     some, heard = np.array([3, 17, 11]), []
     again = search_front(
-        PAPER, WORLDS.take(some), WEIGHTS, budget=300, agents=AGENTS, threads=3,
+        PAPER, WORLDS.take(some), WEIGHTS, count="first", budget=300, agents=AGENTS, threads=3,
         on_progress=lambda *each: heard.append(each),
     )  # fmt: skip
     for count in ("first", "total"):

@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.proofs.followers import after, after_rear, held_by
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, REAR_FIRST
 from ethbrake_marl.extensions.proofs.lower_bound import front_first, lower_bound, rear_first, rounding
 from ethbrake_marl.extensions.proofs.meetings import gentlest, gentlest_front, meet_front, meet_rear
-from ethbrake_marl.motion.layout import SPEED
+from ethbrake_marl.motion.layout import HIT, SPEED
 from tests.extensions.proofs.worlds import opening, play, searched_harm, wide_worlds, worlds
 from tests.motion.lines import lines
 from tests.refused import refused
@@ -71,9 +71,13 @@ def test_bound__is_never_above_what_its_own_optimum_reaches_in_steps(body, step)
 
 def test_both_pairs__add_up():
     # Vehicle 2 cannot drive, and coasts into neither: 300 at the front as above; the rear one is 20 m/s faster.
-    bound = lower_bound(worlds([10, 1], [0, 20, 40], [5, 5, 5]))
+    state = worlds([10, 1], [0, 20, 40], [5, 5, 5])
+    bound = lower_bound(state)
     assert (bound.front_pair[0], bound.rear_pair[0]) == pytest.approx((300, 400 - 2 * 5 * 1))
     assert bound.harm[0] >= bound.front_pair[0] + bound.rear_pair[0]
+    state.line[:, HIT] = 1.0  # further impacts count in total harm, and the honest cost is never below it
+    first, total, honest = (lower_bound(state, count=count).harm[0] for count in ("first", "total", "honest"))
+    assert first == 0.0 and honest == total == pytest.approx(bound.harm[0])
 
 
 def test_early__impacts_before_the_latency_are_certain():
@@ -343,7 +347,7 @@ def test_who_stands_at_the_leader__is_struck_together_with_it(time_step_s, mass,
 
 THREE = worlds([7, 7], [20, 18, 20], [6, 7, 6], [0, 0.5, 0.8])
 REFUSED = {
-    "lower_bound: count = 'worst': must be 'first' or 'total'": dict(count="worst"),
+    "lower_bound: count = 'worst': must be 'first', 'total' or 'honest'": dict(count="worst"),
     "lower_bound: horizon_s = 0.2: must be a finite number of at least 0.5": dict(horizon_s=0.2),
     "lower_bound: horizon_s = inf: must be a finite number of at least 0.5": dict(horizon_s=math.inf),
     "lower_bound: horizon_s = '8': must be a finite number": dict(horizon_s="8"),

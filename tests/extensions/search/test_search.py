@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search.best_harm import best_harm, joined, search_list, starting_profiles
 from ethbrake_marl.extensions.search.extremes import KEPT
@@ -11,7 +12,7 @@ from ethbrake_marl.extensions.search.kernels import try_all
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
 from ethbrake_marl.extensions.search.search import compact, prepared, refine, search_profiles, seeded
 from ethbrake_marl.extensions.search.tables import BestHarmTable
-from ethbrake_marl.motion.layout import MOVING
+from ethbrake_marl.motion.layout import DROVE, MOVING
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
 
@@ -147,6 +148,14 @@ def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool
         world, room = prepared(problem, k, random, driving.ends.shape[1], stepwise)
         try_all(world, room, driving.ends[[k]], driving.commands_mps2[[k]], values)
         assert values[0] == pytest.approx(cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("objective", ["own", "weighted:1,4,2", "maximin"])
+def test_value__of_the_honest_cost_of_vehicles_is_the_amount_of_the_objective(objective: str) -> None:
+    problem = problem_of(GAME, WORLDS, count="honest", objective=objective)
+    last = problem.follow(problem.constant(problem.bounds[:, np.newaxis, :, 1]))
+    assert last.line[:, MOVING].any(axis=1).all() and last.line[:, DROVE].any(axis=1).all()
+    assert problem.value(last) == pytest.approx(amounts(objectives_of(objective, 3), None, last, "honest")[:, 1])
 
 
 def test_extremes__are_better_than_constants() -> None:
