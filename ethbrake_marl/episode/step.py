@@ -151,7 +151,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
 
 
 @kernel
-def beside_harm(line, count):
+def beside_harm(line: Floats, count: Floats) -> float:
     """Return what counts of one world so far beside first-impact and total harm (m2/s2)."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
