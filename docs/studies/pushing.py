@@ -1,9 +1,11 @@
 """Results of the training programs in docs/train.md and README with five seeds: the table `training-blocks`.
 
+    python docs/studies/pushing.py one-honest pair-honest readme-honest
     python docs/studies/pushing.py one pair readme one-bootstrap pair-bootstrap readme-bootstrap one-speed pair-speed
 
-Each argument names a program. ``-bootstrap`` trains with ``horizon_is_end=False``, ``-speed`` with the reward term of
-docs/train.md that makes a vehicle stop. A training takes one or two minutes on one core.
+Each argument names a program. ``-honest`` trains for the honest cost, as the pages do; the others train for first-impact
+harm, ``-bootstrap`` with ``horizon_is_end=False``, ``-speed`` with the reward term of docs/train.md that makes a vehicle
+stop. A training takes one or two minutes on one core.
 """
 
 from __future__ import annotations
@@ -27,6 +29,8 @@ SEEDS, STEPS, WORLDS = range(5), 200_000, 500
 MEASURES = {  # heading -> measure, factor, digits
     "first-impact harm": ("first_impact_harm", 1.0, 2),
     "total harm": ("total_harm", 1.0, 2),
+    "honest cost": ("honest_cost", 1.0, 2),
+    "push (m/s)": ("pushed_mps", 1.0, 2),
     "sampled harm": ("sampled_harm", 1.0, 1),
     "Vehicle 1 pushed (m)": ("pushed_m_1", 1.0, 1),
     "moving at 8 s (%)": ("moving", 100.0, 1),
@@ -43,6 +47,7 @@ def train(block: str, seed: int) -> PPO:
     name, _, variant = block.partition("-")
     scenario, worlds, reward = BLOCKS[name]
     reward = {**reward, "speed": 5e-4} if variant == "speed" else reward
+    reward = {**reward, "harm_count": "honest"} if variant == "honest" else reward
     settings = {"horizon_is_end": False} if variant == "bootstrap" else {}
     venv = eb.make_sb3_vec_env(scenario, n_envs=worlds, reward=reward, **settings)
     return PPO("MlpPolicy", venv, n_steps=64, batch_size=512, learning_rate=1e-3, seed=seed).learn(STEPS)
@@ -52,7 +57,7 @@ def measure(block: str, model: PPO) -> dict[str, float]:
     """Return the measures of the policy on worlds that no training uses."""
     agents = {block: eb.policy_agent(model, clip=True)}
     scenario = BLOCKS[block.partition("-")[0]][0]
-    asked = "pushed_m,sampled_harm"
+    asked = "pushed_m,pushed_mps,sampled_harm"
     columns = eb.evaluate(scenario, agents, episodes=WORLDS, measures=asked)[block]
     values = {name: float(columns[name].mean()) for name, _, _ in MEASURES.values() if name in columns}
     return values | {"moving": float((columns["ended"] == "horizon").mean())}
