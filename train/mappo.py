@@ -37,9 +37,7 @@ class Settings:
     steps: int = 1_000_000  # decisions of all learners together
     seed: int = 0
     output: Path = Path("runs/mappo")  # a new folder
-    harm_count: str = (
-        "honest"  # what the reward counts: "honest" cost, "first" impacts (the paper) or "total" harm
-    )
+    harm_count: str = "honest"  # what the reward counts: "honest" cost, "first" impacts (the paper) or "total" harm
     copies: int = 64  # parallel copies of the environment
     rollout: int = 64  # time steps of each copy between two updates
     epochs: int = 4
