@@ -47,7 +47,7 @@ def test_single_file__leaves_a_team_that_evaluates_and_is_the_same_twice(
     module, line = load(f"../../train/{script}"), eb.load_scenario(name)
     for folder, seed in (("one", 1), ("again", 1), ("other", 2)):
         module.train(module.Settings(scenario=name, seed=seed, **FEW), tmp_path / folder)
-    assert "decisions: mean harm of an episode" in capsys.readouterr().out
+    assert "decisions: mean honest cost of an episode" in capsys.readouterr().out
     one, again, other = (load_drivers(tmp_path / folder / "policy") for folder in ("one", "again", "other"))
     assert [*one] == [f"vehicle_{body}" for body in line.learners]
     for vehicle, policy in one.items():
