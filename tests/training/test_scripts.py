@@ -80,7 +80,7 @@ def test_single_file__advantages_by_hand(script: str) -> None:
 @SINGLE_FILES
 def test_single_file__learns_to_beat_full_braking(script: str, tmp_path: Path) -> None:
     module = load(f"../../train/{script}")
-    module.train(module.Settings(steps=50_000), tmp_path)
+    module.train(module.Settings(steps=50_000, harm_count="first"), tmp_path)
     result = eb.evaluate(PAIR, {"braking": "full_brake", "mine": f"team@{tmp_path}"}, episodes=1000)
     braking, mine = (result[name]["first_impact_harm"].mean() for name in ("braking", "mine"))
     assert mine < 0.7 * braking
