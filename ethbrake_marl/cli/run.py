@@ -40,7 +40,8 @@ def run_command(
     Trains a single learner or a team. Writes a run's folder with policies, results, results per world, three figures
     and report.html. If the scenario is one of the three tests (paper-random, paper-random-brake-only,
     paper-random-obstacle), the policy is also evaluated on the other two. For a team, the report also shows the harm
-    that each vehicle bears, and what each learner adds. Ctrl-C ends the training early and evaluates the policy trained
+    that each vehicle bears, and what each learner adds. All agents minimise the honest cost; with --set rules=paper,
+    first-impact harm, for which pushing is free. Ctrl-C ends the training early and evaluates the policy trained
     so far; a second Ctrl-C stops at once.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:

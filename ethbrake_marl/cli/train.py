@@ -65,6 +65,7 @@ def train_command(
 ) -> None:
     """Train a policy, or the policies of several learners.
 
+    The recipe says what learners minimise: by default the honest cost; with --set rules=paper, first-impact harm.
     Writes the folder of the training run. At the end the command prints the harm of the trained agent and of full
     braking, the agent's name, and a command that evaluates the agent. Ctrl-C ends the training after the current update
     and saves the policy. `ethbrake train --resume FOLDER` continues the training; the final policy is then the same,

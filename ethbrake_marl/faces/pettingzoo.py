@@ -37,7 +37,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
         render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
         learners: names of the vehicles that learn; None: the scenario's.
-        reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``.
+        reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``. Under
+            ``harm``, the default, pushing is free; under ``honest`` it does not pay (``episode.counts``).
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
         max_cycles: number of steps after which an episode is truncated; None: the horizon alone.

@@ -45,7 +45,8 @@ def make_sb3_vec_env(
 ) -> EthBrakeVecEnv:
     """Return ``n_envs`` worlds for Stable-Baselines3, which are simulated together.
 
-    ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``.
+    ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``; under
+    ``reward="honest"`` pushing does not pay.
 
     - ``seed``: of the stream of worlds; None: a random one.
     - ``horizon_is_end``: report an episode at the horizon as ended, not as truncated: the harm after the horizon is not

@@ -140,8 +140,8 @@ def test_tune__a_log_of_other_settings_or_a_damaged_one_is_one_error(
 def test_job__skips_what_is_finished_and_reads_its_best_measurement(tmp_path: Path) -> None:
     job = Job(Training.of(TINY, "paper-random"), tmp_path / "new" / "run")
     assert job.attempt() == "" and job.attempt() == ""
-    harm = [float(row["eval/first_impact_harm"]) for row in kept(job.folder)["rows"][::3]]
-    assert len(harm) == 3 and job.result()["harm"] == job.result()["first_impact_harm"] == min(harm)
+    harm = [float(row["eval/honest_cost"]) for row in kept(job.folder)["rows"][::3]]
+    assert len(harm) == 3 and job.result()["harm"] == job.result()["honest_cost"] == min(harm)
     assert load_policy(job.folder).manifest.steps == job.result()["steps"]
     other = Job(Training.of(TINY, "paper-random", seed=1), job.folder)
     assert "has a training with other settings" in other.attempt()

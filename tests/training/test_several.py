@@ -132,7 +132,10 @@ def test_centralised__the_critic_sees_the_line_and_the_actor_does_not() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["shared", "independent", "centralised"])
 def test_scheme__learns_to_beat_full_braking(scheme: Any, tmp_path: Path) -> None:
-    recipe = TINY.replace(n_envs=32, n_steps=32, batch_size=256, network={"policy": [32, 32], "value": [32, 32]})
+    reward = {**TINY.reward.model_dump(), "harm_count": "first"}
+    recipe = TINY.replace(
+        n_envs=32, n_steps=32, batch_size=256, network={"policy": [32, 32], "value": [32, 32]}, reward=reward
+    )
     result = train(recipe, PAIR, tmp_path / "run", scheme=scheme, steps=60_000, on_progress=None)
     assert result.metrics is not None
     assert result.metrics["first_impact_harm"] < 0.8 * result.evaluations[0]["first_impact_harm"]

@@ -153,7 +153,7 @@ def test_progress__needs_no_stream(broken: str, monkeypatch: pytest.MonkeyPatch)
 
 def test_train__shows_its_progress(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     result = begin("ppo", tmp_path / "run", steps=2 * UPDATE, on_progress="show")
-    harm = f"first-impact harm {result.evaluations[0]['first_impact_harm']:.2f}"
+    harm = f"honest cost {result.evaluations[0]['honest_cost']:.2f}"
     assert capsys.readouterr().err == f"training: 0 of 256, {harm}\n"  # the next line would come after ten seconds
 
 

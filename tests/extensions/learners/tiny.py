@@ -22,7 +22,7 @@ SHORT = {
     "averaging": 0.9, "learning_rate": {"start": 1e-2, "end": 1e-3},
     "evaluation": {"every_updates": 4, "worlds": 10, "seed": 7}, "checkpoint_every_updates": 1,
 }  # fmt: skip
-VINE = load_recipe("vine").replace(start=None, network={"policy": [8]}, **SHORT)
+VINE = load_recipe("vine").replace(start=None, network={"policy": [8]}, reward={"harm": 1.0}, **SHORT)
 ROLLOUTS = load_recipe("rollout-classification").replace(
     memory=40,  # fills up on the way
     gradient_steps=3,
