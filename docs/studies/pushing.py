@@ -3,9 +3,9 @@
     python docs/studies/pushing.py one-honest pair-honest readme-honest
     python docs/studies/pushing.py one pair readme one-bootstrap pair-bootstrap readme-bootstrap one-speed pair-speed
 
-Each argument names a program. ``-honest`` trains for the honest cost, as the pages do, all others for first-impact harm:
-``-bootstrap`` with ``horizon_is_end=False``, ``-speed`` with the reward term of docs/train.md that makes a vehicle stop.
-A training takes one or two minutes on one core.
+Each argument names a program. ``-honest`` trains for the honest cost, as the pages do, all others for first-impact
+harm: ``-bootstrap`` with ``horizon_is_end=False``, ``-speed`` with a reward term that makes a vehicle stop. A training
+takes one or two minutes on one core.
 """
 
 from __future__ import annotations
