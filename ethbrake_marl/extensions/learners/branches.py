@@ -85,7 +85,9 @@ def find_standing(
     """Set ``out`` [n] where worlds stand for good; ``before`` and ``clock`` are those of the step before."""
     bodies = line.shape[2]
     for k in range(len(out)):
-        stands, time = beside_harm(before[k], count) == beside_harm(line[k], count), clock[k, TIME]
+        time = clock[k, TIME]
+        grown = beside_harm(line[k], count) - beside_harm(before[k], count)  # type: ignore[no-untyped-call]  # a kernel
+        stands = grown == 0.0
         for i in range(bodies):
             stands = stands and before[k, SPEED, i] == 0.0 and line[k, SPEED, i] == 0.0
         if stands:
