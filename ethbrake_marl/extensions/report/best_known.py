@@ -7,28 +7,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
 
 MEASURES = ("limits", "avoidable")  # names for ``evaluate(measures=...)``
-BEST = {count: f"best_known_{count}" for count in HARM}
+BEST = {count: f"best_known_{count}" for count in COLUMN}  # count -> column; not all lists have the honest cost
 AVOIDABLE = "avoidable"  # whether contact is proven avoidable; where it is false, proven unavoidable
 
 
 class BestKnown(NamedTuple):
     """What is the least that is known for each world; the same for every agent."""
 
-    harm: Mapping[str, Floats]  # count -> [n] m2/s2
+    harm: Mapping[str, Floats]  # count -> [n] m2/s2: both harms and, if it is known, the honest cost
     avoidable: Bools | None  # [n] whether contact can be avoided; None: not proven
 
     @classmethod
     def of(cls, result: Result) -> BestKnown | None:
         """Return what a result knows; None if it was not measured."""
         columns: Mapping[str, Any] = next(iter(result.columns.values()))
-        if not all(name in columns for name in BEST.values()):
-            return None
-        return cls({count: columns[name] for count, name in BEST.items()}, columns.get(AVOIDABLE))
+        harm = {count: columns[name] for count, name in BEST.items() if name in columns}
+        return cls(harm, columns.get(AVOIDABLE)) if HARM.keys() <= harm.keys() else None
 
     @property
     def in_words(self) -> str:
@@ -37,6 +36,8 @@ class BestKnown(NamedTuple):
         words = (
             f"Mean best known harm of these worlds, where pushing is free: {first:.2f} first-impact, {total:.2f} total."
         )
+        if "honest" in self.harm:
+            words += f" Mean best known honest cost: {self.harm['honest'].mean():.2f}."
         if self.avoidable is None:
             return words
         never = 100.0 * (1.0 - float(self.avoidable.mean()))
