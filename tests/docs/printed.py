@@ -26,21 +26,29 @@ class Shown:
     commands: tuple[str, ...] = ()
 
 
-_TESTS = tuple(
+_HONEST = tuple(
+    f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise,ppo,"
+    "universal-paper,universal,best_harm --episodes 2000 --set rules=honest --set measures=pushed_mps,still_moving"
+    " --json"
+    for test in ("", "-brake-only", "-obstacle")
+)
+_PAPER = tuple(
     f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
     " --set measures=injury --json"
     for test, agents in (
-        ("", "ppo,universal"),
-        ("-brake-only", "ppo,universal"),
+        ("", "ppo,universal-paper"),
+        ("-brake-only", "ppo,universal-paper"),
         ("-obstacle --set harm_count=total", "ppo,rollout-obstacle"),
-        ("-buildup", "ppo,universal"),
+        ("-buildup", "ppo,universal-paper"),
     )
 )
 
 TABLES: dict[str, tuple[str, ...]] = {
-    "| who drives Vehicle 2 | knows | collisions": _TESTS,
+    "| who drives Vehicle 2 | knows | collisions | first-impact harm | total harm | push": _HONEST,
+    "| who drives Vehicle 2 | knows | collisions | first-impact harm | total harm | severe": _PAPER,
     "| who drives Vehicle 2 | collisions | first-impact harm | total harm | share": (
-        "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,idm,universal,best_harm --json",
+        "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,idm,universal-paper,best_harm"
+        " --json",
     ),
     "| agent | what it does | knows": (
         "ethbrake evaluate --agents ladder --scenario paper-random --episodes 10000 --seed 7 --json",
