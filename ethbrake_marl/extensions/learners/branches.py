@@ -86,7 +86,7 @@ def find_standing(
     bodies = line.shape[2]
     for k in range(len(out)):
         time = clock[k, TIME]
-        grown = beside_harm(line[k], count) - beside_harm(before[k], count)  # type: ignore[no-untyped-call]  # a kernel
+        grown = beside_harm(line[k], count) - beside_harm(before[k], count)
         stands = grown == 0.0
         for i in range(bodies):
             stands = stands and before[k, SPEED, i] == 0.0 and line[k, SPEED, i] == 0.0
