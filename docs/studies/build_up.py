@@ -14,7 +14,7 @@ import ethbrake_marl as eb
 
 WORLDS, SEARCHED, SEED = 1_000, 400, 7
 BASE = eb.load_scenario("paper-random")
-AGENTS = {"full_brake": "full_brake", "e_v2x_bm": "e_v2x_bm", "universal": "universal", "main": "ppo"}
+AGENTS = {"full_brake": "full_brake", "e_v2x_bm": "e_v2x_bm", "universal-paper": "universal-paper", "main": "ppo"}
 HARMS = ("first_impact_harm", "total_harm")
 AT_ONCE = 1e6
 CASES = {

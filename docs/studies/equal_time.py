@@ -21,7 +21,7 @@ from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.names import make_teams
 
 AGENTS = (
-    "ppo+search", "ppo", "universal", "full_brake+search", "e_v2x_bm",
+    "ppo+search", "ppo", "universal-paper", "full_brake+search", "e_v2x_bm",
     *(f"best_harm:{candidates}" for candidates in (1000, 3000, 10_000, 40_000)),
 )  # fmt: skip
 WORLDS, SEED, REPEATS = 1000, 8, 2

@@ -9,9 +9,9 @@ honest  harm of every impact, also where a contact passes it on, and what no imp
         then hit something that stands
 ======  ================================================================================================================
 
-All are in m2/s2, and none ever falls in an episode. ``honest`` adds a price to harm so that pushing never pays: without
-it the best braking pushes Vehicle 1 away (docs/findings.md). The two vehicles of a pair share harm and push by their
-masses; each vehicle bears the price of its own driving and motion alone.
+All are in m2/s2, and none ever falls in an episode. ``honest`` adds a price to harm so that pushing hardly pays:
+without it the best braking pushes Vehicle 1 away (docs/findings.md). The two vehicles of a pair share harm and push
+by their masses; each vehicle bears the price of its own driving and motion alone.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Resolving a pair after the other would make the result depend on their order. A 
 resolved together, by the mass-weighted isotonic regression P from front to rear (pool adjacent violators):
 
 * impact with speeds v- before, v+ after, and restitution e: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the
-  paper's eq. (13);
+  paper's eq. (14);
 * resting contact: the accelerations are ``P`` of the bodies' own ones; a block of masses m and own accelerations u has
   ``sum(m u) / sum(m)``. Brakes at rest have any force up to a limit, so a block at rest moves only if the push exceeds
   it.

@@ -29,7 +29,7 @@ PUSHED = 7  # push: closing speed that forces have built up and the pair's conta
 DROVE = 8  # of the vehicle behind the pair: speed that its commands ask for before the line's first impact (m/s)
 MOVING = 9  # of the vehicle behind the pair: square of its speed at the horizon (m2/s2)
 THROWN = 10  # change of its closing speed by impacts since it last touched (m/s)
-PASSED = 11  # harm of impacts of others that its contact passes on, which is neither first nor total (m2/s2)
+PASSED = 11  # harm that its contact passes on in impacts, beyond that of its own closing speed (m2/s2)
 LINE_ROWS = 12
 
 # rows of `car`

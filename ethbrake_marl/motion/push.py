@@ -10,9 +10,10 @@ is what body p + 1 would do if no body were in front of it, u_front what body p 
 Their integral over time is the push (m/s). Harm does not count it.
 
 By itself a part of the line obeys the law of resting contact (``motion.impact``). By the min-max formula of isotonic
-regression, u_rear is the largest of the mean accelerations of the bodies p + 1 to j, u_front the smallest of the bodies
-i to p, both over the bodies that move as one, weighted by mass. For two moving vehicles the push is the integral of
-``u_{p+1} - u_p``. A part that its brakes hold, and the obstacle with what leans on it, has the acceleration 0.
+regression, u_rear is the largest of the mean accelerations of the bodies p + 1 to j, u_front the smallest of those of
+the bodies i to p, both over the bodies that move as one, weighted by mass. For two moving vehicles the push is the
+integral of ``u_{p+1} - u_p``. A part that its brakes hold, and the obstacle with what leans on it, has the
+acceleration 0.
 
 Between two events each mean is a linear function of time, and so the largest is a convex one: the integral is exact.
 """
@@ -53,8 +54,8 @@ def alone(car, scratch, body, last, toward, side, held):
     """Return the acceleration (m/s2) of ``body`` if only the bodies from it to ``last`` were there.
 
     ``toward`` is 1 for the bodies behind a contact, where the largest mean counts, and -1 for those in front, where the
-    smallest does. ``side`` is the row of their own accelerations. ``held``: the line does not speed up or slow down, so
-    the brakes may hold any part of it.
+    smallest does. ``side`` is the row of their own accelerations. ``held``: the block does not speed up or slow down,
+    so the brakes may hold any part of it.
     """
     most, mass, i = toward * scratch[side, body], car[MASS, body], body
     force = mass * most

@@ -45,4 +45,4 @@ class BestKnown(NamedTuple):
 
     def regret(self, result: Result, agent: str, count: str) -> Floats:
         """Return an agent's harm minus the best known harm, [n] m2/s2."""
-        return np.asarray(result[agent][HARM[count]] - self.harm[count])
+        return np.asarray(result[agent][COLUMN[count]] - self.harm[count])

@@ -71,8 +71,8 @@ class Planner:
 class BestHarm(Planner):
     """Drives the best profile that is known: of a shipped table, or of a search.
 
-    A search begins with E-V2X-BM. If this vehicle is the only learner, the result is improved once more, or the
-    episode of a shipped policy where that is better; so it does never more harm than either.
+    A search begins with E-V2X-BM. If this vehicle is the only learner, the better of its result and of a shipped
+    policy's episode is improved once more; so it does never more harm than either.
     """
 
     def __init__(self, scenario: Scenario, count: str = "first", budget: int = BUDGET, name: str = "best_harm") -> None:

@@ -1,4 +1,7 @@
-"""The measures ``limits``: the least harm known in each world, and how far an agent is from it. Asked for by name."""
+"""The measures ``limits``: the least harm and honest cost known in each world, and how far an agent is from them.
+
+They are asked for by name.
+"""
 
 from __future__ import annotations
 
