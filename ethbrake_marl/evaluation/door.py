@@ -44,7 +44,7 @@ def evaluate(
         episodes: number of worlds of the list; None: 10,000.
         seed: of the list; None: 7.
         harm_count: what optimising agents minimise: ``first``, as in the paper, ``total``, or ``honest``, under which
-            pushing does not pay (``episode.counts``).
+            pushing hardly pays (``episode.counts``).
         measures: names of measures beside the usual ones (``evaluation.named_measures``).
         jobs: number of processes.
         on_done: called with the number of worlds that have been driven so far.

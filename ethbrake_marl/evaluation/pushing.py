@@ -86,8 +86,9 @@ def pushed_m(game: Game, alert: State) -> PushedAway | None:
 
 
 def pushed_mps(game: Game, alert: State, last: State) -> Given:
-    """Push: closing speed that contacts take up while vehicles stay in contact. Of the line; with the number of a
-    vehicle: by the vehicle behind it; obstacle: by Vehicle 1 against it.
+    """Push: closing speed that vehicles build up and contacts take up, as long as a contact lasts and in the impacts
+    after a pair's first. Of the line; with the number of a vehicle: by the vehicle behind it; obstacle: by Vehicle 1
+    against it.
     """
     of_pair = last.line[:, PUSHED]
     behind = {f"{i}": of_pair[:, i] for i in range(1, last.vehicles)}

@@ -46,7 +46,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v1")``).
 
     Action, end, infos and options of ``reset`` are those of ``EthBrakeParallelEnv``, as are the arguments: under
-    ``reward="honest"`` pushing does not pay. There must be exactly one learner.
+    ``reward="honest"`` pushing hardly pays. There must be exactly one learner.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")

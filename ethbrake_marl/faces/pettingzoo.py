@@ -38,7 +38,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
         learners: names of the vehicles that learn; None: the scenario's.
         reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``. Under
-            ``harm``, the default, pushing is free; under ``honest`` it does not pay (``episode.counts``).
+            ``harm``, the default, pushing is free; under ``honest`` it hardly pays (``episode.counts``).
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
         max_cycles: number of steps after which an episode is truncated; None: the horizon alone.

@@ -46,7 +46,7 @@ def make_sb3_vec_env(
     """Return ``n_envs`` worlds for Stable-Baselines3, which are simulated together.
 
     ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``; under
-    ``reward="honest"`` pushing does not pay.
+    ``reward="honest"`` pushing hardly pays.
 
     - ``seed``: of the stream of worlds; None: a random one.
     - ``horizon_is_end``: report an episode at the horizon as ended, not as truncated: the harm after the horizon is not
