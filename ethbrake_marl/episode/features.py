@@ -69,6 +69,12 @@ OBSTACLE = (
     Feature("fitting_deceleration", "m/s2", 10.0, 0.0, 2.0, "own deceleration that stops exactly at the obstacle"),
 )
 WHOLE_GROUPS = {"own": OWN, "role": ROLE, "obstacle": OBSTACLE}  # and the neighbours front_K, rear_K
+LISTS = {  # a name for several features of different groups
+    "paper": (
+        *("own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration"),
+        *("rear_1.gap", "rear_1.closing_speed", "rear_1.acceleration"),
+    ),
+}
 SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 
@@ -144,7 +150,7 @@ def register_feature(
 
     """
     meaning = described("feature", name, function, r"[a-z][a-z0-9_]{0,63}", "a-z, 0-9 and _, beginning with a letter")
-    if name in WHOLE_GROUPS or name in GROUPS or SIDE.fullmatch(name):
+    if name in WHOLE_GROUPS or name in GROUPS or name in LISTS or SIDE.fullmatch(name):
         raise InvalidInput(f"feature {name!r}: this is the name of a group; give another name")
     groups = {**WHOLE_GROUPS, "front_1": NEIGHBOUR}
     inside = [group for group, features in groups.items() if name in [feature.name for feature in features]]
@@ -232,7 +238,13 @@ def known_names() -> list[str]:
     """Return what an ``observation:`` list may contain: groups first, then features; neighbours as ``front_1``."""
     groups = [*WHOLE_GROUPS, "front_1", "rear_1", *GROUPS]
     inside = [f"{group}.{feature.name}" for group in groups for feature in group_named(group) or ()]
-    return [*groups, *inside, *(name if FEATURES[name].of == "own" else f"front_1.{name}" for name in FEATURES)]
+    return [*groups, *LISTS, *inside, *(name if FEATURES[name].of == "own" else f"front_1.{name}" for name in FEATURES)]
+
+
+def _names_of(listed: str) -> list[str]:
+    """Return the full names of a group, or of one feature."""
+    group = group_named(listed)
+    return [feature_named(listed).name] if group is None else [f"{listed}.{feature.name}" for feature in group]
 
 
 def listed_features(listed: object) -> tuple[str, ...]:
@@ -247,10 +259,8 @@ def listed_features(listed: object) -> tuple[str, ...]:
     for each in listed:
         if not isinstance(each, str):
             raise InvalidInput(f"observation: {each!r:.60}: must be the name of a group or of a feature")
-        group = group_named(each)
-        more = [feature_named(each).name] if group is None else [f"{each}.{feature.name}" for feature in group]
-        for name in more:
+        for name in LISTS.get(each) or _names_of(each):
             if name in names:
                 raise InvalidInput(f"observation: {name} is listed twice; list it once")
-        names += more
+            names.append(name)
     return tuple(names)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, weights_of
-from ethbrake_marl.episode.state import ENDED, STEPS, State
+from ethbrake_marl.episode.state import ENDED, PHYSICS, STEPS, State, check_exact
 from ethbrake_marl.episode.step import advance, command, note_motion
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
@@ -71,7 +71,7 @@ def played(
     reused.
     """
     most = np.full(len(plans), most)
-    if game.scripts:
+    if game.scripts or PHYSICS in state.memories:
         rows = np.arange(len(plans))
         while (~state.ended & (state.harm(count) <= most)).any():
             now = np.minimum(state.steps, plans.shape[1] - 1)
@@ -99,6 +99,7 @@ def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, unt
     ``until_s`` is the horizon: what still moves then counts as it does there. ``tried`` [n, C, B] are C commands of the
     bodies (m/s2); the others hold ``wanted`` [n, N + 1].
     """
+    check_exact(state, "a plan of constant commands (e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping)")
     out, counts = np.empty((2, *tried.shape[:2])), (weights_of(count), weights_of(other_count(count)))
     hold_worlds(
         state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(tried),

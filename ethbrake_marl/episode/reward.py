@@ -56,7 +56,7 @@ class RewardParams(FileModel):
         weight of harm must be given too. harm_count: what the term harm counts: ``first``, ``total`` or ``honest``
         (``episode.counts``). objective: objective of all vehicles, or a list with one each; None: the scenario's.
         shaping_discount: discount in the term shaping, in (0, 1]; it should be the learner's own. k_energy: factor of
-        the term collision. ttc_scale_s: tau of the term risk, s. safety_buffer_m: d_safe of the term risk, m.
+        the term collision, or a list with one for each pair of vehicles, front to rear. ttc_scale_s: tau of the term risk, s. safety_buffer_m: d_safe of the term risk, m.
         target_gap_m: d_target of the term risk, m. distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a
         registered term -> weight; negative for what should become small.
 
@@ -77,7 +77,7 @@ class RewardParams(FileModel):
     still_moving: Omitted = 0.0
     shaping: NonNegative = 0.0
     shaping_discount: Annotated[float, Field(gt=0.0, le=1.0)] = 1.0
-    k_energy: NonNegative = 1.0
+    k_energy: NonNegative | Annotated[tuple[NonNegative, ...], Field(strict=False, min_length=1)] = 1.0
     ttc_scale_s: Positive = 1.0
     safety_buffer_m: NonNegative = 1.0
     target_gap_m: NonNegative = 3.0
@@ -210,6 +210,11 @@ class Rewarding(NamedTuple):
                 stacklevel=2,
             )
             whole = True
+        if isinstance(params.k_energy, tuple) and len(params.k_energy) != vehicles - 1:
+            raise InvalidInput(
+                f"reward: k_energy has {len(params.k_energy)} entries; must be a number, or have one for each of the"
+                f" {vehicles - 1} pairs of vehicles"
+            )
         rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, COUNTS[params.harm_count])
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
         components = () if vector is None else components_of(vector, counted, vehicles)

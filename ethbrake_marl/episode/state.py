@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import Count, amount_so_far, own_amounts, pair_amounts, weights_of
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import (
     BRAKING,
@@ -34,6 +35,8 @@ LAST = 3  # number of the step that ends at the horizon
 ENDED = 4  # 1 once the episode has ended
 NUMBER = 5  # number of the world in its list; -1: the caller has made it
 CLOCK_COLUMNS = 6
+
+PHYSICS = "physics"  # a memory of this name marks worlds whose impacts are not exact (`worlds.physics`)
 
 
 class State(NamedTuple):
@@ -190,6 +193,14 @@ class State(NamedTuple):
         own, out = own_amounts(self.line, count), np.empty((self.n, self.vehicles))
         split_harm(pair_amounts(self.line, count) - own, self.car[:, MASS], out)
         return out + own[:, :-1]
+
+
+def check_exact(state: State, what: str) -> None:
+    """Raise ``InvalidInput`` if the impacts of these worlds are not exact: ``what`` needs them."""
+    if PHYSICS in state.memories:
+        raise InvalidInput(
+            f"{what} needs exact impacts, and these worlds have another physics (key physics of their scenario)"
+        )
 
 
 def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:

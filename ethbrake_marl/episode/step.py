@@ -9,7 +9,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import COUNTS
-from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State, mapped
+from ethbrake_marl.episode.state import (
+    CLOCK_COLUMNS,
+    ENDED,
+    FIRST_DECISION,
+    LAST,
+    NUMBER,
+    STEPS,
+    TIME,
+    State,
+    check_exact,
+    mapped,
+)
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, PhysicsError, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, MET, drive
@@ -227,6 +238,7 @@ def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[in
 
     No decision lies between the states.
     """
+    check_exact(before, "a quantity of single impacts")
     scratch = scratch_for(after.vehicles + 1)
     for k in np.flatnonzero(these).tolist():
         line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
@@ -272,18 +284,10 @@ def step(
     ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` are those that look at the state at every
     decision. Raises ``InvalidInput`` for a bad action. ``state`` does not change, unless its memory is donated.
     """
-    line, car, clock, know, wanted, memories = state
-    actions = numbers_of(rules, actions, len(clock))
-    commands = {}
-    if scripts:
-        memories = dict(memories)
-        for i, script in scripts.items():
-            commands[i], memories[i] = asked(script, state, memories[i], i)
+    actions = numbers_of(rules, actions, state.n)
+    line, car, clock, know, wanted, memories = scripted(scripts, state, donate=donate)
     if not donate:
-        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
-    running = clock[:, ENDED] == 0.0  # nothing changes in an episode that has ended
-    for i, command_mps2 in commands.items():
-        np.copyto(wanted[:, i], command_mps2, where=running)
+        line, clock = line.copy(), clock.copy()
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
     scratch = scratch_for(wanted.shape[1])
     refused, failed = step_worlds(line, car, clock, wanted, actions, scratch, out, reward, *rules)
@@ -292,6 +296,36 @@ def step(
     if failed >= 0:
         raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
+
+
+def scripted(scripts: Mapping[int, Any], state: State, *, donate: bool = False) -> State:
+    """Return the state with new commands, in memory of their own, and memories of the scripts that look at it."""
+    wanted, memories, commands = state.wanted, state.memories, {}
+    if scripts:
+        memories = dict(memories)
+        for i, script in scripts.items():
+            commands[i], memories[i] = asked(script, state, memories[i], i)
+    if not donate:
+        wanted = wanted.copy()
+    running = ~state.ended  # nothing changes in an episode that has ended
+    for i, command_mps2 in commands.items():
+        np.copyto(wanted[:, i], command_mps2, where=running)
+    return state._replace(wanted=wanted, memories=memories)
+
+
+def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None) -> State:
+    """Return the state with the commands of scripts and learners, as at the beginning of a step.
+
+    Raises ``InvalidInput`` for a bad action.
+    """
+    given = proposals(rules, numbers_of(rules, actions, state.n), state.n)
+    if np.isnan(given).any():
+        raise InvalidInput(f"actions: row {np.isnan(given).any(axis=1).argmax()} is no number")
+    state, learners = scripted(scripts, state), rules.learners
+    capacity = np.where(given < 0.0, state.car[:, BRAKING, learners], state.car[:, DRIVING, learners])
+    running = ~state.ended[:, np.newaxis]
+    state.wanted[:, learners] = np.where(running, given * capacity, state.wanted[:, learners])
+    return state
 
 
 def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:

@@ -39,7 +39,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import TOTAL, Floats
 from ethbrake_marl.registry import Registry
 
 TermFunction = Callable[[State, Step, State], Floats]
@@ -102,7 +102,15 @@ BUILT_IN = {  # name -> (unit, meaning)
 
 def collision(params: Any, before: State, step: Step, after: State) -> Floats:
     """Return the term collision, [n]; ``params`` are ``RewardParams``."""
-    return -params.k_energy * step.total_harm
+    if isinstance(params.k_energy, float):
+        return -params.k_energy * step.total_harm
+    return -(pair_energies(params, after.vehicles) * (after.line[:, TOTAL] - before.line[:, TOTAL])).sum(axis=1)
+
+
+def pair_energies(params: Any, vehicles: int) -> Floats:
+    """Return ``k_energy`` of every pair, [N + 1]; the obstacle has that of the first pair of vehicles."""
+    each = params.k_energy if isinstance(params.k_energy, tuple) else (params.k_energy,) * (vehicles - 1)
+    return np.array([each[0], *each, 0.0])
 
 
 def jerk(before: State, step: Step, after: State) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ethbrake_marl.episode.conduct import driving_s, first_impact_s
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Step, advance_worlds
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.evaluation.summary_row import PUSHED_FAR_M
@@ -35,6 +35,7 @@ ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, becaus
 
 def alone(alert: State, body: int, until_s: Floats) -> tuple[Floats, Floats]:
     """Return speed (m/s) and way (m) of a vehicle at ``until_s`` [n], if nobody touches it, [n] each."""
+    check_exact(alert, "pushed_m")
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
     advance_worlds(line, alert.car[:, :, [0, body]], alert.time_s.copy(), until_s, wanted, scratch_for(2))
@@ -90,6 +91,7 @@ def pushed_mps(game: Game, alert: State, last: State) -> Given:
     after a pair's first. Of the line; with the number of a vehicle: by the vehicle behind it; obstacle: by Vehicle 1
     against it.
     """
+    check_exact(last, "pushed_mps")
     of_pair = last.line[:, PUSHED]
     behind = {f"{i}": of_pair[:, i] for i in range(1, last.vehicles)}
     return {"": of_pair.sum(axis=1), **behind, "obstacle": of_pair[:, 0]}

@@ -14,7 +14,7 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import advance_worlds
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.pushing import with_post
@@ -111,6 +111,7 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
     """Let a team drive some worlds together, and record the motion of each, as ``record_episode`` does."""
+    check_exact(worlds, "a record of the motion between decisions")
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_recorded([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
 

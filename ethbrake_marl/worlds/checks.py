@@ -10,6 +10,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from ethbrake_marl.files.model import UNSHOWN, Wording, refuse, require, suggestion
 from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.worlds.derived import mistakes, world_values
+from ethbrake_marl.worlds.physics import PHYSICS
 from ethbrake_marl.worlds.quantity import DISTRIBUTIONS
 from ethbrake_marl.worlds.roles import HELD, LEARNER
 from ethbrake_marl.worlds.rules import ALTERNATIVES, OF_A_TYPE, RULES, USUAL
@@ -26,6 +27,11 @@ def check_whole(scenario: Scenario) -> None:
     _check_declared_once(scenario)
     _check_channel(scenario)
     _check_roles(scenario)
+    if scenario.physics is not None:
+        names = [*PHYSICS]
+        right = f"{suggestion(scenario.physics, names)}; known: {', '.join(names)}".removeprefix("; ")
+        require(scenario.physics in names, ("physics",), scenario.physics, right)
+        PHYSICS[scenario.physics].check(scenario)
     ends = world_values(scenario, scenario.ends)
     low, high = ({key: each[row : row + 1] for key, each in ends.items()} for row in (0, 1))
     for key, i, _, right in mistakes(scenario, low, high):

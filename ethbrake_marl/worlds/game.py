@@ -16,6 +16,7 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import FreeImpacts
+from ethbrake_marl.worlds.physics import PHYSICS
 from ethbrake_marl.worlds.scenario import Scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
@@ -73,6 +74,8 @@ def game_of(
     game = Game(Pool(scenario), scenario.name, rules, rewarding, views, bodies, scripts)
     for extension in (scenario.members or (scenario,))[0].v2x.extensions:  # members of a mixture have the same
         game = extension.game(game)
+    if scenario.physics is not None:
+        game = PHYSICS[scenario.physics].game(game)
     return scenario, game
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import PHYSICS, State
 from ethbrake_marl.episode.step import at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
@@ -148,6 +148,8 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
     for i, name in enumerate(scenario.vehicle_names):
         wanted[:, i + 1] = first_command(scenario.roles[name], whole["braking_capacity_mps2"][:, i])
     memories = {each.name: each.at_alert(scenario, numbers, unheard, n) for each in scenario.v2x.extensions}
+    if scenario.physics is not None:
+        memories[PHYSICS] = None  # a mark
     return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 

@@ -144,6 +144,11 @@ class Scenario(Part):
         description="whose harm a reward counts: one objective for all vehicles, or a list with one per vehicle",
         examples=["own", "weighted:1,4,1", "first:vehicle_3,then:total"],
     )
+    physics: str | None = Field(
+        default=None,
+        exclude_if=not_,
+        description="physics other than exact impacts: paper-map, the paper's simulation with a fixed time step",
+    )
     observation: Observation | None = Field(
         default=None,
         exclude_if=not_,

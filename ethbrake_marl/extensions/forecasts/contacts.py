@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from ethbrake_marl.episode.features import Feature
-from ethbrake_marl.episode.state import TIME, State
+from ethbrake_marl.episode.state import TIME, State, check_exact
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, MET, drive
@@ -160,6 +160,7 @@ def write_features(scratch, met, i, first, last, time_step_s, value):
 
 def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
     """Return both groups, [n, observers, 42]."""
+    check_exact(state, "a forecast of contacts")
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))
     line, known, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.line import (
     A_F,
@@ -245,6 +245,7 @@ def _check_covered(state: State, body: int) -> None:
     An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring it there, and a
     push begins with an impact.
     """
+    check_exact(state, "a proof")
     if physics_digest() != PROVEN_FOR:
         raise InvalidInput(
             f"avoidability, lower_bound: proven for other physics ({PROVEN_FOR!r}) than this installation's"

@@ -1,6 +1,7 @@
-"""The paper's fixed-step map (eq. dynamics2), in which impacts are detected, and take effect, only at samples.
+"""The paper's fixed-step map (eq. dynamics2): ``physics: paper-map`` in a scenario.
 
-With the sampling period h, one step of a vehicle with command u, from sample n to sample n + 1, is
+Impacts are detected, and take effect, only at samples: the decisions, one time step h apart. One step of a vehicle with
+command u, from sample n to sample n + 1, is
 
     x(n + 1) = x(n) + h f(n) + h^2 / 2 u(n)
     v(n + 1) = f(n) + h u(n)
@@ -12,48 +13,52 @@ where f(n) is its speed after the impacts of sample n. Where the gap of a pair i
   front impact is that of the speeds that f3 leaves; the paper's J_harm has those before both.
 * The paper's f1 and f3 would also pull vehicles together that overlap and separate. Its text below eq. (13) requires a
   positive closing speed, and so does this map. As in the exact physics, a touch does no harm.
-* Samples are at ``tau_2 + n h``, with the latency tau_2 of Vehicle 2. Before the first one worlds move exactly, and
-  have no impact, as the paper assumes.
+* Before the first decision worlds move exactly, and have no impact, as the paper assumes.
 * The command of a step is that in force at its first sample (zero-order hold).
 * ``0 <= v <= v_max`` is a constraint on u in the paper: commands are limited so that the speed keeps it at the next
   sample. An impact can leave a negative speed, which the brakes bring back to 0.
 
-Gaps are negative while vehicles overlap; nothing pushes them apart. Source: the paper, section "Optimization Problem".
+The term ``collision`` of a reward is then the paper's r_collision. Gaps are negative while vehicles overlap; nothing
+pushes them apart. Source: the paper, sections "Optimization Problem" and "MDP formulation".
 """
 
 from __future__ import annotations
 
-import math
+from functools import partial
 
 import numpy as np
 
-from ethbrake_marl.episode.state import FIRST_DECISION, STEPS, TIME, State
-from ethbrake_marl.episode.step import first_decision
+from ethbrake_marl.episode import step as one_step
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.reward import RewardParams
+from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, PHYSICS, STEPS, TIME, State
+from ethbrake_marl.episode.step import COUNTED, HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
+from ethbrake_marl.episode.terms import pair_energies
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.files.model import UNSHOWN, require
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.layout import (
-    BRAKE_RATE,
     COUNT,
-    FAR_M,
     FIRST,
+    FORCE,
     GAP,
     HIT,
     LATENCY,
     LIMIT,
     MASS,
-    RELEASE_RATE,
     RESTITUTION,
     SPEED,
     TOTAL,
     Floats,
 )
+from ethbrake_marl.worlds.scenario import Scenario
 
-SHORTEST_STEP_S = 1e-6
 ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, because times are rounded
+EXACT_ALONE = ("push", "drove", "still_moving")  # terms of a reward that the map does not know
 
 
 def exchange(line: Floats, car: Floats) -> None:
-    """Let the pairs that overlap and close have their impacts, and count their harm, in place: ``line`` [n, 7, N + 1].
+    """Let the pairs that overlap and close have their impacts, and count their harm, in place.
 
     With the closing speed w: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and
     ``v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})`` (eq. 13).
@@ -87,35 +92,80 @@ def sample(state: State, step_s: float) -> State:
     after = np.where(command < 0.0, braked, np.where(command > 0.0, driven, speed))
     way = 0.5 * (speed + after) * step_s
     line[:, GAP, 1:-1] += way[:, 1:-1] - way[:, 2:]
-    line[:, SPEED] = after
+    line[:, SPEED], line[:, FORCE] = after, command
     clock[:, STEPS] += 1.0
     clock[:, TIME] = clock[:, FIRST_DECISION] + clock[:, STEPS] * step_s
     return state._replace(line=line, clock=clock)
 
 
-def advance_sampled(alert: State, until_s: float, step_s: float = 0.1) -> State:
-    """Return worlds, given at the alert, at their first sample at or after ``until_s`` (s since the alert).
+def collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
+    """Return the paper's r_collision: minus ``k_energy w^2`` of every pair that overlaps at the sample, [n].
 
-    All vehicles hold ``alert.wanted`` [n, N + 1] m/s2. The impacts of the last sample have not happened: the state is
-    the paper's s(n). Raises ``InvalidInput`` for a step below 1e-6 s, an end that is no time after the first sample,
-    an obstacle, brakes that build up, and worlds with an impact before the first sample.
+    w is the closing speed before the impacts of the sample. A pair counts at each sample of its overlap, also while it
+    separates: the paper's Gamma asks for the gap alone.
     """
-    if not SHORTEST_STEP_S <= step_s < math.inf:
-        raise InvalidInput(f"advance_sampled: step_s = {step_s:g}: must be finite and at least {SHORTEST_STEP_S:g} s")
-    start = alert.car[:, LATENCY, 2]
-    if not start.max() <= until_s < math.inf:
-        raise InvalidInput(f"advance_sampled: until_s = {until_s:g}: must be finite and at least {start.max():g} s")
-    obstacle = alert.line[:, GAP, 0] < FAR_M
-    builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any(axis=(1, 2))
-    state = first_decision(alert, np.array([2]), step_s, until_s)
-    for wrong, what in (
-        (obstacle, "an obstacle"),
-        (builds, "brakes that build up"),
-        (state.collided, "an impact before Vehicle 2 may act"),
-    ):
-        if wrong.any():
-            raise InvalidInput(f"advance_sampled: row {np.argmax(wrong)} has {what}, which the paper's map has not")
-    last = np.ceil((until_s - start) / step_s - ON_SAMPLE)
-    while (running := state.steps < last).any():
-        state = state.put(running, sample(state.take(running), step_s), donate=True)
-    return state
+    speed, gap = before.line[:, SPEED], before.line[:, GAP]
+    closing = np.diff(speed[:, 1:], axis=1)
+    squares = np.where(gap[:, 1:-1] <= 0.0, closing * closing, 0.0)
+    return -(pair_energies(params, before.vehicles)[1:-1] * squares).sum(axis=1)
+
+
+class MappedGame(Game):
+    """A game in which vehicles move by the paper's map."""
+
+    __slots__ = ()
+
+    def first_decision(self, alert: State) -> State:
+        """Return the episodes at the first sample. Raises ``InvalidInput`` for worlds with an impact before it."""
+        state = super().first_decision(alert)
+        if state.collided.any():
+            raise InvalidInput(
+                f"scenario {self.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
+                " which physics: paper-map does not know; early_impacts: reject draws such worlds again"
+            )
+        return state._replace(memories={**state.memories, PHYSICS: None})
+
+    def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
+        """Return the state one sample later, and what the step did. The memory of ``state`` is not reused."""
+        before, rules = one_step.decided(self.rules, self.scripts, state, actions), self.rules
+        after, over = sample(before, rules.time_step_s), state.ended
+        np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
+        np.copyto(after.clock, before.clock, where=over[:, np.newaxis])
+        last = after.clock[:, STEPS] >= after.clock[:, LAST]
+        after.clock[:, ENDED] = over | last | after.at_rest
+        out = np.zeros((OUT_ROWS, state.n))
+        for row, of_line in ((HARM, FIRST), (TOTAL_HARM, TOTAL)):
+            out[row] = (after.line[:, of_line] - before.line[:, of_line]).sum(axis=1)
+        ends = after.ended & ~over
+        out[TERMINATED], out[TRUNCATED] = ends & after.at_rest, ends & ~after.at_rest
+        out[SAFE_END] = ends & ~after.collided
+        out[COUNTED] = rules.counting[0] * out[HARM] + rules.counting[1] * out[TOTAL_HARM]
+        shared = rules.terminal * out[SAFE_END] - rules.harm * out[COUNTED]
+        reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)
+        return after, Step(reward, out, rules.time_step_s)
+
+
+class PaperMap:
+    """``physics: paper-map``."""
+
+    def check(self, scenario: Scenario) -> None:
+        """Refuse what the paper's map has not: an obstacle, brakes that build up, messages."""
+        right = "is not known to physics: paper-map; leave one of the two out"
+        for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
+            require(key not in scenario.sources, (key,), UNSHOWN, right)
+        require(not scenario.v2x.extensions, ("v2x",), UNSHOWN, right)
+
+    def game(self, game: Game) -> Game:
+        """Return the game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
+        counted = [name for name in game.rewarding.counted if name in EXACT_ALONE]
+        if game.rules.counting[2:].any() or counted:
+            what = f"the term {counted[0]}" if counted else "harm_count honest"
+            raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
+        terms = tuple(
+            (name, weight, partial(collision, game.rewarding.params) if name == "collision" else function)
+            for name, weight, function in game.rewarding.terms
+        )
+        return MappedGame(*game._replace(rewarding=game.rewarding._replace(terms=terms)))
+
+
+PAPER_MAP = PaperMap()

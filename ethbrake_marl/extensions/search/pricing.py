@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, own_amount, pair_amount, weights_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
-from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State
+from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State, check_exact
 from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
@@ -262,6 +262,7 @@ def problem_of(
     a script that looks at the state, whose commands are not known at the alert.
 
     """
+    check_exact(alert, "a search for the best braking")
     check_count("count", count)
     chosen = np.array(game.rules.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):

@@ -1,0 +1,29 @@
+"""Physics other than exact impacts, which the key ``physics`` of a scenario names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.registry import Registry
+
+if TYPE_CHECKING:
+    from ethbrake_marl.worlds.scenario import Scenario
+
+
+class Physics(Protocol):
+    """How the vehicles of a game move, in place of the exact physics."""
+
+    def check(self, scenario: Scenario) -> None:
+        """Refuse (``files.model.refuse``) a scenario that this physics cannot play."""
+
+    def game(self, game: Game) -> Game:
+        """Return the game with this physics: a subclass with its own ``follow``."""
+
+
+def register_physics(name: str, physics: Physics) -> None:
+    """Register a physics. Entry points: ``ethbrake_marl.physics``."""
+    PHYSICS.add(name, physics, lambda other: other is physics)
+
+
+PHYSICS: Registry[Physics] = Registry("physics", "physics", register_physics)
