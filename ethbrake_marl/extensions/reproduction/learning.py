@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.curves import curves_figure, over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
-from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge, not_run
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
@@ -105,3 +105,122 @@ def unconverged(folder: Path) -> str:
     """Return the spec of the policy "obtained from training before convergence occurred", which has been trained."""
     ((run,),) = trained(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"
+
+
+def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
+    """Return the policies of the paper's process, one for each seed: name -> specs; those that have been trained."""
+    runs = trained(settings.folder, group) if settings.full else {}
+    return {
+        name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
+    }
+
+
+NAMES = {"sac-paper": "SAC", "ppo-paper": "PPO"}
+RETURN, HARM = "rollout/ep_rew_mean", "eval/first_impact_harm"  # columns of progress.csv
+ALIKE, RISEN = 0.1, 0.9  # parts of the rise of a return: what counts as nearly identical, and as converged
+
+Values = Sequence[Mapping[float, float]]  # for each seed: progress (%) -> value; all seeds have the same progress
+
+
+class Course(NamedTuple):
+    """Trainings by one recipe at one delay: two quantities over the progress, for each seed."""
+
+    returns: Values  # mean return of training episodes
+    harm: Values  # first-impact harm on the fixed list (m2/s2)
+
+    @property
+    def values(self) -> Floats:
+        """Returns, [seeds, k]."""
+        return np.array([[*each.values()] for each in self.returns])
+
+    @property
+    def last(self) -> Floats:
+        """Mean return over the last tenth of the progress, [seeds]."""
+        return np.asarray(self.values[:, -max(self.values.shape[1] // 10, 1) :].mean(axis=1))
+
+    @property
+    def rise(self) -> Floats:
+        """Growth of the return from the first value to the last ones, [seeds]."""
+        return np.asarray(self.last - self.values[:, 0])
+
+    @property
+    def converged(self) -> Floats:
+        """Progress at which nine tenths of the rise are behind, [seeds] %."""
+        risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
+        return np.array([*self.returns[0]])[risen.argmax(axis=1)]
+
+    @property
+    def unrest(self) -> Floats:
+        """Standard deviation of the return over the second half of the progress, [seeds]."""
+        return np.asarray(self.values[:, self.values.shape[1] // 2 :].std(axis=1, ddof=1))
+
+    @property
+    def spread(self) -> Floats:
+        """Standard deviation of the return over the seeds, at each of k steps of the second half, [k]."""
+        return np.asarray(self.values[:, self.values.shape[1] // 2 :].std(axis=0, ddof=1))
+
+
+def column(run: Path, name: str) -> dict[float, float]:
+    """Return a column of a run's table: progress (%) -> value, where there is one."""
+    rows = [*csv.DictReader((run / "progress.csv").read_text("utf-8").splitlines())]
+    last = float(rows[-1]["steps"])
+    return {100.0 * float(row["steps"]) / last: float(row[name]) for row in rows if row.get(name)}
+
+
+def courses_of(settings: Settings, delay: str) -> dict[str, Course]:
+    """Return the trainings at a delay that have finished: PPO or SAC -> course; none without ``full``."""
+    return {
+        NAMES[recipe]: Course(*([column(run, name) for run in runs] for name in (RETURN, HARM)))
+        for recipe, runs in (trained(settings.folder, delay) if settings.full else {}).items()
+    }
+
+
+def reproduce_curves(delay: str, settings: Settings) -> Made:
+    """Reproduce the learning curves at one delay from the trainings of ``--full``."""
+    courses = {each: courses_of(settings, each) for each in (HIGH, LOW)}
+    if not all(name in courses[each] for each in courses for name in NAMES.values()):
+        why = "needs trainings at both delays; --full does them"
+        return Made([Claim(FIGURE[delay], what, "", "", "not run", why) for what in STATEMENTS[delay]])
+    own = courses[delay]
+    title = f"Learning curves at {delay} delay, the paper's process"
+    text = f"{title}: return and harm against progress, mean over seeds; bands: one standard deviation."
+    panels = {
+        "Mean return of training episodes": {name: over_seeds(each.returns) for name, each in own.items()},
+        f"{TITLES['first']}, fixed list": {name: over_seeds(each.harm) for name, each in own.items()},
+    }
+    figure = Drawn(f"learning-{delay}", title, text, curves_figure(panels, "Training progress (%)", text))
+    rows = [
+        (name, len(each.harm), *(mean(np.array([each.harm[k][100.0] for k in range(len(each.harm))])), mean(each.last)))
+        for name, each in own.items()
+    ]
+    note = "Harm: first-impact, m²/s², 1,000 worlds of seed 1007. Return: of the last tenth. Means over seeds, t intervals."
+    sheet = Sheet(title, ("Algorithm", Column("Seeds"), Column("Last policy, harm"), Column("Last return")), rows, note)
+    return Made(judged(delay, courses), [sheet], [figure])
+
+
+FIGURE = {HIGH: "Fig. 2", LOW: "Fig. 3"}
+STATEMENTS = {
+    HIGH: ("the final returns of PPO and SAC are nearly identical",),
+    LOW: (
+        "both algorithms reach higher returns than at high delay",
+        "SAC converges faster than PPO",
+        "PPO converges more stably than SAC",
+        "returns of different seeds vary more than at high delay",
+    ),
+}
+
+
+def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Claim]:
+    """Return the paper's statements about the learning curves at a delay."""
+    high, low = courses[HIGH], courses[LOW]
+    if delay == HIGH:
+        apart = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
+        parts = [[Less("difference minus a tenth of PPO's rise", mean(apart))]]
+    else:
+        parts = [
+            [Less.of_lists(name, high[name].last, low[name].last) for name in high],
+            [Less.of_lists("progress (%) at nine tenths of the rise", low["SAC"].converged, low["PPO"].converged)],
+            [Less.of_lists("deviation in the second half", low["PPO"].unrest, low["SAC"].unrest)],
+            [Less.of_lists(name, high[name].spread, low[name].spread) for name in high],
+        ]
+    return [judge(FIGURE[delay], text, each) for text, each in zip(STATEMENTS[delay], parts, strict=True)]

@@ -27,6 +27,7 @@ Outcome = Literal["agrees", "differs", "cannot be", "undecided", "not run"]
 TOLERANCE, WIDE = 0.02, 0.15
 
 HARM, PERCENT = Column("Harm"), Column("Collision rate", digits=1, scale=100.0, unit=" %")
+APART = Column("Difference", sign="+")
 
 
 class Claim(NamedTuple):
@@ -42,14 +43,15 @@ class Claim(NamedTuple):
     @property
     def verdict(self) -> str:
         """Outcome and reason."""
-        because = {"differs": "differs because ", "cannot be": "cannot be because "}
-        return because.get(self.outcome, f"{self.outcome}: " * bool(self.why) or self.outcome) + self.why
+        link = " because " if self.outcome in ("differs", "cannot be") else ": "
+        return f"{self.outcome}{link}{self.why}" if self.why else self.outcome
 
 
 def claims_sheet(claims: Sequence[Claim]) -> Sheet:
     """Return the table."""
     rows = [(f"{each.where}: {each.paper}", each.ours, each.nearest, each.verdict) for each in claims]
-    return Sheet("", ("The paper", "Ours, as stated", "Ours, nearest reading", "Why"), rows)
+    headings = "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
+    return Sheet("", [Column(heading, text=True) for heading in headings], rows)
 
 
 def chance(ours: Estimate) -> float:
@@ -91,12 +93,14 @@ class Less(NamedTuple):
         return self.difference.ends[1] < 0.0
 
 
-def judge_statement(parts: Sequence[Less], show: Column = HARM) -> tuple[str, Outcome, str]:
+def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, Outcome, str]:
     """Return in how many comparisons a statement holds, the outcome, and the comparisons that fail, or the nearest."""
     compared = [part for part in parts if not part.both_are_0]
     failing = [part for part in compared if not part.holds]
     ties = f", both are 0 in {len(parts) - len(compared)} more" if len(compared) < len(parts) else ""
     text = f"holds in {len(compared) - len(failing)} of {len(compared)}{ties}"
+    if len(parts) == 1:
+        text = "does not hold" if failing else "holds"
     if not failing:
         worst = max(compared, key=lambda part: part.difference.value, default=None)
         return text, "agrees", "" if worst is None else f"{worst.where}, {show.show(worst.difference).in_words}"
@@ -106,15 +110,10 @@ def judge_statement(parts: Sequence[Less], show: Column = HARM) -> tuple[str, Ou
 
 
 def judge(
-    where: str,
-    paper: str,
-    stated: Sequence[Less],
-    nearest: Sequence[Less] = (),
-    *,
-    why: str = "",
-    show: Column = HARM,
+    where: str, paper: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, why: str = "", show: Column = APART
 ) -> Claim:
-    """Return a statement as a claim; ``why`` follows what the numbers say."""
+    """Return a statement as a claim; ``why``: the reason for what the numbers say."""
     ours, outcome, numbers = judge_statement(stated, show)
     other = judge_statement(nearest, show)[0] if nearest else ""
-    return Claim(where, paper, ours, other, outcome, ". ".join(filter(None, (numbers, why))))
+    text = f"{why} ({numbers})" if why and numbers else why or numbers
+    return Claim(where, paper, ours, other, outcome, text)
