@@ -27,7 +27,12 @@ def reproduce_command(
     quick: Annotated[
         bool, typer.Option("--quick", help="Use shipped policies; train only one that has not converged (default).")
     ] = False,
-    full: Annotated[bool, typer.Option("--full", help="Also train policies for the learning curves.")] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="Also train by the paper's own process, and search over the readings.")
+    ] = False,
+    policies: Annotated[
+        str, typer.Option(metavar="NAME=AGENT,...", help="Agents in place of the shipped policies: ppo=policy@RUN.")
+    ] = "",
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for all results.")] = Path("runs/reproduction"),
     episodes: Annotated[
         int,
@@ -42,10 +47,10 @@ def reproduce_command(
 ) -> None:
     """Reproduce the paper's results, and compare ours with them.
 
-    An item is a figure or a table of the paper. The command prints how long the work takes, then reproduces each item.
-    It writes one page (README.md) with all items, and figures (SVG, PDF) and tables (CSV, LaTeX) of each. A verdict
-    says whether our results agree with the paper, differ, or cannot agree. After an interruption, repeat the command:
-    trainings go on where they were.
+    The command prints how long the work takes, and then one table: each number and statement of the paper, ours, and
+    why they differ. It writes a page (README.md) with this table and all items, and figures (SVG, PDF) and tables (CSV,
+    LaTeX) of each. An item is a figure or a table of the paper. After an interruption, repeat the command: trainings go
+    on where they were.
     """
     with Out(as_json=as_json, force=force, remains=REMAINS) as out:
         from ethbrake_marl.extensions.reproduction import items
@@ -60,7 +65,7 @@ def reproduce_command(
             sheet = Sheet("", ("Item", "Label in the paper", "What"), known)
             out.result(sheet.json(), sheet)
             return
-        settings = Settings(output, full, episodes, out.show_progress)
+        settings = Settings(output, full, episodes, out.show_progress, chosen_policies(policies))
         out.note(items.cost(settings, chosen))
         if cost:
             return
@@ -69,6 +74,19 @@ def reproduce_command(
             out.interrupted(f"interrupted; {REMAINS}")
         out.result(items.plain(results), items.overview(results))
         out.note(f"page: {output / items.PAGE}")
+
+
+def chosen_policies(text: str) -> dict[str, str]:
+    """Return the specs of SAC and PPO; ``text`` replaces some. Raises ``InvalidInput`` for something else."""
+    chosen = {"SAC": "sac", "PPO": "ppo"}
+    for part in filter(None, text.split(",")):
+        name, _, spec = part.partition("=")
+        if name.upper() not in chosen or not spec:
+            raise InvalidInput(
+                f"--policies {text}: {part!r}: must be ppo=AGENT or sac=AGENT, for instance ppo=policy@RUN"
+            )
+        chosen[name.upper()] = spec
+    return chosen
 
 
 REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))

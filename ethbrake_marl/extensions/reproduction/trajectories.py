@@ -11,138 +11,149 @@ from matplotlib.figure import Figure
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
+from ethbrake_marl.extensions.reproduction.learning import process
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Drawn, Made, Settings
-from ethbrake_marl.extensions.reproduction.readings import COUPLED, FOUR, NON_ETHICAL, PPO, READINGS, SAC, Reading
-from ethbrake_marl.extensions.reproduction.verdicts import Less, Verdict, judge_statement
+from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
+from ethbrake_marl.extensions.reproduction.search import NEAREST
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game, teams_of
 
-AGENTS = {name: FOUR[name] for name in (PPO, SAC, COUPLED, NON_ETHICAL)}
-DRL = (PPO, SAC)
 SCENARIOS = (1, 2)
 ARROW_S = 1.0  # between arrows: ten steps, as in the paper
 VEHICLE_2 = 1  # column of arrays
 
-Records = dict[tuple[Reading, int, str], EpisodeRecord]  # (reading, number of the scenario, strategy) -> episode
+Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the scenario) -> episode
 
 
 @cache
-def record_all() -> Records:
-    """Return the recorded episodes."""
-    records: Records = {}
-    for reading in READINGS:
-        for number in SCENARIOS:
-            scenario, game = open_game(reading.scenario(f"paper-scenario-{number}"))
-            world = scenario.sample(1, SEED)
-            for name, team in teams_of(AGENTS, scenario).items():
-                records[reading, number, name] = record_episode(world, team, game)
+def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Records:
+    """Return the recorded episodes; ``policies`` are pairs of a name and a spec."""
+    records = {}
+    for number in SCENARIOS:
+        scenario, game = open_game(reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}"))
+        world = scenario.sample(1, SEED)
+        for name, team in teams_of(dict(policies), scenario).items():
+            records[name, number] = record_episode(world, team, game)
     return records
 
 
 @in_our_style
-def road_figure(records: Mapping[str, EpisodeRecord], caption: str) -> Figure:
+def road_figure(records: Records, caption: str) -> Figure:
     """Draw vehicles along the road in four episodes, as the paper does: a row each, an arrow every second.
 
     Dashes join equal times.
     """
     figure, panels = new_panels((10.0, 4.8), 2, 2, sharex=True, sharey=True)
-    for axes, (title, record) in zip(panels, records.items(), strict=True):
+    for axes, ((name, number), record) in zip(panels, records.items(), strict=True):
         vehicles = np.arange(1, record.positions_m.shape[1] + 1)
         times = np.arange(0.0, record.time_s[-1] + 1e-9, ARROW_S)
         at = np.array([np.interp(times, record.time_s, column) for column in record.positions_m.T])
         axes.plot(at, vehicles, color=GREY, linewidth=0.7, linestyle="--")
-        for number, places in zip(vehicles, at, strict=True):
-            axes.plot(places, np.full(len(times), number), marker=">", color=series_style(number)["color"])
-        axes.set(title=title, xlabel="Position along the road (m)", ylabel="Vehicle", yticks=vehicles, ylim=(0.5, 3.5))
+        for vehicle, places in zip(vehicles, at, strict=True):
+            axes.plot(places, np.full(len(times), vehicle), marker=">", color=series_style(vehicle)["color"])
+        axes.set(title=f"{name}, Scenario {number}", xlabel="Position along the road (m)", ylabel="Vehicle")
+        axes.set(yticks=vehicles, ylim=(0.5, 3.5))
         axes.label_outer()
     return finish(figure, caption)
 
 
 @in_our_style
-def profiles_figure(panels: Mapping[str, Mapping[str, EpisodeRecord]], caption: str) -> Figure:
-    """Draw the command of Vehicle 2 over time: title of one of four panels -> label of a curve -> episode."""
+def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
+    """Draw the command of Vehicle 2 over time, a panel for each policy and scenario: label of a curve -> episodes."""
     figure, every = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
-    for axes, (title, records) in zip(every, panels.items(), strict=True):
+    for axes, key in zip(every, next(iter(curves.values())), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
-        for number, (label, record) in enumerate(records.items()):
-            style = {**series_style(number), "marker": ""}
+        for number, (label, records) in enumerate(curves.items()):
+            style, record = {**series_style(number), "marker": ""}, records[key]
             command = record.command_mps2[:, VEHICLE_2]
             axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)
-        axes.set(title=title, xlabel="Time since Vehicle 1 began to brake (s)", ylabel="Command (m/s²)")
+        axes.set(title=f"{key[0]}, Scenario {key[1]}", ylabel="Command (m/s²)")
+        axes.set(xlabel="Time since Vehicle 1 began to brake (s)")
         axes.label_outer()
     return finish(figure, caption, every[0], columns=4)
 
 
+def all_records(settings: Settings) -> dict[str, Records]:
+    """Return the episodes as stated, in the nearest reading, and of the first seed of the paper's process."""
+    policies = tuple(settings.policies.items())
+    found = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
+    trained = tuple((name, specs[0]) for name, specs in process(settings).items())
+    return found | ({"paper's process": record_all(STATED, trained)} if trained else {})
+
+
 def reproduce_trajectories(settings: Settings) -> Made:
     """Reproduce the trajectories."""
-    records, figures, verdicts = record_all(), [], []
-    for reading, stem in zip(READINGS, ("stated", "early"), strict=True):
-        own = {f"{name}, Scenario {k}": records[reading, k, name] for name in DRL for k in SCENARIOS}
-        text = f"Positions of the vehicles, {reading.name}; an arrow every second, dashed lines join equal times."
-        road = road_figure(own, text)
-        figures.append(Drawn(f"trajectories-road-{stem}", f"Trajectories, {reading.name}", text, road))
-        one, two = (apart(records, reading, k, "positions_m") for k in SCENARIOS)
-        ahead, behind = ([float(gap.mean()) for gap in both(records, reading, 2, "gaps_m", k)] for k in (0, 1))
-        claims = {
-            "Vehicle 2 of PPO and SAC is nearer together in Scenario 1 than in 2": (
-                f"root mean square {one:.2f} m against {two:.2f} m", one, two,
-            ),
-            "Scenario 2: PPO keeps the larger distance to Vehicle 3": (
-                f"mean gap {behind[1]:.2f} m under SAC, {behind[0]:.2f} m under PPO", behind[1], behind[0],
-            ),
-            "Scenario 2: SAC keeps the larger distance to Vehicle 1": (
-                f"mean gap {ahead[0]:.2f} m under PPO, {ahead[1]:.2f} m under SAC", ahead[0], ahead[1],
-            ),
-        }  # fmt: skip
-        verdicts += judge_one_world(claims, reading, " m")
+    every, parts = all_records(settings), []
+    figures = []
+    for name, records in every.items():
+        text = f"Positions of the vehicles, {name}; an arrow every second, dashed lines join equal times."
+        stem = f"trajectories-{name.partition(' ')[0].replace(chr(39), '')}"
+        figures.append(Drawn(stem, f"Trajectories, {name}", text, road_figure(records, text)))
+    for records in (every["as stated"], every["nearest reading"]):
+        one, two = (apart(records, k, "positions_m") for k in SCENARIOS)
+        (ppo_1, sac_1), (ppo_2, sac_2) = (
+            [float(gap.mean()) for gap in both(records, 2, "gaps_m", pair)] for pair in (0, 1)
+        )
+        parts.append(
+            {
+                "positions under PPO and SAC are more alike in Scenario 1 than in 2": (
+                    f"root mean square {one:.2f} m against {two:.2f} m", one - two,
+                ),
+                "Scenario 2: PPO keeps the larger distance to Vehicle 3": (
+                    f"mean gap {sac_2:.2f} m under SAC, {ppo_2:.2f} m under PPO", sac_2 - ppo_2,
+                ),
+                "Scenario 2: SAC keeps the larger distance to Vehicle 1": (
+                    f"mean gap {ppo_1:.2f} m under PPO, {sac_1:.2f} m under SAC", ppo_1 - sac_1,
+                ),
+            }
+        )  # fmt: skip
     rows = [
         (
-            *(reading.name, str(number), name, int(record.impacts.number.sum())),
-            *(float(record.last.harm("first")[0]), *map(float, record.gaps_m[-1])),
+            *(name, str(number), policy, int(record.impacts.number.sum())),
+            *(
+                *map(float, (record.last.harm("first")[0], record.last.harm("total")[0])),
+                *map(float, record.gaps_m[-1]),
+            ),
         )
-        for (reading, number, name), record in records.items()
+        for name, records in every.items()
+        for (policy, number), record in records.items()
     ]
-    numbers = map(Column, ("Impacts", "First-impact harm", "Last gap 1 (m)", "Last gap 2 (m)"))
-    note = f"One world each: no intervals. Harm in m²/s². {POLICIES}"
-    sheet = Sheet("How the episodes end", ("Reading", "Scenario", "Strategy", *numbers), rows, note)
-    return Made(verdicts, [sheet], figures)
+    numbers = ("Impacts", "First-impact harm", "Total harm", "Last gap 1 (m)", "Last gap 2 (m)")
+    note = f"One world each: no intervals. Exact physics; harm in m²/s². {POLICIES}"
+    sheet = Sheet("How the episodes end", ("Reading", "Scenario", "Policy", *map(Column, numbers)), rows, note)
+    return Made(claims_of("Fig. 6", parts, " m"), [sheet], figures)
 
 
 def reproduce_accelerations(settings: Settings) -> Made:
     """Reproduce the commands of Vehicle 2."""
-    records, verdicts = record_all(), []
-    asked = {key: asked_of_vehicle_2(record) for key, record in records.items()}
-    panels = {
-        f"{name}, Scenario {k}": {reading.name: records[reading, k, name] for reading in READINGS}
-        for name in DRL
-        for k in SCENARIOS
-    }
-    text = "Command of Vehicle 2 over time, as the paper states the latencies and with Vehicle 2 acting at 0.2 s."
-    figure = Drawn("accelerations", "Acceleration profiles", text, profiles_figure(panels, text))
-    for reading in READINGS:
-        one, two = (apart(records, reading, k, "command_mps2") for k in SCENARIOS)
-        (first, ppo_changes, _), (_, sac_changes, braking) = (asked[reading, 2, name] for name in DRL)
-        claims = {
-            "the profiles are more alike in Scenario 1 than in 2": (
-                f"root mean square difference {one:.2f} m/s² against {two:.2f} m/s²", one, two,
-            ),
-            "Scenario 2: PPO accelerates before it brakes": (f"first command {first:+.2f} m/s²", 0.0, first),
-            "Scenario 2: SAC decelerates throughout most of it": (
-                f"braking in {100.0 * braking:.0f} % of the time it moves", 0.5, braking,
-            ),
-            "Scenario 2: PPO's profile is the smoother one": (
-                f"ups and downs {ppo_changes:.1f} m/s² under PPO, {sac_changes:.1f} m/s² under SAC", ppo_changes,
-                sac_changes,
-            ),
-        }  # fmt: skip
-        verdicts += judge_one_world(claims, reading, " m/s²")
+    every, parts = all_records(settings), []
+    text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
+    figure = Drawn("accelerations", "Acceleration profiles", text, profiles_figure(every, text))
+    for records in (every["as stated"], every["nearest reading"]):
+        one, two = (apart(records, k, "command_mps2") for k in SCENARIOS)
+        (first, ppo_changes, _), (_, sac_changes, braking) = (asked(records[name, 2]) for name in ("PPO", "SAC"))
+        parts.append(
+            {
+                "profiles of PPO and SAC are more alike in Scenario 1 than in 2": (
+                    f"root mean square difference {one:.2f} m/s² against {two:.2f} m/s²", one - two,
+                ),
+                "Scenario 2: PPO accelerates before it brakes": (f"first command {first:+.2f} m/s²", -first),
+                "Scenario 2: SAC decelerates throughout most of it": (
+                    f"braking in {100.0 * braking:.0f} % of the time it moves", 0.5 - braking,
+                ),
+                "Scenario 2: PPO's profile is the smoother one": (
+                    f"ups and downs {ppo_changes:.1f} m/s² under PPO, {sac_changes:.1f} m/s² under SAC",
+                    ppo_changes - sac_changes,
+                ),
+            }
+        )  # fmt: skip
     rows = [
-        (
-            *(reading.name, str(number), name, first),
-            *(float(records[reading, number, name].command_mps2[:, VEHICLE_2].min()), braking, changes),
-        )
-        for (reading, number, name), (first, changes, braking) in asked.items()
+        (*(name, str(number), policy, first), *(float(record.command_mps2[:, VEHICLE_2].min()), braking, changes))
+        for name, records in every.items()
+        for (policy, number), record in records.items()
+        for first, changes, braking in (asked(record),)
     ]
     numbers = (
         Column("First command", sign="+"),
@@ -151,36 +162,41 @@ def reproduce_accelerations(settings: Settings) -> Made:
         Column("Ups and downs", digits=1),
     )
     note = "Commands of Vehicle 2 in m/s². One world each: no intervals."
-    sheet = Sheet("Commands of Vehicle 2", ("Reading", "Scenario", "Strategy", *numbers), rows, note)
-    return Made(verdicts, [sheet], [figure])
+    sheet = Sheet("Commands of Vehicle 2", ("Reading", "Scenario", "Policy", *numbers), rows, note)
+    return Made(claims_of("Fig. 7", parts, " m/s²"), [sheet], [figure])
 
 
-def both(records: Records, reading: Reading, number: int, what: str, column: int) -> list[Floats]:
+def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
     """Return a recorded quantity under PPO, and under SAC at the same times; an episode that has ended stays as it is.
 
     ``number`` is that of the scenario, ``what`` an attribute of ``EpisodeRecord``, ``column`` a vehicle or pair from 0.
     """
-    pair = [records[reading, number, name] for name in DRL]
+    pair = [records[name, number] for name in ("PPO", "SAC")]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
     return [np.interp(times, each.time_s, getattr(each, what)[:, column]) for each in pair]
 
 
-def apart(records: Records, reading: Reading, number: int, what: str) -> float:
+def apart(records: Records, number: int, what: str) -> float:
     """Return the root mean square over time of the difference between PPO and SAC, of Vehicle 2."""
-    one, other = both(records, reading, number, what, VEHICLE_2)
+    one, other = both(records, number, what, VEHICLE_2)
     return float(np.sqrt(np.mean((one - other) * (one - other))))
 
 
-def judge_one_world(claims: Mapping[str, tuple[str, float, float]], reading: Reading, unit: str) -> list[Verdict]:
-    """Return verdicts on claims about one world: claim -> words, the number that should be smaller, the larger one."""
-    show = Column("", unit=unit)
+def claims_of(where: str, readings: list[dict[str, tuple[str, float]]], unit: str) -> list[Claim]:
+    """Return claims about one world; each reading has: claim -> words, what should be smaller minus the larger one."""
+    show = Column("", unit=unit, sign="+")
     return [
-        judge_statement(f"{claim} ({reading.name})", [Less(words, Estimate(smaller - larger, None))], show=show)
-        for claim, (words, smaller, larger) in claims.items()
+        judge(
+            where,
+            text,
+            *([Less(words, Estimate(value, None))] for words, value in (each[text] for each in readings)),
+            show=show,
+        )
+        for text in readings[0]
     ]
 
 
-def asked_of_vehicle_2(record: EpisodeRecord) -> tuple[float, float, float]:
+def asked(record: EpisodeRecord) -> tuple[float, float, float]:
     """Return the first command of Vehicle 2 and the sum of its changes (m/s2), and how long it brakes while it moves.
 
     The last is a share of the time in which it moves after its latency.

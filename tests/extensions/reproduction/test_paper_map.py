@@ -1,22 +1,20 @@
-"""The paper's fixed-step map: impacts by hand, a slow reference, figures of version 0.5, and what it refuses."""
-
-from collections.abc import Callable
-from typing import Any
+"""The paper's fixed-step map: impacts by hand, a slow reference, figures of version 0.5, reward, what it refuses."""
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.reproduction.paper_map import sample
-from ethbrake_marl.motion.layout import COUNT, GAP, HIT, SPEED
+from ethbrake_marl.episode.reward import RewardParams
+from ethbrake_marl.extensions.reproduction.paper_map import collision, sample
+from ethbrake_marl.motion.layout import COUNT, GAP, HIT, LATENCY, SPEED
 from tests.refused import refused
 
-SCENARIO = eb.load_scenario("paper-random-map")
+MAPPED = eb.load_scenario("paper-random-map")
 
 
 def at_a_sample(gaps, speeds) -> eb.State:
-    """One world of the map, in which nobody commands anything, at a sample with these gaps and speeds."""
-    state = SCENARIO.sample(1, 7)
+    """One world of the random test, in which nobody commands anything, at a sample with these gaps and speeds."""
+    state = MAPPED.sample(1, 7)
     line, wanted, clock = state.line.copy(), np.zeros(state.wanted.shape), state.clock.copy()
     line[0, GAP, 1:3], line[0, SPEED, 1:] = gaps, speeds
     clock[0, 0] = clock[0, 1] = 2.0
@@ -53,15 +51,22 @@ def test_impacts__of_one_sample_go_from_the_rear_to_the_front() -> None:
      (0.25, "full_brake", 36.812182133604814), (0.5, "full_brake", 35.79459513033634),
      (0.1, "constant:5", 27.97726529370422)],
 )  # fmt: skip
-def test_map__has_the_figures_of_version_0_5(step_s: float, agent: str, harm: float) -> None:
-    result = eb.evaluate(SCENARIO.replace(time_step_s=step_s), agent, episodes=2_000)
+def test_game__has_the_figures_of_version_0_5(step_s: float, agent: str, harm: float) -> None:
+    result = eb.evaluate(MAPPED.replace(time_step_s=step_s), agent, episodes=2_000)
     assert result[agent]["first_impact_harm"].mean() == harm
 
 
-def test_worlds__are_those_of_the_exact_scenario() -> None:
-    exact, mapped = (eb.load_scenario(name).sample(50, 7) for name in ("paper-random", "paper-random-map"))
-    for one, other in zip(exact[:5], mapped[:5], strict=True):
-        assert np.array_equal(one, other)
+def test_game__world_does_not_depend_on_the_others_and_its_end_stays() -> None:
+    alert = MAPPED.sample(3, 7)
+    alert.car[1, LATENCY, 2] = 0.31
+    _, game = eb.open_game(MAPPED)
+    states = [game.reset(alert), *(game.reset(alert.take([k])) for k in range(3))]
+    for step in range(90):
+        action = -0.5 + 0.3 * np.sin(step)
+        before, states = states[0], [game.step(each, np.full((each.n, 1), action))[0] for each in states]
+        assert all(np.array_equal(states[0].line[k], states[k + 1].line[0]) for k in range(3))
+    assert before.ended.all() and np.array_equal(before.line, states[0].line)
+    assert before.time_s.max() <= 8.1
 
 
 def by_hand(start: eb.State, actions: np.ndarray) -> tuple[list[float], list[float], float]:
@@ -86,9 +91,9 @@ def by_hand(start: eb.State, actions: np.ndarray) -> tuple[list[float], list[flo
     return [places[0] - places[1], places[1] - places[2]], speeds, harm
 
 
-def test_map__is_that_of_a_slow_reference() -> None:
-    _, game = eb.open_game(SCENARIO)
-    state = start = game.reset(SCENARIO.sample(60, 7))
+def test_game__is_that_of_a_slow_reference() -> None:
+    _, game = eb.open_game(MAPPED)
+    state = start = game.reset(MAPPED.sample(60, 7))
     actions = np.random.default_rng(7).uniform(-1.0, 1.0, (75, 60, 1))
     for each in actions:
         state, _ = game.step(state, each)
@@ -100,86 +105,123 @@ def test_map__is_that_of_a_slow_reference() -> None:
         assert state.harm("total")[k] == pytest.approx(harm, abs=1e-9)
 
 
-def test_collision__counts_each_sample_of_an_overlap() -> None:
-    """Minus k_i w_i^2 of the pairs that overlap when the step begins, closing or not."""
-    reward = {"harm": 0.0, "collision": 1.0, "k_energy": [1.0, 3.0]}
-    _, game = eb.open_game(SCENARIO, reward=reward)
-    state, counted = game.reset(SCENARIO.sample(40, 7)), 0
+def test_step__reports_and_rewards_what_happens() -> None:
+    scenario, game = eb.open_game(MAPPED, reward={"harm": 2.0, "terminal": 5.0, "harm_count": "total"})
+    state, total, rewards = game.reset(scenario.sample(50, 7)), np.zeros(50), np.zeros(50)
+    ends = np.zeros((3, 50))
     while not state.ended.all():
-        before = state
-        state, step = game.step(state, np.full((40, 1), -0.2))
-        squares = np.where(before.gaps_m <= 0.0, np.diff(before.speeds_mps, axis=1) ** 2, 0.0)
-        expected = np.where(before.ended, 0.0, -squares @ np.array([1.0, 3.0]))
-        assert step.reward[:, 1] == pytest.approx(expected, abs=1e-12)
-        counted += int((expected < 0.0).sum())
-    assert counted > 80  # more samples than pairs
+        state, step = game.step(state, np.full((50, 1), -0.8))
+        total += step.total_harm
+        rewards += step.reward[:, 1]
+        ends += step.terminated, step.truncated, step.safe_end
+    assert total == pytest.approx(state.harm("total"))
+    assert np.array_equal(ends[0] + ends[1], np.ones(50)) and np.array_equal(ends[2] == 1.0, ~state.collided)
+    assert 0 < ends[2].sum() < 50
+    assert rewards == pytest.approx(5.0 * ends[2] - 2.0 * total)
 
 
-def test_step__does_not_change_the_state_and_nothing_happens_after_the_end() -> None:
-    _, game = eb.open_game(SCENARIO)
-    state = game.reset(SCENARIO.sample(20, 7))
-    line = state.line.copy()
-    game.step(state, np.full((20, 1), -1.0))
-    assert np.array_equal(state.line, line)
-    while not state.ended.all():
-        state, _ = game.step(state, np.full((20, 1), -1.0))
-    after, step = game.step(state, np.full((20, 1), 1.0))
-    assert np.array_equal(after.line, state.line) and np.array_equal(after.clock, state.clock)
-    assert not step.reward.any()
+def test_collision__counts_every_sample_of_an_overlap_with_the_weight_of_its_pair() -> None:
+    overlap = at_a_sample([-0.5, -0.1], [10.0, 20.0, 15.0])  # the front pair closes at 10, the rear one separates at 5
+    params = RewardParams(harm=0.0, collision=1.0, k_energy=(0.5, 2.0))
+    assert collision(params, overlap, None, None).tolist() == [-(0.5 * 100.0 + 2.0 * 25.0)]
+    apart = at_a_sample([0.5, 0.1], [10.0, 20.0, 15.0])
+    assert collision(params, apart, None, None).tolist() == [0.0]
+
+
+def test_k_energy__of_each_pair_in_exact_physics() -> None:
+    def rewards(energy) -> float:
+        env = eb.parallel_env(scenario="paper-random", reward={"harm": 0.0, "collision": 1.0, "k_energy": energy})
+        env.reset(seed=7)
+        total = 0.0
+        while env.agents:
+            total += env.step({"vehicle_2": np.array([-1.0], np.float32)})[1]["vehicle_2"]
+        return total
+
+    assert rewards([0.0, 1.0]) + rewards([1.0, 0.0]) == pytest.approx(rewards(1.0))
+    assert rewards([0.0, 1.0]) != 0.0
+    with refused("reward: k_energy has 3 entries; must be a number, or have one for each of the 2 pairs"):
+        rewards([1.0, 1.0, 1.0])
+
+
+def test_observation__is_the_state_of_the_paper() -> None:
+    env = eb.EthBrakeEnv("paper-random-map")
+    observation, _ = env.reset(seed=7)
+    assert observation.shape == (8,)
+    assert env.unwrapped.game.views[2].names == (
+        "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
+        "rear_1.closing_speed", "rear_1.acceleration",
+    )  # fmt: skip
+    with refused("observation: own.speed is listed twice"):
+        eb.load_scenario("paper-random").replace(observation=["own", "paper"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"physics": "paper-mop"}, "physics = paper-mop: did you mean paper-map?; known: paper-map"),
+        ({"obstacle_margin_m": 1.7}, "obstacle_margin_m: is not known to physics: paper-map"),
+        ({"brake_rate_mps3": 10.0}, "brake_rate_mps3: is not known to physics: paper-map"),
+        ({"v2x": {"preset": "nominal", "persistence": "periodic"}}, "v2x: is not known to physics: paper-map"),
+    ],
+)
+def test_scenario__refuses_what_the_map_has_not(changes, message: str) -> None:
+    with refused(message):
+        MAPPED.replace(**changes)
+
+
+def test_early_impacts__are_refused() -> None:
+    early = MAPPED.replace(gaps_m=0.2, speeds_mps=[18, 22, 22], early_impacts="keep")
+    with refused("row 0 has an impact before the first decision, which physics: paper-map does not know"):
+        eb.evaluate(early, "full_brake", episodes=3)
+
+
+@pytest.mark.parametrize("agent", ["e_v2x_bm", "ppo+episode", "ppo+step", "best_harm", "universal"])
+def test_agents__that_plan_with_exact_impacts_are_refused(agent: str) -> None:
+    with refused("needs exact impacts, and these worlds have another physics"):
+        eb.evaluate(MAPPED, agent, episodes=3)
+
+
+def test_agents__that_drive_here() -> None:
+    result = eb.evaluate(MAPPED, "full_brake,e_v2x_bm:pairwise,ppo,ppo+episode:pairwise", episodes=20)
+    assert result["ppo"]["total_harm"].mean() < result["full_brake"]["total_harm"].mean()
+
+
+MEASURES = (
+    *("pushed_mps", "pushed_m", "push", "drove", "drove_towards", "injury_gidas"),
+    *("proven_harm", "avoidable", "limits"),
+)
+
+
+@pytest.mark.parametrize("measure", MEASURES)
+def test_measures__of_exact_impacts_are_refused(measure: str) -> None:
+    with refused("needs exact impacts, and these worlds have another physics"):
+        eb.evaluate(MAPPED, "full_brake", episodes=3, measures=measure)
 
 
 def test_results__have_no_honest_cost() -> None:
-    columns = eb.evaluate(SCENARIO, "full_brake", episodes=5)["full_brake"]
+    columns = eb.evaluate(MAPPED, "full_brake", episodes=5)["full_brake"]
     assert "total_harm" in columns and not any(name.startswith("honest_cost") for name in columns)
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ({"obstacle_gap_m": 60.0}, "obstacle_gap_m: is not known to physics: paper-map"),
-        ({"brake_rate_mps3": 30.0}, "brake_rate_mps3: is not known to physics: paper-map"),
-        ({"physics": "paper-mop"}, "physics = paper-mop: did you mean paper-map?; known: paper-map"),
-    ],
+    ("reward", "message"),
+    [("honest", "harm_count honest needs exact impacts"), ({"harm": 1.0, "push": 1.0}, "the term push needs exact")],
 )
-def test_scenario__that_the_map_cannot_play_is_refused(changes: dict[str, Any], told: str) -> None:
-    with refused(told):
-        SCENARIO.replace(**changes)
-
-
-def record() -> None:
-    _, game = eb.open_game(SCENARIO)
-    team = eb.Team.of({"vehicle_2": eb.make_agent("full_brake")}, "full_brake")
-    eb.record_episode(SCENARIO.sample(1, 7), team, game)
-
-
-def refusals() -> dict[str, Callable[[], Any]]:
-    late = {"latency_s": [0, 1.5, 1.6], "early_impacts": "keep"}
-
-    def drive(agent: str, measures: str = "") -> Callable[[], Any]:
-        return lambda: eb.evaluate(SCENARIO, agent, episodes=5, measures=measures or ())
-
-    return {
-        "a plan of constant commands (e_v2x_bm other than": drive("e_v2x_bm"),
-        "shields other than episode:pairwise": drive("full_brake+step"),
-        "pushed_m needs exact impacts": drive("full_brake", "pushed_m"),
-        "pushed_mps needs exact impacts": drive("full_brake", "pushed_mps"),
-        "the term push needs exact impacts": drive("full_brake", "push"),
-        "the term drove needs exact impacts": drive("full_brake", "drove"),
-        "a record of the motion between decisions needs exact impacts": record,
-        "harm_count honest needs exact impacts": lambda: eb.open_game(SCENARIO, reward="honest"),
-        "the term still_moving needs exact impacts": lambda: eb.open_game(
-            SCENARIO, reward={"harm": 1.0, "still_moving": 1.0}
-        ),
-        "row 0 has an impact before the first decision": lambda: eb.evaluate(
-            SCENARIO.replace(**late), "full_brake", episodes=5
-        ),
-        "k_energy has 1 entries; must be a number, or have one for each of the 2 pairs": lambda: eb.open_game(
-            SCENARIO, reward={"harm": 0.0, "collision": 1.0, "k_energy": [1.0]}
-        ),
-    }
-
-
-@pytest.mark.parametrize("message", refusals())
-def test_what_needs_exact_impacts__is_refused(message: str) -> None:
+def test_rewards__of_exact_impacts_are_refused(reward, message: str) -> None:
     with refused(message):
-        refusals()[message]()
+        eb.EthBrakeEnv(MAPPED, reward=reward)
+
+
+def test_record__is_refused() -> None:
+    scenario, game = eb.open_game(MAPPED)
+    with refused("a record of the motion between decisions needs exact impacts"):
+        eb.record_episode(scenario.sample(1, 7), eb.Team.of({"vehicle_2": eb.make_agent("coast")}, "coast"), game)
+
+
+def test_mixture__has_one_physics() -> None:
+    exact = {"scenario": eb.load_scenario("paper-random").declared()}
+    mapped = {"scenario": MAPPED.replace(observation=None, name="other").declared()}
+    with refused("physics must be the same in all scenarios of the mixture"):
+        eb.Scenario(name="mixed", mixture=[exact, mapped])
+    both = eb.Scenario(name="mixed", physics="paper-map", mixture=[exact, mapped])
+    assert eb.evaluate(both, "full_brake", episodes=10).n == 10

@@ -1,0 +1,72 @@
+"""What every strategy does under a reading: the paper's four, what we set beside them, and the paper's own process."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
+from ethbrake_marl.extensions.reproduction.learning import process
+from ethbrake_marl.extensions.reproduction.made import Settings
+from ethbrake_marl.extensions.reproduction.random_test import (
+    E_V2X_BM,
+    NON_E,
+    PLANS,
+    WORLDS,
+    Outcome,
+    brake,
+    drive_all,
+    opened,
+    plan,
+)
+from ethbrake_marl.extensions.reproduction.readings import Reading
+from ethbrake_marl.motion.layout import Floats
+
+COUPLED, SIMULATED = "E-V2X-BM (coupled)", "simulated H*"
+PAPERS = "paper's process"
+PREDICTED = "predicted"  # key of an outcome: harm that is expected at the alert, [n] m2/s2
+MAP_STEP_S = 0.1
+
+
+def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Outcome]:
+    """Return what each strategy does; where impacts are exact, also E-V2X-BM (coupled) and its hybrids.
+
+    ``policies``: name -> spec. Hybrids decide by first-impact harm, as Algorithm 1: a policy whose harm is above H*
+    leaves the whole episode to E-V2X-BM.
+    """
+    worlds, plans = reading.only(*WORLDS), reading.only(*PLANS)
+    baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
+    found = {NON_E: brake(worlds, None, "brakes on", episodes), E_V2X_BM: baseline}
+    hybrids = {"": baseline}
+    if reading.step_s is None:
+        coupled = drive_all(worlds, "e_v2x_bm", "first", episodes)
+        found[COUPLED] = {**coupled, PREDICTED: coupled["first"]}
+        hybrids[f", {SIMULATED}"] = found[COUPLED]
+    found |= {name: drive_all(worlds, spec, "first", episodes) for name, spec in policies.items()}
+    for name in policies:
+        for ending, bound in hybrids.items():
+            found[f"Hybrid {name}{ending}"] = algorithm_1(found[name], bound)
+    return found
+
+
+def algorithm_1(policy: Outcome, bound: Outcome) -> Outcome:
+    """Return what the hybrid of a policy and E-V2X-BM does."""
+    follows = policy["first"] <= bound[PREDICTED]
+    least = {PREDICTED: np.minimum(policy["first"], bound[PREDICTED])}
+    return {key: np.where(follows, policy[key], bound[key]) for key in policy} | least
+
+
+def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[str, list[dict[str, Outcome]]]:
+    """Return what the policies of the paper's process do in its map, alone and in the hybrid: name -> seeds."""
+    mapped = reading._replace(step_s=MAP_STEP_S)
+    return {
+        name: [strategies(mapped, episodes, {name: spec}) for spec in specs]
+        for name, specs in process(settings).items()
+    }
+
+
+def least_harm(reading: Reading, episodes: int) -> Floats:
+    """Return a lower bound that is proven for every strategy under exact impacts, [n] m2/s2."""
+    scenario, _, alert = opened(reading.only(*WORLDS), episodes)
+    return lower_bound(alert, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm
