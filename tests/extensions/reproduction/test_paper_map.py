@@ -1,5 +1,7 @@
 """The paper's fixed-step map: impacts by hand, a slow reference, figures of version 0.5, reward, what it refuses."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.extensions.reproduction.paper_map import collision, sample
 from ethbrake_marl.motion.layout import COUNT, GAP, HIT, LATENCY, SPEED
+from ethbrake_marl.training.experiment import run_experiment
 from tests.refused import refused
 
 MAPPED = eb.load_scenario("paper-random-map")
@@ -216,6 +219,17 @@ def test_record__is_refused() -> None:
     scenario, game = eb.open_game(MAPPED)
     with refused("a record of the motion between decisions needs exact impacts"):
         eb.record_episode(scenario.sample(1, 7), eb.Team.of({"vehicle_2": eb.make_agent("coast")}, "coast"), game)
+
+
+def test_run__is_refused_before_it_trains(tmp_path: Path) -> None:
+    with refused("physics = paper-map: ethbrake run compares with shields, which need exact impacts"):
+        run_experiment(eb.load_recipe("ppo-paper"), MAPPED, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_watch__is_refused() -> None:
+    with refused("a picture of the motion needs exact impacts"):
+        eb.EthBrakeEnv(MAPPED, render_mode="ansi").reset(seed=1)
 
 
 def test_mixture__has_one_physics() -> None:
