@@ -1,11 +1,11 @@
-"""The paper's strategies in our physics, under two readings of the time from which Vehicle 2 may act."""
+"""Readings of the paper: what its text leaves open, as a value; and the paper's strategies under a reading."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -44,20 +44,76 @@ ABOUT_BASELINE = (
 )
 
 
-class Reading(NamedTuple):
-    """A reading of the paper's text: the time from which Vehicle 2 acts."""
+Reported = Literal["realised", "predicted", "predicted harm, realised collisions"]
 
-    name: str
-    acts_s: float | None = None  # since the alert (s); None: the latency of the scenario
+WORDS = {  # field of a reading -> its default in words, and another value
+    "acts_s": ("Vehicle 2 acts at its latency", "Vehicle 2 acts at {} s"),
+    "rear_s": ("Vehicle 3 brakes at its latency", "Vehicle 3 brakes at {} s"),
+    "step_s": ("exact impacts", "the paper's map at {} s"),
+    "restitution": ("e of the scenario", "e = {}"),
+    "others": ("other keys of the scenario", "{}"),
+    "seed": ("the usual seed", "seed {}"),
+    "counted": ("first-impact harm counts", "{} harm counts"),
+    "after_impact": ("Non-E brakes on after an impact", "Non-E {} after an impact"),
+    "plans_as_stated": ("E-V2X-BM plans for what is driven", "E-V2X-BM plans for the stated latencies"),
+    "star": ("a* in the middle", "a* at the {}"),
+    "baseline": ("E-V2X-BM: realised", "E-V2X-BM: {}"),
+    "hybrid": ("hybrid: realised", "hybrid: {}"),
+}
+
+
+def say(field: str, value: Any) -> str:
+    """Return a value of a field of a reading in words."""
+    default, other = WORDS[field]
+    if value == Reading._field_defaults[field]:
+        return default
+    return other.format(", ".join(f"{key} = {each}" for key, each in value) if field == "others" else value)
+
+
+class Reading(NamedTuple):
+    """A reading of the paper's text: a value for each of the quantities that it leaves open. Defaults are ours."""
+
+    acts_s: float | None = None  # when Vehicle 2 acts (s since the alert); None: the latency of the scenario
+    rear_s: float | None = None  # when Vehicle 3 brakes (s since the alert); None: the same
+    step_s: float | None = (
+        None  # of the paper's map, whose impacts happen at samples; None: impacts at their exact time
+    )
+    restitution: float | None = None  # None: the scenario's
+    others: tuple[tuple[str, Any], ...] = ()  # other keys of the scenario, and their values
+    seed: int = SEED  # of the list of worlds
+    counted: Literal["first", "total"] = "first"  # harm of each pair's first impact, or of every impact
+    after_impact: Literal["brakes on", "coasts", "ends"] = "brakes on"  # what Non-E does then; the episode ends
+    plans_as_stated: bool = False  # E-V2X-BM plans for the latencies of the scenario, whichever are driven
+    star: Literal["low end", "middle", "high end"] = "middle"  # of the decelerations that do equally little harm
+    baseline: Reported = "realised"  # what is reported of E-V2X-BM: what happens, or what it predicts
+    # what is reported of Algorithm 1: with the pairwise H* what happens, or what it predicts, min(H_RL, H*)
+    hybrid: Reported | Literal["realised, by the coupled H*", "policy alone"] = "realised"
+
+    @property
+    def name(self) -> str:
+        """What differs from the defaults, in words."""
+        changed = (field for field, value in self._asdict().items() if value != self._field_defaults[field])
+        return "; ".join(say(field, getattr(self, field)) for field in changed) or "as stated"
+
+    def only(self, *fields: str) -> Reading:
+        """Return the reading with defaults in all fields but these."""
+        return Reading(**{field: getattr(self, field) for field in fields})
 
     def scenario(self, name: str, **changes: Any) -> Scenario:
-        """Return a shipped scenario under this reading, with ``changes`` of other keys."""
+        """Return a shipped scenario of three vehicles under this reading, with ``changes`` of other keys."""
         scenario = load_scenario(name).replace(**changes)
-        first, _, *others = scenario.model_dump()["latency_s"]
-        return scenario if self.acts_s is None else scenario.replace(latency_s=[first, self.acts_s, *others])
+        keys = dict(self.others)
+        first, middle, rear = scenario.model_dump()["latency_s"]
+        if self.acts_s is not None or self.rear_s is not None:
+            keys["latency_s"] = [first, middle if self.acts_s is None else self.acts_s, self.rear_s or rear]
+        if self.step_s is not None:
+            keys |= {"physics": "paper-map", "time_step_s": self.step_s}
+        if self.restitution is not None:
+            keys["restitution"] = self.restitution
+        return scenario.replace(**keys)
 
 
-READINGS = STATED, EARLY = Reading("as stated"), Reading("Vehicle 2 acts at 0.2 s", 0.2)
+READINGS = STATED, EARLY = Reading(), Reading(acts_s=0.2)
 
 
 def expected(game: Game, alert: State, last: State) -> Floats | None:

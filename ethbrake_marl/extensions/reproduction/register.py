@@ -2,85 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
-from ethbrake_marl.evaluation.door import SEED
-from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
-from ethbrake_marl.extensions.reproduction.readings import COUPLED, FOUR, NON_ETHICAL, PPO, RANDOM, REALISED, drive
-from ethbrake_marl.extensions.reproduction.verdicts import PERCENT, Verdict, compare_number
+from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, HYBRID_PPO, NON_E, Table, table_of
+from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
+from ethbrake_marl.extensions.reproduction.search import NEAREST, differences, numbers_of, reproduce_search
+from ethbrake_marl.extensions.reproduction.verdicts import HARM, PERCENT, Verdict, compare_number
 from ethbrake_marl.files.sheet import Column, Sheet
-from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.progress import Progress
-from ethbrake_marl.worlds.catalogue import load_scenario
 
 WORLDS = 2_000
-SHOWN = (NON_ETHICAL, REALISED, COUPLED, PPO)
 
 
-@dataclass(frozen=True)
-class Alternative:
-    """Another value of a quantity."""
-
-    value: str
-    changes: Mapping[str, Any] = field(default_factory=dict)  # keys of the scenario
-    seed: int = SEED
-    count: str = "first_impact"  # ``total``, ``sampled``, or ``predicted``: what E-V2X-BM expects
-    ppo: str = FOUR[PPO]  # what drives as PPO
-
-
-@dataclass(frozen=True)
-class Gap:
+class Gap(NamedTuple):
     """A quantity that the paper does not state, or not clearly."""
 
     name: str
     paper: str  # what it says, with the label in its source
     ours: str  # our default
-    alternatives: tuple[Alternative, ...] = ()
+    alternatives: tuple[Reading, ...] = ()
     otherwise: str = ""  # why there are none
 
 
-def _of(key: str, *values: float, unit: str = "") -> tuple[Alternative, ...]:
-    return tuple(Alternative(f"{value:g}{unit}", {key: value}) for value in values)
+def each(field: str, *values: Any) -> tuple[Reading, ...]:
+    """Return readings with other values of one field."""
+    return tuple(STATED._replace(**{field: value}) for value in values)
 
+
+def key(name: str, *values: Any) -> tuple[Reading, ...]:
+    """Return readings with other values of one key of the scenario."""
+    return tuple(STATED._replace(others=((name, value),)) for value in values)
+
+
+EARLY_DRIVEN = STATED._replace(acts_s=0.2, plans_as_stated=True, baseline="predicted harm, realised collisions")
 
 GAPS = (
+    Gap("impacts at samples or exact, time step Δt", "dynamics2: at samples; a sampling period, no number",
+        "at their exact time; a decision every 0.1 s",
+        (*each("step_s", 0.1, 0.2, 0.25, 0.5), *key("time_step_s", 0.05, 0.2))),
+    Gap("when Vehicle 2 may act", "text to Fig:Harm-ivds: τ2 = 0.5 s", "0.5 s", each("acts_s", 0.3, 0.2)),
+    Gap("what the latency of Vehicle 3 is counted from", "eq:olle2: from t = 0", "from t = 0; 1.3 s: from τ2",
+        each("rear_s", 0.95, 1.3)),
     Gap("restitution e", "eq:12: e in [0, 1], typically at most 0.3; not said for its tests", "0.1",
-        _of("restitution", 0.0, 0.2, 0.3, 0.5)),
-    Gap("time step Δt", "sec:optimization_problem: a sampling period, no number", "0.1 s",
-        _of("time_step_s", 0.05, 0.2, unit=" s between decisions")),
-    Gap("impacts at samples or exact", "dynamics2: at samples", "at their exact time; each impact once",
-        (Alternative("the paper's map at 0.1 s, harm at every sample of an overlap (eq:Jharmn)", count="sampled"),)),
-    Gap("horizon N", "Jfunc: N steps, no number", "8 s", _of("horizon_s", 5.0, 16.0, unit=" s")),
-    Gap("largest speed v_max", "eq:52: a limit, no number", "40 m/s", _of("speed_limit_mps", 25.0, unit=" m/s")),
-    Gap("when Vehicle 2 may act", "text to Fig:Harm-ivds: τ2 = 0.5 s", "0.5 s",
-        (Alternative("0.2 s", {"latency_s": [0, 0.2, 0.8]}), Alternative("0.3 s", {"latency_s": [0, 0.3, 0.8]}))),
-    Gap("what the latency of Vehicle 3 is counted from", "eq:olle2: from t = 0", "from t = 0",
-        (Alternative("from τ2 (τ3 = 1.3 s)", {"latency_s": [0, 0.5, 1.3]}),)),
+        each("restitution", 0.0, 0.2, 0.3, 0.5)),
     Gap("which impacts count", "sec:result: each pairwise collision once; eq:Jharmn: at every sample",
-        "each pair's first impact", (Alternative("every impact", count="total"),)),
-    Gap("H* of E-V2X-BM, predicted or realised", "Eq:BaselineHarm: the expected harm", "realised; both are shown",
-        (Alternative("predicted, pair by pair", count="predicted"),)),
-    Gap("H* inside the hybrid", "alg:hybrid: H* of Eq:BaselineHarm", "realised (coupled)",
-        (Alternative("hybrid with realised H*", ppo="ppo+episode"),
-         Alternative("hybrid with predicted H*", ppo="ppo+episode:pairwise"))),
-    Gap("initial speeds of Table:hybrid", "identical simulation settings; only gaps are named", "18 to 22 m/s",
-        (Alternative("20, 18, 20 m/s", {"speeds_mps": [20, 18, 20]}),)),
-    Gap("seed of the test", "text to Table:hybrid: a fixed random seed", "7",
-        (Alternative("8", seed=8), Alternative("9", seed=9))),
-    Gap("impacts before Vehicle 2 may act", "sec:system_model: assumed not to happen", "such worlds are drawn again",
-        (Alternative("kept", {"early_impacts": "keep"}),)),
-    Gap("what Vehicle 1 brakes for", "sec:problem: an unforeseen obstacle, not modelled", "nothing ahead",
-        (Alternative("an obstacle 1.7 m beyond its stopping point", {"obstacle_margin_m": 1.7}),)),
+        "each pair's first impact", each("counted", "total")),
+    Gap("the non-ethical vehicles after an impact", "text to Fig:Harm-ivds: brake until standstill or collision",
+        "brake until they stand", each("after_impact", "coasts", "ends")),
+    Gap("for which latencies E-V2X-BM plans", "sec:result: those of the test", "those that are driven",
+        (EARLY_DRIVEN, EARLY_DRIVEN._replace(star="low end"), EARLY_DRIVEN._replace(star="high end"))),
+    Gap("which a*", "Eq:BaselineHarm: any of an interval, if H* = 0", "the middle",
+        otherwise="no effect, unless other latencies are driven than planned for: see above"),
+    Gap("what is reported of E-V2X-BM", "Eq:BaselineHarm: the expected harm", "realised; both are shown",
+        each("baseline", "predicted")),
+    Gap("H* inside the hybrid, and what is reported", "alg:hybrid: H* of Eq:BaselineHarm, expects min(H_RL, H*)",
+        "the pairwise H*, realised", each("hybrid", "predicted", "realised, by the coupled H*", "policy alone")),
     Gap("may Vehicle 2 drive", "text to Fig:Harm-ivds: yes, a_u,2 = 7 m/s²; E-V2X-BM only brakes", "yes",
-        (Alternative("no, brake and coast only", {"driving_capacity_mps2": [6, 0, 6]}),)),
-    Gap("Vehicles 1 and 3 after an impact", "eq:olle1, eq:olle2: brake for a time fixed by the initial speeds",
-        "brake until they stand",
-        otherwise="not measured: the engine has no vehicle that rolls on after its braking time"),
+        key("driving_capacity_mps2", (6.0, 0.0, 6.0))),
+    Gap("what Vehicle 1 brakes for", "sec:problem: an unforeseen obstacle, not modelled", "nothing ahead",
+        key("obstacle_margin_m", 1.7)),
+    Gap("initial speeds of Table:hybrid", "identical simulation settings; only gaps are named", "18 to 22 m/s",
+        key("speeds_mps", (20.0, 18.0, 20.0))),
+    Gap("horizon N", "Jfunc: N steps, no number", "8 s", otherwise="no effect on any number, from 5 to 16 s"),
+    Gap("largest speed v_max", "eq:52: a limit, no number", "40 m/s", otherwise="no effect on any number, from 25 m/s"),
+    Gap("seed of the test", "text to Table:hybrid: a fixed random seed", "7", each("seed", 8, 9)),
+    Gap("impacts before Vehicle 2 may act", "sec:system_model: assumed not to happen", "such worlds are drawn again",
+        otherwise="no effect: no world of the random test has one"),
     Gap("weights of the reward", "w_h, w_p, w_j, R_safe, k_energy, k_d, d_safe, d_target: none stated",
         "1, 0.1, 1e-5, 10 in ppo-paper", otherwise="not measured: each needs trainings that converge"),
     Gap("state of the policy", "MDP formulation: positions, speeds, actions of the others",
@@ -92,66 +82,65 @@ GAPS = (
         otherwise="not measured: one training each takes minutes; docs/train.md compares recipes"),
 )  # fmt: skip
 DEFAULTS = Gap("our defaults", "", "")
-
-
-def measure(alternative: Alternative, episodes: int) -> tuple[Result, dict[str, Floats]]:
-    """Drive the random test with another value; return the harm of each strategy, [n] m2/s2, beside the result.
-
-    What predicts nothing has its first-impact harm in place of the predicted one.
-    """
-    scenario = load_scenario(RANDOM).replace(**alternative.changes)
-    agents = {name: FOUR[name] for name in SHOWN} | {PPO: alternative.ppo}
-    result = drive(scenario, agents, episodes, alternative.seed, ["sampled_harm"])
-    harm = {}
-    for name, columns in result.columns.items():
-        harm[name] = columns.get(f"{alternative.count}_harm", columns["first_impact_harm"])
-    return result, harm
+COMBINED = Gap("several at once", "", "", (
+    EARLY_DRIVEN._replace(star="low end", hybrid="predicted"),
+    STATED._replace(acts_s=0.2, step_s=0.2),
+    STATED._replace(rear_s=0.95, step_s=0.2),
+    NEAREST,
+))  # fmt: skip
 
 
 def reproduce_gaps(settings: Settings) -> Made:
-    """Measure every alternative of the register."""
+    """Measure every alternative of the register; with ``settings.full``, also search over all combinations."""
     episodes = min(WORLDS, settings.episodes)
-    asked = [(DEFAULTS, Alternative("")), *((gap, each) for gap in GAPS for each in gap.alternatives)]
-    rows, harms = [], dict[str, dict[str, Floats]]()
-    for number, (gap, each) in enumerate(asked):
+    asked = [(DEFAULTS, STATED), *((gap, each) for gap in (*GAPS, COMBINED) for each in gap.alternatives)]
+    rows, tables = [], dict[str, Table]()
+    for number, (gap, reading) in enumerate(asked):
         settings.tell(Progress("open quantities", number, len(asked)))
-        result, harm = measure(each, episodes)
-        harms[f"{gap.name}: {each.value}"] = harm
-        rates = (rate(columns["collided"]).value for columns in result.columns.values())
-        rows.append((gap.name, each.value, *map(mean, harm.values()), *rates))
-    base, *others = harms.values()
-    printed = {row.agent: row.average_harm for row in RANDOM_TEST}
+        tables[reading.name] = table = table_of(reading, episodes)
+        rates, harms = zip(*table.values(), strict=True)
+        rows.append(
+            (
+                gap.name,
+                reading.name,
+                float(differences(numbers_of(table)).mean()),
+                *harms,
+                *(rate.value for rate in rates),
+            )
+        )
+    base, *others = tables.values()
     verdicts = [
         compare_number(
-            f"{agent}, average harm of Table:Random, one open quantity changed at a time",
-            printed[agent],
-            mean(base[name]),
-            others={row: mean(harm[name]) for row, harm in harms.items() if harm is not base},
+            f"{row.agent}, {what} of Table:Random, one open quantity changed at a time",
+            printed,
+            base[row.agent][column],
+            show=show,
+            others={name: table[row.agent][column] for name, table in tables.items() if table is not base},
         )
-        for agent, name in (("Non-E", NON_ETHICAL), ("E-V2X-BM", REALISED), ("Hybrid PPO", PPO))
+        for row in RANDOM_TEST
+        for column, (what, printed, show) in enumerate(
+            (("collision rate", row.collision_rate, PERCENT), ("average harm", row.average_harm, HARM))
+        )
     ]
-    broken = [
-        row
-        for row, harm in harms.items()
-        if harm is not base and not harm[PPO].mean() <= harm[COUPLED].mean() <= harm[NON_ETHICAL].mean()
-    ]
+    broken = [name for name, table in tables.items() if table is not base and not in_order(table)]
     stays = f"in {len(others) - len(broken)} of {len(others)} alternatives"
     verdicts.append(
         Verdict(
-            f"the order stays: {PPO} < {COUPLED} < {NON_ETHICAL}",
+            f"the order of harm stays: {HYBRID_PPO} < {E_V2X_BM} < {NON_E}",
             "differs" if broken else "agrees",
             f"{stays}; not with {'; '.join(broken)}" if broken else stays,
         )
     )
     register = [
-        (gap.name, gap.paper, gap.ours, "; ".join(each.value for each in gap.alternatives) or gap.otherwise)
+        (gap.name, gap.paper, gap.ours, "; ".join(each.name for each in gap.alternatives) or gap.otherwise)
         for gap in GAPS
     ]
-    collisions = [replace(PERCENT, heading=f"Collisions, {name}") for name in SHOWN]
+    collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in base]
     note = (
-        f"{episodes:,} worlds. Mean harm (m²/s²) with its 95 % interval, then the collision rate. In the rows of H*"
-        f" inside the hybrid, PPO stands behind Algorithm 1. {POLICIES} They are not trained anew for an alternative."
+        f"{episodes:,} worlds. Distance: mean of |ours / printed - 1| over the eight numbers. Then mean harm (m²/s²)"
+        f" with its 95 % interval, and the collision rate. {POLICIES} They are not trained anew for an alternative."
     )
+    columns = ("Quantity", "Value", replace(PERCENT, heading="Distance"), *map(Column, base), *collisions)
     sheets = [
         Sheet(
             "Register of what the paper leaves open",
@@ -159,6 +148,12 @@ def reproduce_gaps(settings: Settings) -> Made:
             register,
             "Labels are those of the paper's source.",
         ),
-        Sheet("The random test with other values", ("Quantity", "Value", *map(Column, SHOWN), *collisions), rows, note),
+        Sheet("The random test with other values", columns, rows, note),
     ]
-    return Made(verdicts, sheets)
+    more = reproduce_search(settings) if settings.full else Made([])
+    return Made([*verdicts, *more.verdicts], [*sheets, *more.sheets], notes=more.notes)
+
+
+def in_order(table: Table) -> bool:
+    """Return whether the hybrid harms least, and full braking most."""
+    return table[HYBRID_PPO][1].value <= table[E_V2X_BM][1].value <= table[NON_E][1].value

@@ -1,0 +1,159 @@
+"""The paper's random test (``Table:Random``) under a reading: collision rate and mean harm of its four strategies.
+
+A row of the table depends on some fields of a reading alone: what readings have in common is simulated once.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from functools import cache
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ethbrake_marl.agents.drive import drive
+from ethbrake_marl.agents.pairwise import CANDIDATES, TIE, Choice, find_candidates, pairwise, predicted_harm
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import ENDED, State
+from ethbrake_marl.errors import Unfamiliar
+from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl.extensions.reproduction.readings import RANDOM, Reading
+from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.motion.layout import BRAKING, HIT, LATENCY, Bools, Floats
+from ethbrake_marl.names import open_game, teams_of
+from ethbrake_marl.worlds.scenario import Scenario
+
+VEHICLE_2 = 2  # body
+NON_E, E_V2X_BM, HYBRID_SAC, HYBRID_PPO = "Non-E", "E-V2X-BM", "Hybrid SAC", "Hybrid PPO"  # rows of the paper
+SHIPPED: Mapping[str, str] = MappingProxyType({HYBRID_SAC: "sac", HYBRID_PPO: "ppo"})  # specs of the policies
+
+WORLDS = ("acts_s", "rear_s", "step_s", "restitution", "others", "seed")  # fields that change worlds or their physics
+PLANS = ("acts_s", "rear_s", "others", "seed", "plans_as_stated", "star")  # that change what E-V2X-BM plans
+DEPENDS = {  # row -> fields on which it depends
+    NON_E: (*WORLDS, "counted", "after_impact"),
+    E_V2X_BM: (*WORLDS, *PLANS, "counted", "baseline"),
+    HYBRID_SAC: (*WORLDS, *PLANS, "counted", "hybrid"),
+    HYBRID_PPO: (*WORLDS, *PLANS, "counted", "hybrid"),
+}
+
+SHORT_STEP_S = 0.02  # between decisions, where what follows an impact begins at the next decision
+
+Table = Mapping[str, tuple[Estimate, Estimate]]  # row -> collision rate, and mean harm (m2/s2)
+
+
+Outcome = Mapping[str, NDArray[Any]]  # collided [n]; first, total: harm [n] m2/s2
+
+
+def outcome_of(last: State) -> Outcome:
+    """Return what has happened in episodes."""
+    return {"collided": last.collided, "first": last.harm("first"), "total": last.harm("total")}
+
+
+def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED) -> Table:
+    """Return the table under a reading, in the first worlds of the random test, with 95 % intervals.
+
+    ``policies`` are the specs of the two policies: ``Hybrid SAC``, ``Hybrid PPO``. Raises ``InvalidInput`` for the
+    coupled H* in the paper's map.
+    """
+    return {row: estimate(row, reading.only(*DEPENDS[row]), episodes, policies.get(row, "")) for row in DEPENDS}
+
+
+@cache
+def estimate(row: str, reading: Reading, episodes: int, spec: str) -> tuple[Estimate, Estimate]:
+    """Return collision rate and mean harm of a row."""
+    collided, harm = reported(row, reading, episodes, spec)
+    return rate(collided), mean(harm)
+
+
+def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
+    """Return whether there is a collision, and the harm (m2/s2), in each world, [n], as a reading reports them.
+
+    ``spec`` is the policy of a hybrid (Algorithm 1): where it does more harm than H*, E-V2X-BM drives the episode.
+    """
+    worlds, counted = reading.only(*WORLDS), reading.counted
+    if row == NON_E:
+        braking = brake(worlds, None, reading.after_impact, episodes)
+        return braking["collided"], braking[counted]
+    plans = reading.only(*PLANS)
+    baseline, bound = brake(worlds, plans, "brakes on", episodes), plan(plans, episodes).harm
+    if row == E_V2X_BM:
+        return choose(reading.baseline, baseline["collided"], baseline[counted], bound)
+    policy = drive_all(worlds, spec, "first", episodes)
+    if reading.hybrid == "realised, by the coupled H*":
+        baseline = drive_all(worlds, "e_v2x_bm", counted, episodes)
+        bound = baseline[counted]
+    own, other = policy[counted], baseline[counted]
+    follows = (own <= bound) | (reading.hybrid == "policy alone")
+    collided = np.where(follows, policy["collided"], baseline["collided"])
+    return choose(reading.hybrid, collided, np.where(follows, own, other), np.minimum(own, bound))
+
+
+def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
+    """Return what is reported: what happens, or what was predicted at the alert."""
+    if numbers == "predicted":
+        return predicted > 0.0, predicted
+    return collided, predicted if numbers == "predicted harm, realised collisions" else harm
+
+
+@cache
+def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
+    """Return scenario, game and worlds at the alert."""
+    scenario, game = open_game(worlds.scenario(RANDOM))
+    return scenario, game, scenario.sample(episodes, worlds.seed)
+
+
+@cache
+def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> Outcome:
+    """Let all vehicles brake fully, or Vehicle 2 as E-V2X-BM plans.
+
+    "coasts": vehicles stop braking at the first decision after their first impact. "ends": the episode ends there.
+    """
+    if after_impact != "brakes on" and worlds.step_s is None:
+        worlds = worlds._replace(others=(*worlds.others, ("time_step_s", SHORT_STEP_S)))
+    _, game, alert = opened(worlds, episodes)
+    car = alert.car.copy()
+    if plans is not None:
+        car[:, BRAKING, VEHICLE_2] = plan(plans, episodes).deceleration_mps2
+    state, fully = game.reset(alert._replace(car=car)), np.full((episodes, 1), -1.0)
+    while not state.ended.all():
+        state, _ = game.step(state, fully)
+        if after_impact == "coasts":
+            hit = np.maximum(state.line[:, HIT, :-1], state.line[:, HIT, 1:]) == 1.0  # [n, N], in front or behind
+            for commands in (car[:, BRAKING, 1:], state.wanted[:, 1:]):
+                commands[hit] = 0.0
+        if after_impact == "ends":
+            state.clock[:, ENDED] = np.maximum(state.clock[:, ENDED], state.collided)
+    return outcome_of(state)
+
+
+@cache
+def plan(plans: Reading, episodes: int) -> Choice:
+    """Return what E-V2X-BM plans by the paper's closed form, which knows neither restitution nor time step.
+
+    Of all decelerations that do equally little harm it is the middle one, or the low or high end.
+    """
+    latencies = () if plans.plans_as_stated else ("acts_s", "rear_s")
+    _, _, alert = opened(plans.only("others", "seed", *latencies), episodes)
+    chosen = pairwise(alert, VEHICLE_2)
+    if plans.star == "middle":
+        return chosen
+    at, ends = np.empty(CANDIDATES), np.empty((episodes, 2))
+    for k, (line, car) in enumerate(zip(alert.line, alert.car.copy(), strict=True)):
+        find_candidates(line, car[BRAKING], car[LATENCY], VEHICLE_2, at)
+        possible = at[(at >= 0.0) & (at <= car[BRAKING, VEHICLE_2])]
+        harm = np.array([predicted_harm(line, car[BRAKING], car[LATENCY], VEHICLE_2, a) for a in possible])
+        tied = possible[harm <= harm.min() + TIE * (1.0 + harm.min())]
+        ends[k] = tied.min(), tied.max()
+    return chosen._replace(deceleration_mps2=ends[:, ("low end", "high end").index(plans.star)])
+
+
+@cache
+def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> Outcome:
+    """Let an agent drive Vehicle 2. Where a policy drives that was trained elsewhere, the page says so."""
+    scenario, game, alert = opened(worlds, episodes)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Unfamiliar)
+        return outcome_of(drive(game, alert, teams_of({spec: spec}, scenario, harm_count=counted)[spec]))

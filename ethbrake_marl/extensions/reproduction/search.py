@@ -1,0 +1,150 @@
+"""A search over readings of the paper: which one comes nearest to all numbers of ``Table:Random`` together?
+
+The eight independent numbers are collision rate and average harm of four strategies; the others follow from them. The
+*difference* of a number is |ours / printed - 1|. The *distance* of a reading is the mean difference of the eight.
+
+The nearest reading is a hypothesis: among so many readings some come near by chance. To judge this, the search also
+looks for tables that nobody has printed. Each of their numbers is from a reading drawn at random, one draw for each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
+from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
+from ethbrake_marl.extensions.reproduction.random_test import DEPENDS, SHIPPED, Table, table_of
+from ethbrake_marl.extensions.reproduction.readings import STATED, Reading, say
+from ethbrake_marl.extensions.reproduction.verdicts import PERCENT, Verdict
+from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.progress import OnProgress, Progress
+
+WORLDS, WORLDS_AGAIN = 1_000, 10_000  # of the search, and of the nearest readings
+KEPT, SHOWN = 30, 10  # nearest readings that are measured again, and that are shown
+FAKES = 200  # tables that nobody has printed
+
+ONLY_BRAKES = (("driving_capacity_mps2", (6.0, 0.0, 6.0)),)  # keys of the scenario
+
+Grid = Mapping[str, Sequence[Any]]  # field of a reading -> values
+GRID: Grid = {
+    "acts_s": (None, 0.3, 0.2),
+    "rear_s": (None, 0.95, 1.3),
+    "step_s": (None, 0.1, 0.2, 0.25, 0.5),
+    "restitution": (None, 0.0, 0.3),
+    "others": ((), ONLY_BRAKES),
+    "counted": ("first", "total"),
+    "after_impact": ("brakes on", "coasts", "ends"),
+    "plans_as_stated": (False, True),
+    "star": ("middle", "low end", "high end"),
+    "baseline": ("realised", "predicted", "predicted harm, realised collisions"),
+    "hybrid": (
+        "realised",
+        "predicted",
+        "predicted harm, realised collisions",
+        "realised, by the coupled H*",
+        "policy alone",
+    ),
+}
+
+PRINTED = np.array([(row.collision_rate, row.average_harm) for row in RANDOM_TEST])  # [4, 2], in the order of DEPENDS
+NEAREST = STATED._replace(
+    acts_s=0.2,
+    step_s=0.2,
+    plans_as_stated=True,
+    star="low end",
+    baseline="predicted harm, realised collisions",
+    hybrid="policy alone",
+)
+
+
+def readings_of(grid: Grid) -> Iterator[Reading]:
+    """Yield all combinations of a grid; the paper's map has no coupled H*."""
+    for values in product(*grid.values()):
+        reading = STATED._replace(**dict(zip(grid, values, strict=True)))
+        if reading.step_s is None or reading.hybrid != "realised, by the coupled H*":
+            yield reading
+
+
+def search(
+    grid: Grid = GRID,
+    episodes: int = WORLDS,
+    policies: Mapping[str, str] = SHIPPED,
+    tell: OnProgress = lambda progress: None,
+) -> tuple[list[Reading], Floats]:
+    """Return the readings of a grid, and their numbers, [R, 4, 2]. Of readings with the same numbers it has the first.
+
+    ``policies`` are the specs of the two policies: ``Hybrid SAC``, ``Hybrid PPO``.
+    """
+    every, different = [*readings_of(grid)], dict[bytes, tuple[Reading, Floats]]()
+    for number, reading in enumerate(every):
+        if number % 1_000 == 0:
+            tell(Progress("readings", number, len(every)))
+        numbers = numbers_of(table_of(reading, episodes, policies))
+        different.setdefault(numbers.tobytes(), (reading, numbers))
+    readings, found = zip(*different.values(), strict=True)
+    return [*readings], np.array(found)
+
+
+def numbers_of(table: Table) -> Floats:
+    """Return collision rate and mean harm (m2/s2) of the four rows, [4, 2]."""
+    return np.array([[each.value for each in row] for row in table.values()])
+
+
+def differences(numbers: Floats, printed: Floats = PRINTED) -> Floats:
+    """Return the differences of numbers [..., 4, 2] from a printed table [4, 2], as [..., 8]."""
+    return np.abs(numbers / printed - 1.0).reshape(*numbers.shape[:-2], -1)
+
+
+def by_chance(numbers: Floats) -> Floats:
+    """Return the distance of the nearest reading from each of some tables that nobody has printed, [FAKES].
+
+    ``numbers`` [R, 4, 2] are those of all readings.
+    """
+    drawn = np.random.default_rng(0).integers(len(numbers), size=(FAKES, *PRINTED.shape))
+    fakes = np.take_along_axis(numbers, drawn, axis=0)
+    return np.array([differences(numbers, fake).mean(axis=1).min() for fake in fakes])
+
+
+def reproduce_search(settings: Settings) -> Made:
+    """Search for the nearest reading; measure the nearest ones again in more worlds."""
+    episodes, again = min(WORLDS, settings.episodes), min(WORLDS_AGAIN, settings.episodes)
+    readings, numbers = search(episodes=episodes, tell=settings.tell)
+    distances = differences(numbers).mean(axis=1)
+    kept = [readings[k] for k in np.argsort(distances, kind="stable")[:KEPT]]
+    measured = {reading: numbers_of(table_of(reading, again)) for reading in (*kept, STATED)}
+    nearest = sorted(kept, key=lambda reading: float(differences(measured[reading]).mean()))[:SHOWN]
+    rows: list[tuple[Any, ...]] = [("printed", 0.0, 0.0, *PRINTED.T.ravel())]
+    for reading in (*nearest, STATED):
+        off = differences(measured[reading])
+        rows.append((reading.name, float(off.mean()), float(off.max()), *measured[reading].T.ravel()))
+    fixed = []
+    for field, values in GRID.items():
+        for value in values:
+            best = min((distances[k], k) for k, each in enumerate(readings) if getattr(each, field) == value)[1]
+            fixed.append((say(field, value), float(distances[best]), readings[best].name))
+    fakes = by_chance(numbers)
+    note = (
+        "The nearest reading is a hypothesis: the paper does not say that its numbers were made like this, and among"
+        f" {len(readings):,} readings with different numbers some come near by chance. For {FAKES} tables that nobody"
+        " has printed, whose numbers are each drawn from a reading at random, the nearest reading has a distance of"
+        f" {100.0 * np.median(fakes):.1f} % in the median; for {100.0 * (fakes <= distances.min()).mean():.1f} % of"
+        f" them it is as near as to the printed table. {POLICIES}"
+    )
+    part = replace(PERCENT, heading="Distance")
+    columns = (
+        *("Reading", part, replace(part, heading="Largest difference")),
+        *(replace(PERCENT, heading=f"Collisions, {row}") for row in DEPENDS),
+        *(Column(f"Harm, {row}") for row in DEPENDS),
+    )
+    sheets = [
+        Sheet("The nearest readings", columns, rows, f"{again:,} worlds; harm in m²/s²."),
+        Sheet("The nearest reading with one value fixed", ("Fixed", part, "Reading"), fixed, f"{episodes:,} worlds."),
+    ]
+    same = "agrees" if nearest[0] == NEAREST else "differs"
+    return Made([Verdict("the nearest reading is the one of this page", same, nearest[0].name)], sheets, notes=[note])
