@@ -263,8 +263,8 @@ BENCHMARKS: tuple[Benchmark, ...] = (
         _start_seconds,
     ),
     _rate_of("sampling", "a list of worlds, refused draws included", _sampling, 10_000, unit="worlds/s"),
-    _rate_of("E-V2X-BM pairwise", "one optimum per world", partial(_optimise, pairwise), 10_000, unit="worlds/s"),
-    _rate_of("E-V2X-BM coupled", "one optimum per world", partial(_optimise, coupled), 1000, unit="worlds/s"),
+    _rate_of("E-V2X-BM (pairwise)", "one optimum per world", partial(_optimise, pairwise), 10_000, unit="worlds/s"),
+    _rate_of("E-V2X-BM (coupled)", "one optimum per world", partial(_optimise, coupled), 1000, unit="worlds/s"),
     _rate_of("hold", "16 constant commands per world, to the horizon", _forecast, 1000, unit="runs/s"),
 )
 

@@ -365,7 +365,7 @@ def table(found: Results) -> list[list[str]]:
     rows = []
     for level in levels_of(found):
         harms = found["references"].get(level, {})
-        for name, label in (("full_brake", "full braking"), ("e_v2x_bm", "E-V2X-BM")):
+        for name, label in (("full_brake", "full braking"), ("e_v2x_bm", "E-V2X-BM (coupled)")):
             if name in harms:
                 rows.append([f"`{level}`", label, "–", "–", *(f"{harm:.2f}" for harm in harms[name])])
         for algorithm, (label, _) in ALGORITHMS.items():
@@ -394,7 +394,7 @@ def draw(found: Results) -> Figure:
                 axes.plot(spent, [each.value for each in middles], label=label.replace("`", ""), **style)
                 low, high = np.transpose([each.interval or (each.value, each.value) for each in middles])
                 band(axes, spent, low, high, style)
-        lines = {"e_v2x_bm": ("E-V2X-BM", ":"), "joint optimum": ("joint optimum (search)", "--")}
+        lines = {"e_v2x_bm": ("E-V2X-BM (coupled)", ":"), "joint optimum": ("joint optimum (search)", "--")}
         for name, (label, dashes) in lines.items():
             if level in found["references"]:
                 harm = found["references"][level][name][0]

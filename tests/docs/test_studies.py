@@ -89,7 +89,12 @@ def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_
     found = {"seconds": 2.0, "worlds": 100, "seed": 1, "speeds": [], "references": {level: harms}, "curves": curves}
     assert json.loads(team_curves.text_of(found)) == found
     rows = team_curves.table(found)
-    assert [row[1] for row in rows] == ["full braking", "E-V2X-BM", "IPPO (`train/ippo.py`)", "joint optimum (search)"]
+    assert [row[1] for row in rows] == [
+        "full braking",
+        "E-V2X-BM (coupled)",
+        "IPPO (`train/ippo.py`)",
+        "joint optimum (search)",
+    ]
     assert rows[2][2:4] == ["8,192", "2 s"]
     assert [cell.split(" [")[0] for cell in rows[2][4:]] == ["4.00", "8.00"]
     assert rows[3][4:] == ["0.50", "0.75"]

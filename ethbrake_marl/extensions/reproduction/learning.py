@@ -1,6 +1,8 @@
-"""Trainings, and the paper's learning curves (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``).
+"""Trainings by the paper's own process, and its learning curves.
 
-A further PPO is stopped before it has converged.
+The process is the recipes ``ppo-paper`` and ``sac-paper`` in the paper's map, five seeds each: in the random test, and
+at a high and a low delay (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``). A further PPO of ours is stopped
+before it has converged.
 """
 
 from __future__ import annotations
@@ -17,12 +19,12 @@ from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.curves import curves_figure, over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
-from ethbrake_marl.extensions.reproduction.verdicts import Less, Verdict, judge_statement
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge, not_run
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 
-HIGH, LOW, STOPPED = "high", "low", "stopped"
+RANDOM, HIGH, LOW, STOPPED = "random", "high", "low", "stopped"
 STATUS = "run.json"  # of a run
 
 
@@ -31,25 +33,21 @@ class Plan(NamedTuple):
 
     scenario: str
     recipe: str
-    decisions: int
-    every_updates: int  # between two measurements
     seeds: int
-    per_s: int  # decisions in a second on one core (Intel Xeon), to tell how long it takes
+    seconds: float  # of each on one core, to tell how long it takes
+    decisions: int | None = None  # None: those of the recipe
+    mapped: bool = True  # in the paper's map
 
 
-def _curves(scenario: str) -> tuple[Plan, ...]:
-    return (
-        Plan(scenario, "ppo", 400_000, 4, 3, 16_000),
-        Plan(scenario, "sac", 60_000, 30, 3, 3_000),
-        Plan(scenario, "ppo-paper", 100_000, 1, 3, 5_000),
-        Plan(scenario, "sac-paper", 20_000, 1_000, 3, 170),
-    )
+def _process(scenario: str) -> tuple[Plan, ...]:
+    return Plan(scenario, "ppo-paper", 5, 200.0), Plan(scenario, "sac-paper", 5, 200.0)
 
 
 GROUPS = {
-    STOPPED: (Plan("paper-random", "ppo", 100_000, 4, 1, 16_000),),  # a fifteenth of the recipe's decisions
-    HIGH: _curves("paper-delay-high"),
-    LOW: _curves("paper-delay-low"),
+    STOPPED: (Plan("paper-random", "ppo", 1, 6.0, 100_000, mapped=False),),  # a fifteenth of the recipe's decisions
+    RANDOM: _process("paper-random"),
+    HIGH: _process("paper-delay-high"),
+    LOW: _process("paper-delay-low"),
 }
 
 
@@ -72,14 +70,8 @@ def trained(folder: Path, group: str) -> dict[str, list[Path]]:
 
 def seconds_left(folder: Path, groups: Iterable[str]) -> float:
     """Return about how long the runs take that have not finished, in processor seconds."""
-    left = [
-        plan.decisions / plan.per_s
-        for group in groups
-        for plan in GROUPS[group]
-        for run in runs_of(folder, group, plan)
-        if not is_finished(run)
-    ]
-    return sum(left)
+    plans = [(group, plan) for group in groups for plan in GROUPS[group]]
+    return sum(plan.seconds for group, plan in plans for run in runs_of(folder, group, plan) if not is_finished(run))
 
 
 def train(settings: Settings, groups: Iterable[str]) -> bool:
@@ -100,12 +92,12 @@ def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
 
     if (run / STATUS).is_file():
         return eb.resume(run, on_progress=settings.tell).status == "finished"
-    recipe = eb.load_recipe(plan.recipe)
-    changes = {"log_every_updates": plan.every_updates} if hasattr(recipe, "log_every_updates") else {}
-    measured = {**recipe.evaluation.model_dump(), "every_updates": plan.every_updates}
+    scenario, recipe = eb.load_scenario(plan.scenario), eb.load_recipe(plan.recipe)
+    if plan.mapped:
+        scenario = scenario.replace(physics="paper-map")
     reward = {**recipe.reward.model_dump(mode="json"), "harm_count": RULES["paper"]}
-    recipe = recipe.replace(evaluation=measured, reward=reward, **changes)
-    result = eb.train(recipe, plan.scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
+    recipe = recipe.replace(reward=reward)
+    result = eb.train(recipe, scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
     return result.status == "finished"
 
 
@@ -113,108 +105,3 @@ def unconverged(folder: Path) -> str:
     """Return the spec of the policy "obtained from training before convergence occurred", which has been trained."""
     ((run,),) = trained(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"
-
-
-PAIRS = {  # stem of the figure -> what its recipes are, and the recipes
-    "ours": ("our recipes", "ppo", "sac"),
-    "paper": ("the paper's hyperparameters and reward", "ppo-paper", "sac-paper"),
-}
-RETURN, HARM = "rollout/ep_rew_mean", "eval/first_impact_harm"  # columns of progress.csv
-SHOWN = Column("Final return", digits=3)
-
-Values = Sequence[Mapping[int, float]]  # for each seed: decisions -> value; all seeds have the same decisions
-
-
-class Course(NamedTuple):
-    """Trainings by one recipe at one delay: two quantities over decisions, for each seed."""
-
-    returns: Values  # mean return of training episodes
-    harm: Values  # first-impact harm on the fixed list (m2/s2)
-
-    @property
-    def last_returns(self) -> Floats:
-        """Mean return over the last tenth of the updates, [seeds]."""
-        values = as_array(self.returns)
-        return np.asarray(values[:, -max(values.shape[1] // 10, 1) :].mean(axis=1))
-
-    @property
-    def spread(self) -> Floats:
-        """Standard deviation of the return over the seeds, at each of k steps of the second half, [k]."""
-        values = as_array(self.returns)
-        return np.asarray(values[:, values.shape[1] // 2 :].std(axis=0, ddof=1))
-
-
-def as_array(values: Values) -> Floats:
-    """Return values by seed and decision, [seeds, k]."""
-    return np.array([[*each.values()] for each in values])
-
-
-def column(run: Path, name: str) -> dict[int, float]:
-    """Return a column of a run's table: decisions -> value, where there is one."""
-    rows = csv.DictReader((run / "progress.csv").read_text("utf-8").splitlines())
-    return {int(float(row["steps"])): float(row[name]) for row in rows if row.get(name)}
-
-
-def courses_of(settings: Settings, delay: str) -> dict[str, Course]:
-    """Return the trainings at a delay that have finished, by recipe; none without ``full``."""
-    return {
-        recipe: Course(*([column(run, name) for run in runs] for name in (RETURN, HARM)))
-        for recipe, runs in (trained(settings.folder, delay) if settings.full else {}).items()
-    }
-
-
-def reproduce_curves(delay: str, settings: Settings) -> Made:
-    """Reproduce the learning curves at one delay from the trainings of ``--full``."""
-    courses = {each: courses_of(settings, each) for each in (HIGH, LOW)}
-    own = courses[delay]
-    if not own:
-        return Made([Verdict(f"learning curves at {delay} delay", "not run", "no training; --full trains them")])
-    figures = []
-    for stem, (who, *recipes) in PAIRS.items():
-        chosen = {recipe: own[recipe] for recipe in recipes if recipe in own}
-        if chosen:
-            title = f"Learning curves, {delay} delay, {who}"
-            text = f"{title}: return and harm against decisions, mean over seeds; bands: one standard deviation."
-            panels = {
-                "Mean return of training episodes": {name: over_seeds(each.returns) for name, each in chosen.items()},
-                f"{TITLES['first']}, fixed list": {name: over_seeds(each.harm) for name, each in chosen.items()},
-            }
-            figures.append(Drawn(f"learning-{delay}-{stem}", title, text, curves_figure(panels, "Decisions", text)))
-    rows = []
-    for name, each in own.items():
-        harm = as_array(each.harm)
-        last = max(each.harm[0])
-        rows.append(
-            (*(name, len(harm), f"{last:,}"), *(mean(harm.min(axis=1)), mean(harm[:, -1]), mean(each.last_returns)))
-        )
-    note = (
-        "Harm: first-impact, m²/s², 1,000 worlds of seed 1007. Final return: of the last tenth of the updates. Means"
-        " over seeds with t intervals. Recipes ppo and sac have other rewards and lengths: their returns are not"
-        " compared."
-    )
-    numbers = map(Column, ("Seeds", "Decisions", "Kept policy, harm", "Last policy, harm"))
-    sheet = Sheet(f"Trainings at {delay} delay", ("Recipe", *numbers, SHOWN), rows, note)
-    return Made(judge(courses[HIGH], courses[LOW]), [sheet], figures)
-
-
-def judge(high: Mapping[str, Course], low: Mapping[str, Course]) -> list[Verdict]:
-    """Return verdicts on the paper's statements, from the paper's two recipes, which share a reward."""
-    recipes = PAIRS["paper"][1:]
-    claims = {
-        "both algorithms reach higher returns at low delay than at high": "last_returns",
-        "returns of different seeds spread more at low delay than at high": "spread",
-        "nearly identical final returns at high delay; at low delay SAC converges faster, PPO is more stable": "",
-    }
-    if not all(name in courses for name in recipes for courses in (high, low)):
-        missing = "ppo-paper and sac-paper are not both trained at both delays"
-        return [Verdict(what, "not run", missing) for what in claims]
-    return [
-        judge_statement(
-            what,
-            [Less.of_lists(name, getattr(high[name], value), getattr(low[name], value)) for name in recipes],
-            show=SHOWN,
-        )
-        if value
-        else Verdict(what, "not run", "ppo-paper and sac-paper have not converged at these lengths")
-        for what, value in claims.items()
-    ]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.extensions.reproduction.verdicts import Verdict, summarise
+from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.progress import OnProgress
 
@@ -25,9 +25,10 @@ class Settings:
     """How a reproduction is made."""
 
     folder: Path  # of all results, and of the trainings
-    full: bool = False  # use trainings for learning curves
+    full: bool = False  # train by the paper's own process, and search over the readings
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
     tell: OnProgress = lambda progress: None
+    policies: Mapping[str, str] = field(default_factory=lambda: {"SAC": "sac", "PPO": "ppo"})  # name -> spec
 
 
 class Drawn(NamedTuple):
@@ -42,15 +43,10 @@ class Drawn(NamedTuple):
 class Made(NamedTuple):
     """What an item shows."""
 
-    verdicts: Sequence[Verdict]  # one for each comparison with the paper, at least one
+    claims: Sequence[Claim] = ()  # of the paper
     sheets: Sequence[Sheet] = ()  # tables
     figures: Sequence[Drawn] = ()
     notes: Sequence[str] = ()  # what was run
-
-    @property
-    def verdict(self) -> Verdict:
-        """All verdicts in one."""
-        return summarise(self.verdicts)
 
 
 class Item(NamedTuple):

@@ -1,11 +1,11 @@
-"""Verdicts: does a number or a statement of the paper agree with our results?
+"""The one table of the reproduction: a claim of the paper, ours as stated, ours in the nearest reading, and why.
 
 The *chance difference* is the largest difference between means of two random lists of worlds that is due to chance
 alone (95 %): sqrt(2) times half of the interval. A printed number
 
 - *agrees* if ours is within 2 % of it, or within the chance difference where that is at most 15 % of the larger one;
 - is *undecided* if ours is within a larger chance difference: too few worlds;
-- *cannot agree* if a lower bound that is proven for every strategy is above it by more than the chance difference;
+- *cannot be* if a lower bound that is proven for every strategy is above it by more than the chance difference;
 - *differs* otherwise.
 
 A statement of the paper says that quantities are smaller than others. It agrees if the interval of every difference
@@ -15,26 +15,41 @@ A statement of the paper says that quantities are smaller than others. It agrees
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 from ethbrake_marl.evaluation.statistics import difference, mean, unpaired
-from ethbrake_marl.files.sheet import Column, Estimate
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.motion.layout import Floats
 
-Outcome = Literal["cannot agree", "differs", "undecided", "not run", "agrees"]  # the worst first
+Outcome = Literal["agrees", "differs", "cannot be", "undecided", "not run"]
 
 TOLERANCE, WIDE = 0.02, 0.15
 
 HARM, PERCENT = Column("Harm"), Column("Collision rate", digits=1, scale=100.0, unit=" %")
 
 
-class Verdict(NamedTuple):
-    """Outcome of a comparison, and the numbers that explain it."""
+class Claim(NamedTuple):
+    """A number or a statement of the paper, and what comes out here."""
 
-    what: str
-    outcome: Outcome
-    because: str
+    where: str  # in the paper
+    paper: str  # what it says
+    ours: str  # as the paper states its parameters
+    nearest: str  # in the nearest reading
+    outcome: Outcome  # as stated
+    why: str
+
+    @property
+    def verdict(self) -> str:
+        """Outcome and reason."""
+        because = {"differs": "differs because ", "cannot be": "cannot be because "}
+        return because.get(self.outcome, f"{self.outcome}: " * bool(self.why) or self.outcome) + self.why
+
+
+def claims_sheet(claims: Sequence[Claim]) -> Sheet:
+    """Return the table."""
+    rows = [(f"{each.where}: {each.paper}", each.ours, each.nearest, each.verdict) for each in claims]
+    return Sheet("", ("The paper", "Ours, as stated", "Ours, nearest reading", "Why"), rows)
 
 
 def chance(ours: Estimate) -> float:
@@ -43,47 +58,14 @@ def chance(ours: Estimate) -> float:
     return math.sqrt(2.0) * 0.5 * (high - low)
 
 
-def within(printed: float, ours: Estimate) -> bool:
-    """Return whether our number agrees with a printed one."""
+def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) -> Outcome:
+    """Compare a printed number, which is not 0, with ours. ``least``: a proven lower bound for all strategies."""
+    if least is not None and least.value - printed > chance(least):
+        return "cannot be"
     by_chance = chance(ours) if chance(ours) <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
-    return abs(ours.value - printed) <= max(by_chance, TOLERANCE * abs(printed))
-
-
-def compare_number(
-    what: str,
-    printed: float,
-    ours: Estimate,
-    *,
-    show: Column = HARM,
-    least: tuple[str, Estimate] | None = None,
-    others: Mapping[str, Estimate] | None = None,
-) -> Verdict:
-    """Compare a printed number, which is not 0, with ours.
-
-    ``show`` is its format. ``least``: a proven lower bound for all strategies, in words and numbers. ``others``: our
-    numbers under other readings; where ours differs, the verdict names the nearest.
-    """
-
-    def off(other: Estimate) -> str:
-        return f"{100.0 * (other.value / printed - 1.0):+.1f} %"
-
-    text = f"ours {show.show(ours).in_words}, printed {show.scale * printed:.{show.digits + 1}f}{show.unit}"
-    if least is not None and least[1].value - printed > chance(least[1]):
-        bound = f"{least[0]}: at least {show.show(least[1]).in_words}, whoever drives"
-        return Verdict(what, "cannot agree", f"{bound}; {text}")
-    if within(printed, ours):
-        return Verdict(what, "agrees", text)
-    if abs(ours.value - printed) <= chance(ours):
-        return Verdict(what, "undecided", f"{text}: too few worlds to tell")
-    text += f" ({off(ours)})"
-    if others:
-        name, nearest = min(others.items(), key=lambda each: abs(each[1].value - printed))
-        if abs(nearest.value - printed) < abs(ours.value - printed):
-            how = "which agrees" if within(printed, nearest) else off(nearest)
-            text += f"; nearest: {name}, {show.show(nearest).in_words}, {how}"
-        else:
-            text += "; no other reading here comes nearer"
-    return Verdict(what, "differs", text)
+    if abs(ours.value - printed) <= max(by_chance, TOLERANCE * abs(printed)):
+        return "agrees"
+    return "undecided" if abs(ours.value - printed) <= chance(ours) else "differs"
 
 
 class Less(NamedTuple):
@@ -103,37 +85,36 @@ class Less(NamedTuple):
         """Compare two quantities in the same worlds, [n]."""
         return cls(where, difference(smaller, larger), not smaller.any() and not larger.any())
 
+    @property
+    def holds(self) -> bool:
+        """Whether the interval of the difference is below 0."""
+        return self.difference.ends[1] < 0.0
 
-def judge_statement(what: str, parts: Sequence[Less], *, or_equal: bool = False, show: Column = HARM) -> Verdict:
-    """Return the verdict on a statement. With ``or_equal``, a difference may also be exactly 0."""
-    ties = [part.where for part in parts if part.both_are_0]
+
+def judge_statement(parts: Sequence[Less], show: Column = HARM) -> tuple[str, Outcome, str]:
+    """Return in how many comparisons a statement holds, the outcome, and the comparisons that fail, or the nearest."""
     compared = [part for part in parts if not part.both_are_0]
-    places = ", ".join(ties) if len(ties) <= 2 else f"{len(ties)} more"
-    if not compared:
-        return Verdict(what, "agrees", f"nothing to undercut: both are 0 in {places}")
-    failing = [
-        part
-        for part in compared
-        if not (part.difference.ends[1] < 0.0 or (or_equal and part.difference.ends[1] == 0.0))
-    ]
-    counts = f"holds in {len(compared) - len(failing)} of {len(compared)}{f' (both are 0 in {places})' if ties else ''}"
-    if failing:
-        undecided = all(part.difference.ends[0] < 0.0 <= part.difference.ends[1] for part in failing)
-        text = ", ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in failing)
-        lead = f"{counts}; " if len(parts) > 1 else ""
-        return Verdict(
-            what, "undecided" if undecided else "differs", f"{lead}not {'shown' if undecided else 'so'}: {text}"
-        )
-    worst = max(compared, key=lambda part: part.difference.value)
-    lead = f"{counts}; the nearest is " if len(parts) > 1 else ""
-    return Verdict(what, "agrees", f"{lead}{worst.where}, {show.show(worst.difference).in_words}")
+    failing = [part for part in compared if not part.holds]
+    ties = f", both are 0 in {len(parts) - len(compared)} more" if len(compared) < len(parts) else ""
+    text = f"holds in {len(compared) - len(failing)} of {len(compared)}{ties}"
+    if not failing:
+        worst = max(compared, key=lambda part: part.difference.value, default=None)
+        return text, "agrees", "" if worst is None else f"{worst.where}, {show.show(worst.difference).in_words}"
+    undecided = all(part.difference.ends[0] < 0.0 for part in failing)
+    named = "; ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in failing)
+    return text, "undecided" if undecided else "differs", named
 
 
-def summarise(verdicts: Sequence[Verdict]) -> Verdict:
-    """Return one verdict with the worst outcome: how often each occurs, and the first of the worst."""
-    counted = {outcome: sum(each.outcome == outcome for each in verdicts) for outcome in get_args(Outcome)}
-    plural = {"agrees": "agree", "differs": "differ"}
-    parts = [f"{n} {plural.get(outcome, outcome) if n > 1 else outcome}" for outcome, n in counted.items() if n]
-    worst = next(each for outcome in counted for each in verdicts if each.outcome == outcome)
-    lead = "" if len(verdicts) == 1 else f"of {len(verdicts)} comparisons {', '.join(parts)}; "
-    return Verdict("all", worst.outcome, f"{lead}{worst.what}: {worst.because}")
+def judge(
+    where: str,
+    paper: str,
+    stated: Sequence[Less],
+    nearest: Sequence[Less] = (),
+    *,
+    why: str = "",
+    show: Column = HARM,
+) -> Claim:
+    """Return a statement as a claim; ``why`` follows what the numbers say."""
+    ours, outcome, numbers = judge_statement(stated, show)
+    other = judge_statement(nearest, show)[0] if nearest else ""
+    return Claim(where, paper, ours, other, outcome, ". ".join(filter(None, (numbers, why))))

@@ -1,28 +1,20 @@
-"""The paper's fixed-step map: impacts by hand, figures of version 0.5."""
+"""The paper's fixed-step map: impacts by hand, figures of version 0.5, the paper's reward, what it refuses."""
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.reproduction.paper_map import advance_sampled, sample
-from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, GAP, HIT, LATENCY, SPEED
+from ethbrake_marl.episode.reward import RewardParams
+from ethbrake_marl.extensions.reproduction.paper_map import collision, sample
+from ethbrake_marl.motion.layout import COUNT, GAP, HIT, LATENCY, SPEED
 from tests.refused import refused
 
-SCENARIO = eb.load_scenario("paper-random")
-
-
-def worlds(n: int, vehicle_2: float = -7.0) -> eb.State:
-    """Worlds of the random test at the alert, in which Vehicle 2 holds a command and the others brake fully."""
-    alert = SCENARIO.sample(n, 7)
-    wanted = alert.wanted.copy()
-    wanted[:, 1:] = -alert.braking_capacity_mps2
-    wanted[:, 2] = vehicle_2
-    return alert._replace(wanted=wanted)
+MAPPED = eb.load_scenario("paper-random-map")
 
 
 def at_a_sample(gaps, speeds) -> eb.State:
     """One world of the random test, in which nobody commands anything, at a sample with these gaps and speeds."""
-    state = SCENARIO.sample(1, 7)
+    state = MAPPED.sample(1, 7)
     line, wanted, clock = state.line.copy(), np.zeros(state.wanted.shape), state.clock.copy()
     line[0, GAP, 1:3], line[0, SPEED, 1:] = gaps, speeds
     clock[0, 0] = clock[0, 1] = 2.0
@@ -54,43 +46,138 @@ def test_impacts__of_one_sample_go_from_the_rear_to_the_front() -> None:
 
 
 @pytest.mark.parametrize(
-    ("step_s", "vehicle_2", "harm"),
-    [(0.1, -7.0, 23.479299909088144), (0.2, -7.0, 29.585014941952608), (0.25, -7.0, 36.812182133604814),
-     (0.5, -7.0, 35.79459513033634), (0.1, -5.0, 27.97726529370422)],
+    ("step_s", "agent", "harm"),
+    [(0.1, "full_brake", 23.479299909088144), (0.2, "full_brake", 29.585014941952608),
+     (0.25, "full_brake", 36.812182133604814), (0.5, "full_brake", 35.79459513033634),
+     (0.1, "constant:5", 27.97726529370422)],
 )  # fmt: skip
-def test_map__has_the_figures_of_version_0_5(step_s: float, vehicle_2: float, harm: float) -> None:
-    assert advance_sampled(worlds(2_000, vehicle_2), 8.0, step_s).harm("first").mean() == harm
+def test_game__has_the_figures_of_version_0_5(step_s: float, agent: str, harm: float) -> None:
+    result = eb.evaluate(MAPPED.replace(time_step_s=step_s), agent, episodes=2_000)
+    assert result[agent]["first_impact_harm"].mean() == harm
 
 
-def test_map__of_a_world_does_not_depend_on_the_others() -> None:
-    alert = worlds(3)
+def test_game__world_does_not_depend_on_the_others_and_its_end_stays() -> None:
+    alert = MAPPED.sample(3, 7)
     alert.car[1, LATENCY, 2] = 0.31
-    whole = advance_sampled(alert, 5.0)
-    for k in range(3):
-        assert np.array_equal(advance_sampled(alert.take([k]), 5.0).line[0], whole.line[k])
+    _, game = eb.open_game(MAPPED)
+    states = [game.reset(alert), *(game.reset(alert.take([k])) for k in range(3))]
+    for step in range(90):
+        action = -0.5 + 0.3 * np.sin(step)
+        before, states = states[0], [game.step(each, np.full((each.n, 1), action))[0] for each in states]
+        assert all(np.array_equal(states[0].line[k], states[k + 1].line[0]) for k in range(3))
+    assert before.ended.all() and np.array_equal(before.line, states[0].line)
+    assert before.time_s.max() <= 8.1
+
+
+def test_step__reports_and_rewards_what_happens() -> None:
+    scenario, game = eb.open_game(MAPPED, reward={"harm": 2.0, "terminal": 5.0, "harm_count": "total"})
+    state, total, rewards = game.reset(scenario.sample(50, 7)), np.zeros(50), np.zeros(50)
+    ends = np.zeros((3, 50))
+    while not state.ended.all():
+        state, step = game.step(state, np.full((50, 1), -0.8))
+        total += step.total_harm
+        rewards += step.reward[:, 1]
+        ends += step.terminated, step.truncated, step.safe_end
+    assert total == pytest.approx(state.harm("total"))
+    assert np.array_equal(ends[0] + ends[1], np.ones(50)) and np.array_equal(ends[2] == 1.0, ~state.collided)
+    assert 0 < ends[2].sum() < 50
+    assert rewards == pytest.approx(5.0 * ends[2] - 2.0 * total)
+
+
+def test_collision__counts_every_sample_of_an_overlap_with_the_weight_of_its_pair() -> None:
+    overlap = at_a_sample([-0.5, -0.1], [10.0, 20.0, 15.0])  # the front pair closes at 10, the rear one separates at 5
+    params = RewardParams(harm=0.0, collision=1.0, k_energy=(0.5, 2.0))
+    assert collision(params, overlap, None, None).tolist() == [-(0.5 * 100.0 + 2.0 * 25.0)]
+    apart = at_a_sample([0.5, 0.1], [10.0, 20.0, 15.0])
+    assert collision(params, apart, None, None).tolist() == [0.0]
+
+
+def test_k_energy__of_each_pair_in_exact_physics() -> None:
+    def rewards(energy) -> float:
+        env = eb.parallel_env(scenario="paper-random", reward={"harm": 0.0, "collision": 1.0, "k_energy": energy})
+        env.reset(seed=7)
+        total = 0.0
+        while env.agents:
+            total += env.step({"vehicle_2": np.array([-1.0], np.float32)})[1]["vehicle_2"]
+        return total
+
+    assert rewards([0.0, 1.0]) + rewards([1.0, 0.0]) == pytest.approx(rewards(1.0))
+    assert rewards([0.0, 1.0]) != 0.0
+    with refused("reward: k_energy has 3 entries; must be a number, or have one for each of the 2 pairs"):
+        rewards([1.0, 1.0, 1.0])
+
+
+def test_observation__is_the_state_of_the_paper() -> None:
+    env = eb.EthBrakeEnv("paper-random-map")
+    observation, _ = env.reset(seed=7)
+    assert observation.shape == (8,)
+    assert env.unwrapped.game.views[2].names == (
+        "own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration", "rear_1.gap",
+        "rear_1.closing_speed", "rear_1.acceleration",
+    )  # fmt: skip
+    with refused("observation: own.speed is listed twice"):
+        eb.load_scenario("paper-random").replace(observation=["own", "paper"])
 
 
 @pytest.mark.parametrize(
-    ("until_s", "step_s", "told"),
-    [(8.0, 0.0, "step_s = 0:"), (8.0, float("nan"), "step_s = nan"), (8.0, float("inf"), "step_s = inf"),
-     (0.1, 0.1, "until_s = 0.1:"), (float("inf"), 0.1, "until_s = inf")],
-)  # fmt: skip
-def test_map__refuses_times(until_s: float, step_s: float, told: str) -> None:
-    with refused(f"advance_sampled: {told}"):
-        advance_sampled(worlds(2), until_s, step_s)
-
-
-@pytest.mark.parametrize(
-    ("part", "row", "body", "value", "told"),
+    ("changes", "message"),
     [
-        ("line", GAP, 0, 30.0, "an obstacle"),
-        ("line", SPEED, 2, 60.0, "an impact before Vehicle 2 may act"),
-        ("car", BRAKE_RATE, 3, 30.0, "brakes that build up"),
+        ({"physics": "paper-mop"}, "physics = paper-mop: did you mean paper-map?; known: paper-map"),
+        ({"obstacle_margin_m": 1.7}, "obstacle_margin_m: is not known to physics: paper-map"),
+        ({"brake_rate_mps3": 10.0}, "brake_rate_mps3: is not known to physics: paper-map"),
+        ({"v2x": {"preset": "nominal", "persistence": "periodic"}}, "v2x: is not known to physics: paper-map"),
     ],
 )
-def test_map__refuses_worlds_that_it_has_not(part: str, row: int, body: int, value: float, told: str) -> None:
-    alert = worlds(2)
-    changed = getattr(alert, part).copy()
-    changed[1, row, body] = value
-    with refused(f"advance_sampled: row 1 has {told}"):
-        advance_sampled(alert._replace(**{part: changed}), 8.0)
+def test_scenario__refuses_what_the_map_has_not(changes, message: str) -> None:
+    with refused(message):
+        MAPPED.replace(**changes)
+
+
+def test_early_impacts__are_refused() -> None:
+    early = MAPPED.replace(gaps_m=0.2, speeds_mps=[18, 22, 22], early_impacts="keep")
+    with refused("row 0 has an impact before the first decision, which physics: paper-map does not know"):
+        eb.evaluate(early, "full_brake", episodes=3)
+
+
+@pytest.mark.parametrize("agent", ["e_v2x_bm", "ppo+episode", "ppo+step", "best_harm", "universal"])
+def test_agents__that_plan_with_exact_impacts_are_refused(agent: str) -> None:
+    with refused("needs exact impacts, and these worlds have another physics"):
+        eb.evaluate(MAPPED, agent, episodes=3)
+
+
+def test_agents__that_drive_here() -> None:
+    result = eb.evaluate(MAPPED, "full_brake,e_v2x_bm:pairwise,ppo,ppo+episode:pairwise", episodes=20)
+    assert result["ppo"]["total_harm"].mean() < result["full_brake"]["total_harm"].mean()
+
+
+MEASURES = ("pushed_mps", "pushed_m", "drove_towards", "injury_gidas", "proven_harm", "avoidable")
+
+
+@pytest.mark.parametrize("measure", MEASURES)
+def test_measures__of_exact_impacts_are_refused(measure: str) -> None:
+    with refused("needs exact impacts, and these worlds have another physics"):
+        eb.evaluate(MAPPED, "full_brake", episodes=3, measures=measure)
+
+
+@pytest.mark.parametrize(
+    ("reward", "message"),
+    [("honest", "harm_count honest needs exact impacts"), ({"harm": 1.0, "push": 1.0}, "the term push needs exact")],
+)
+def test_rewards__of_exact_impacts_are_refused(reward, message: str) -> None:
+    with refused(message):
+        eb.EthBrakeEnv(MAPPED, reward=reward)
+
+
+def test_record__is_refused() -> None:
+    scenario, game = eb.open_game(MAPPED)
+    with refused("a record of the motion between decisions needs exact impacts"):
+        eb.record_episode(scenario.sample(1, 7), eb.Team.of({"vehicle_2": eb.make_agent("coast")}, "coast"), game)
+
+
+def test_mixture__has_one_physics() -> None:
+    exact = {"scenario": eb.load_scenario("paper-random").declared()}
+    mapped = {"scenario": MAPPED.replace(observation=None, name="other").declared()}
+    with refused("physics must be the same in all scenarios of the mixture"):
+        eb.Scenario(name="mixed", mixture=[exact, mapped])
+    both = eb.Scenario(name="mixed", physics="paper-map", mixture=[exact, mapped])
+    assert eb.evaluate(both, "full_brake", episodes=10).n == 10
