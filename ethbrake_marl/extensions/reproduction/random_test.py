@@ -28,7 +28,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 VEHICLE_2 = 2  # body
 NON_E, E_V2X_BM, HYBRID_SAC, HYBRID_PPO = "Non-E", "E-V2X-BM", "Hybrid SAC", "Hybrid PPO"  # rows of the paper
-SHIPPED: Mapping[str, str] = MappingProxyType({HYBRID_SAC: "sac", HYBRID_PPO: "ppo"})  # specs of the policies
+SHIPPED: Mapping[str, str] = MappingProxyType({"SAC": "sac", "PPO": "ppo"})  # specs of the policies
 
 WORLDS = ("acts_s", "rear_s", "step_s", "restitution", "others", "seed")  # fields that change worlds or their physics
 PLANS = ("acts_s", "rear_s", "others", "seed", "plans_as_stated", "star")  # that change what E-V2X-BM plans
@@ -55,10 +55,11 @@ def outcome_of(last: State) -> Outcome:
 def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED) -> Table:
     """Return the table under a reading, in the first worlds of the random test, with 95 % intervals.
 
-    ``policies`` are the specs of the two policies: ``Hybrid SAC``, ``Hybrid PPO``. Raises ``InvalidInput`` for the
+    ``policies`` are the specs of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the
     coupled H* in the paper's map.
     """
-    return {row: estimate(row, reading.only(*DEPENDS[row]), episodes, policies.get(row, "")) for row in DEPENDS}
+    specs = {HYBRID_SAC: policies["SAC"], HYBRID_PPO: policies["PPO"]}
+    return {row: estimate(row, reading.only(*DEPENDS[row]), episodes, specs.get(row, "")) for row in DEPENDS}
 
 
 @cache
@@ -109,7 +110,7 @@ def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
 def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> Outcome:
     """Let all vehicles brake fully, or Vehicle 2 as E-V2X-BM plans.
 
-    "coasts": vehicles stop braking at the first decision after their first impact. "ends": the episode ends there.
+    After an impact vehicles brake on, or coast from the next decision on, or the episode ends there.
     """
     if after_impact != "brakes on" and worlds.step_s is None:
         worlds = worlds._replace(others=(*worlds.others, ("time_step_s", SHORT_STEP_S)))
@@ -122,7 +123,7 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
         state, _ = game.step(state, fully)
         if after_impact == "coasts":
             hit = np.maximum(state.line[:, HIT, :-1], state.line[:, HIT, 1:]) == 1.0  # [n, N], in front or behind
-            for commands in (car[:, BRAKING, 1:], state.wanted[:, 1:]):
+            for commands in (state.car[:, BRAKING, 1:], state.wanted[:, 1:]):
                 commands[hit] = 0.0
         if after_impact == "ends":
             state.clock[:, ENDED] = np.maximum(state.clock[:, ENDED], state.collided)
@@ -142,9 +143,10 @@ def plan(plans: Reading, episodes: int) -> Choice:
         return chosen
     at, ends = np.empty(CANDIDATES), np.empty((episodes, 2))
     for k, (line, car) in enumerate(zip(alert.line, alert.car.copy(), strict=True)):
-        find_candidates(line, car[BRAKING], car[LATENCY], VEHICLE_2, at)
+        world = line, car[BRAKING], car[LATENCY], VEHICLE_2
+        find_candidates(*world, at)  # type: ignore[no-untyped-call]
         possible = at[(at >= 0.0) & (at <= car[BRAKING, VEHICLE_2])]
-        harm = np.array([predicted_harm(line, car[BRAKING], car[LATENCY], VEHICLE_2, a) for a in possible])
+        harm = np.array([predicted_harm(*world, a) for a in possible])  # type: ignore[no-untyped-call]
         tied = possible[harm <= harm.min() + TIE * (1.0 + harm.min())]
         ends[k] = tied.min(), tied.max()
     return chosen._replace(deceleration_mps2=ends[:, ("low end", "high end").index(plans.star)])

@@ -43,7 +43,6 @@ ABOUT_BASELINE = (
     " are exchanged. Coupled: the constant deceleration of least harm in the same physics."
 )
 
-
 Reported = Literal["realised", "predicted", "predicted harm, realised collisions"]
 
 WORDS = {  # field of a reading -> its default in words, and another value
@@ -75,14 +74,12 @@ class Reading(NamedTuple):
 
     acts_s: float | None = None  # when Vehicle 2 acts (s since the alert); None: the latency of the scenario
     rear_s: float | None = None  # when Vehicle 3 brakes (s since the alert); None: the same
-    step_s: float | None = (
-        None  # of the paper's map, whose impacts happen at samples; None: impacts at their exact time
-    )
+    step_s: float | None = None  # of the paper's map, in which impacts happen at samples; None: exact impacts
     restitution: float | None = None  # None: the scenario's
     others: tuple[tuple[str, Any], ...] = ()  # other keys of the scenario, and their values
     seed: int = SEED  # of the list of worlds
     counted: Literal["first", "total"] = "first"  # harm of each pair's first impact, or of every impact
-    after_impact: Literal["brakes on", "coasts", "ends"] = "brakes on"  # what Non-E does then; the episode ends
+    after_impact: Literal["brakes on", "coasts", "ends"] = "brakes on"  # what a vehicle of Non-E, or its episode does
     plans_as_stated: bool = False  # E-V2X-BM plans for the latencies of the scenario, whichever are driven
     star: Literal["low end", "middle", "high end"] = "middle"  # of the decelerations that do equally little harm
     baseline: Reported = "realised"  # what is reported of E-V2X-BM: what happens, or what it predicts
@@ -103,9 +100,12 @@ class Reading(NamedTuple):
         """Return a shipped scenario of three vehicles under this reading, with ``changes`` of other keys."""
         scenario = load_scenario(name).replace(**changes)
         keys = dict(self.others)
-        first, middle, rear = scenario.model_dump()["latency_s"]
-        if self.acts_s is not None or self.rear_s is not None:
-            keys["latency_s"] = [first, middle if self.acts_s is None else self.acts_s, self.rear_s or rear]
+        latency_s = [*scenario.model_dump()["latency_s"]]
+        if self.acts_s is not None:
+            latency_s[1] = self.acts_s
+        if self.rear_s is not None:
+            latency_s[2] = self.rear_s
+        keys["latency_s"] = latency_s
         if self.step_s is not None:
             keys |= {"physics": "paper-map", "time_step_s": self.step_s}
         if self.restitution is not None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
-from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, HYBRID_PPO, NON_E, Table, table_of
+from ethbrake_marl.extensions.reproduction.random_test import DEPENDS, table_of
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
 from ethbrake_marl.extensions.reproduction.search import NEAREST, differences, numbers_of, reproduce_search
-from ethbrake_marl.extensions.reproduction.verdicts import HARM, PERCENT, Verdict, compare_number
+from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.progress import Progress
 
@@ -94,10 +93,10 @@ def reproduce_gaps(settings: Settings) -> Made:
     """Measure every alternative of the register; with ``settings.full``, also search over all combinations."""
     episodes = min(WORLDS, settings.episodes)
     asked = [(DEFAULTS, STATED), *((gap, each) for gap in (*GAPS, COMBINED) for each in gap.alternatives)]
-    rows, tables = [], dict[str, Table]()
+    rows = []
     for number, (gap, reading) in enumerate(asked):
         settings.tell(Progress("open quantities", number, len(asked)))
-        tables[reading.name] = table = table_of(reading, episodes)
+        table = table_of(reading, episodes, settings.policies)
         rates, harms = zip(*table.values(), strict=True)
         rows.append(
             (
@@ -108,39 +107,17 @@ def reproduce_gaps(settings: Settings) -> Made:
                 *(rate.value for rate in rates),
             )
         )
-    base, *others = tables.values()
-    verdicts = [
-        compare_number(
-            f"{row.agent}, {what} of Table:Random, one open quantity changed at a time",
-            printed,
-            base[row.agent][column],
-            show=show,
-            others={name: table[row.agent][column] for name, table in tables.items() if table is not base},
-        )
-        for row in RANDOM_TEST
-        for column, (what, printed, show) in enumerate(
-            (("collision rate", row.collision_rate, PERCENT), ("average harm", row.average_harm, HARM))
-        )
-    ]
-    broken = [name for name, table in tables.items() if table is not base and not in_order(table)]
-    stays = f"in {len(others) - len(broken)} of {len(others)} alternatives"
-    verdicts.append(
-        Verdict(
-            f"the order of harm stays: {HYBRID_PPO} < {E_V2X_BM} < {NON_E}",
-            "differs" if broken else "agrees",
-            f"{stays}; not with {'; '.join(broken)}" if broken else stays,
-        )
-    )
     register = [
         (gap.name, gap.paper, gap.ours, "; ".join(each.name for each in gap.alternatives) or gap.otherwise)
         for gap in GAPS
     ]
-    collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in base]
+    collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in DEPENDS]
     note = (
         f"{episodes:,} worlds. Distance: mean of |ours / printed - 1| over the eight numbers. Then mean harm (m²/s²)"
         f" with its 95 % interval, and the collision rate. {POLICIES} They are not trained anew for an alternative."
     )
-    columns = ("Quantity", "Value", replace(PERCENT, heading="Distance"), *map(Column, base), *collisions)
+    distance = replace(PERCENT, heading="Distance")
+    columns: list[Column | str] = ["Quantity", "Value", distance, *map(Column, DEPENDS), *collisions]
     sheets = [
         Sheet(
             "Register of what the paper leaves open",
@@ -150,10 +127,5 @@ def reproduce_gaps(settings: Settings) -> Made:
         ),
         Sheet("The random test with other values", columns, rows, note),
     ]
-    more = reproduce_search(settings) if settings.full else Made([])
-    return Made([*verdicts, *more.verdicts], [*sheets, *more.sheets], notes=more.notes)
-
-
-def in_order(table: Table) -> bool:
-    """Return whether the hybrid harms least, and full braking most."""
-    return table[HYBRID_PPO][1].value <= table[E_V2X_BM][1].value <= table[NON_E][1].value
+    more = reproduce_search(settings) if settings.full else Made()
+    return Made(sheets=[*sheets, *more.sheets], notes=more.notes)

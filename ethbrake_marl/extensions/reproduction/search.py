@@ -20,7 +20,7 @@ from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import DEPENDS, SHIPPED, Table, table_of
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading, say
-from ethbrake_marl.extensions.reproduction.verdicts import PERCENT, Verdict
+from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.progress import OnProgress, Progress
@@ -79,7 +79,7 @@ def search(
 ) -> tuple[list[Reading], Floats]:
     """Return the readings of a grid, and their numbers, [R, 4, 2]. Of readings with the same numbers it has the first.
 
-    ``policies`` are the specs of the two policies: ``Hybrid SAC``, ``Hybrid PPO``.
+    ``policies`` are the specs of ``SAC`` and ``PPO``.
     """
     every, different = [*readings_of(grid)], dict[bytes, tuple[Reading, Floats]]()
     for number, reading in enumerate(every):
@@ -114,10 +114,10 @@ def by_chance(numbers: Floats) -> Floats:
 def reproduce_search(settings: Settings) -> Made:
     """Search for the nearest reading; measure the nearest ones again in more worlds."""
     episodes, again = min(WORLDS, settings.episodes), min(WORLDS_AGAIN, settings.episodes)
-    readings, numbers = search(episodes=episodes, tell=settings.tell)
+    readings, numbers = search(GRID, episodes, settings.policies, settings.tell)
     distances = differences(numbers).mean(axis=1)
     kept = [readings[k] for k in np.argsort(distances, kind="stable")[:KEPT]]
-    measured = {reading: numbers_of(table_of(reading, again)) for reading in (*kept, STATED)}
+    measured = {reading: numbers_of(table_of(reading, again, settings.policies)) for reading in (*kept, STATED)}
     nearest = sorted(kept, key=lambda reading: float(differences(measured[reading]).mean()))[:SHOWN]
     rows: list[tuple[Any, ...]] = [("printed", 0.0, 0.0, *PRINTED.T.ravel())]
     for reading in (*nearest, STATED):
@@ -137,14 +137,14 @@ def reproduce_search(settings: Settings) -> Made:
         f" them it is as near as to the printed table. {POLICIES}"
     )
     part = replace(PERCENT, heading="Distance")
-    columns = (
+    columns: list[Column | str] = [
         *("Reading", part, replace(part, heading="Largest difference")),
         *(replace(PERCENT, heading=f"Collisions, {row}") for row in DEPENDS),
         *(Column(f"Harm, {row}") for row in DEPENDS),
-    )
+    ]
     sheets = [
         Sheet("The nearest readings", columns, rows, f"{again:,} worlds; harm in m²/s²."),
         Sheet("The nearest reading with one value fixed", ("Fixed", part, "Reading"), fixed, f"{episodes:,} worlds."),
     ]
-    same = "agrees" if nearest[0] == NEAREST else "differs"
-    return Made([Verdict("the nearest reading is the one of this page", same, nearest[0].name)], sheets, notes=[note])
+    same = "the same as" if nearest[0] == NEAREST else "another one than"
+    return Made(sheets=sheets, notes=[f"The nearest reading is {same} that of the tables.", note])
