@@ -46,6 +46,7 @@ ABOUT_BASELINE = (
 Reported = Literal["realised", "predicted", "predicted harm, realised collisions"]
 
 WORDS = {  # field of a reading -> its default in words, and another value
+    "base": ("the random test", "{}"),
     "acts_s": ("Vehicle 2 acts at its latency", "Vehicle 2 acts at {} s"),
     "rear_s": ("Vehicle 3 brakes at its latency", "Vehicle 3 brakes at {} s"),
     "step_s": ("exact impacts", "the paper's map at {} s"),
@@ -72,6 +73,7 @@ def say(field: str, value: Any) -> str:
 class Reading(NamedTuple):
     """A reading of the paper's text: a value for each of the quantities that it leaves open. Defaults are ours."""
 
+    base: str = RANDOM  # name of the scenario, of three vehicles
     acts_s: float | None = None  # when Vehicle 2 acts (s since the alert); None: the latency of the scenario
     rear_s: float | None = None  # when Vehicle 3 brakes (s since the alert); None: the same
     step_s: float | None = None  # of the paper's map, in which impacts happen at samples; None: exact impacts

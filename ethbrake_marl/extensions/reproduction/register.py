@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import DEPENDS, table_of
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
-from ethbrake_marl.extensions.reproduction.search import NEAREST, differences, numbers_of, reproduce_search
+from ethbrake_marl.extensions.reproduction.search import NEAREST, differences, numbers_of
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.progress import Progress
@@ -90,7 +90,7 @@ COMBINED = Gap("several at once", "", "", (
 
 
 def reproduce_gaps(settings: Settings) -> Made:
-    """Measure every alternative of the register; with ``settings.full``, also search over all combinations."""
+    """Measure every alternative of the register."""
     episodes = min(WORLDS, settings.episodes)
     asked = [(DEFAULTS, STATED), *((gap, each) for gap in (*GAPS, COMBINED) for each in gap.alternatives)]
     rows = []
@@ -127,5 +127,4 @@ def reproduce_gaps(settings: Settings) -> Made:
         ),
         Sheet("The random test with other values", columns, rows, note),
     ]
-    more = reproduce_search(settings) if settings.full else Made()
-    return Made(sheets=[*sheets, *more.sheets], notes=more.notes)
+    return Made(sheets=sheets)

@@ -28,6 +28,7 @@ from ethbrake_marl.progress import OnProgress, Progress
 WORLDS, WORLDS_AGAIN = 1_000, 10_000  # of the search, and of the nearest readings
 KEPT, SHOWN = 30, 10  # nearest readings that are measured again, and that are shown
 FAKES = 200  # tables that nobody has printed
+SEARCH_S = 240.0  # processor time of a search
 
 ONLY_BRAKES = (("driving_capacity_mps2", (6.0, 0.0, 6.0)),)  # keys of the scenario
 
@@ -112,7 +113,9 @@ def by_chance(numbers: Floats) -> Floats:
 
 
 def reproduce_search(settings: Settings) -> Made:
-    """Search for the nearest reading; measure the nearest ones again in more worlds."""
+    """Search for the nearest reading, with ``full``; measure the nearest ones again in more worlds."""
+    if not settings.full:
+        return Made(notes=["The search needs `--full`."])
     episodes, again = min(WORLDS, settings.episodes), min(WORLDS_AGAIN, settings.episodes)
     readings, numbers = search(GRID, episodes, settings.policies, settings.tell)
     distances = differences(numbers).mean(axis=1)

@@ -21,7 +21,7 @@ from ethbrake_marl.extensions.reproduction.random_test import (
     reported,
     table_of,
 )
-from ethbrake_marl.extensions.reproduction.readings import EARLY, RANDOM, STATED, Reading
+from ethbrake_marl.extensions.reproduction.readings import EARLY, RANDOM, STATED, Reading, drive
 from ethbrake_marl.extensions.reproduction.search import GRID, NEAREST, differences, numbers_of, readings_of
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
 from tests.refused import refused
@@ -94,6 +94,12 @@ def test_baselines__are_what_the_agents_do(reading: Reading) -> None:
     assert np.array_equal(predicted, result["e_v2x_bm:pairwise"]["predicted_harm"])
 
 
+def test_predicted__harm_of_the_hybrid_is_what_algorithm_1_expects() -> None:
+    expected = drive(STATED.scenario(RANDOM), {"x": "ppo+episode:pairwise"}, WORLDS)["x"]["expected_harm"]
+    collided, harm = reported(HYBRID_PPO, STATED._replace(hybrid="predicted"), WORLDS, "ppo")
+    assert np.array_equal(harm, expected) and np.array_equal(collided, expected > 0.0)
+
+
 def test_mixed__report_has_the_collisions_that_happen_and_the_harm_that_was_predicted() -> None:
     collided, harm = reported(E_V2X_BM, DRIVEN_EARLY, WORLDS)
     assert np.array_equal(harm, plan(DRIVEN_EARLY, WORLDS).harm)
@@ -138,7 +144,7 @@ def test_names__say_what_differs() -> None:
 
 
 def test_scenario__has_what_the_reading_says() -> None:
-    scenario = Reading(0.25, 1.1, 0.5, 0.3, (("horizon_s", 5.0),)).scenario("paper-delay-low", gaps_m=[7, 7])
+    scenario = Reading(RANDOM, 0.25, 1.1, 0.5, 0.3, (("horizon_s", 5.0),)).scenario("paper-delay-low", gaps_m=[7, 7])
     assert scenario.latency_s == (0.0, 0.25, 1.1) and (scenario.physics, scenario.time_step_s) == ("paper-map", 0.5)
     assert (scenario.restitution, scenario.horizon_s, scenario.gaps_m) == (0.3, 5.0, (7.0, 7.0))
     assert STATED.scenario("paper-delay-low").latency_s == (0.0, 0.1, 0.3)
@@ -187,7 +193,8 @@ def test_chance__is_how_near_readings_come_to_tables_of_mixed_readings() -> None
 
 def test_reproduce_search__shows_the_nearest_and_says_that_it_is_a_hypothesis(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "GRID", SMALL)
-    made = search.reproduce_search(SETTINGS)
+    assert search.reproduce_search(SETTINGS).notes == ["The search needs `--full`."]
+    made = search.reproduce_search(replace(SETTINGS, full=True))
     nearest, fixed = made.sheets
     assert nearest.rows[0][:2] == ("printed", 0.0) and nearest.rows[-1][0] == "as stated"
     distances = [row[1] for row in nearest.rows[1:-1]]
