@@ -26,9 +26,9 @@ from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.progress import OnProgress, Progress
 
 WORLDS, WORLDS_AGAIN = 1_000, 10_000  # of the search, and of the nearest readings
-SEARCH_S = 240.0  # processor time of a search
 KEPT, SHOWN = 30, 10  # nearest readings that are measured again, and that are shown
 FAKES = 200  # tables that nobody has printed
+SEARCH_S = 240.0  # processor time of a search
 
 ONLY_BRAKES = (("driving_capacity_mps2", (6.0, 0.0, 6.0)),)  # keys of the scenario
 
