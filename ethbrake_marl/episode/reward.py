@@ -56,9 +56,10 @@ class RewardParams(FileModel):
         weight of harm must be given too. harm_count: what the term harm counts: ``first``, ``total`` or ``honest``
         (``episode.counts``). objective: objective of all vehicles, or a list with one each; None: the scenario's.
         shaping_discount: discount in the term shaping, in (0, 1]; it should be the learner's own. k_energy: factor of
-        the term collision, or a list with one for each pair of vehicles, front to rear. ttc_scale_s: tau of the term risk, s. safety_buffer_m: d_safe of the term risk, m.
-        target_gap_m: d_target of the term risk, m. distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a
-        registered term -> weight; negative for what should become small.
+        the term collision, or a list with one for each pair of vehicles, front to rear. ttc_scale_s: tau of the term
+        risk, s. safety_buffer_m: d_safe of the term risk, m. target_gap_m: d_target of the term risk, m.
+        distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a registered term -> weight; negative for what
+        should become small.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
