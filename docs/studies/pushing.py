@@ -31,7 +31,6 @@ MEASURES = {  # heading -> measure, factor, digits
     "total harm": ("total_harm", 1.0, 2),
     "honest cost": ("honest_cost", 1.0, 2),
     "push (m/s)": ("pushed_mps", 1.0, 2),
-    "sampled harm": ("sampled_harm", 1.0, 1),
     "Vehicle 1 pushed (m)": ("pushed_m_1", 1.0, 1),
     "moving at 8 s (%)": ("moving", 100.0, 1),
 }
@@ -57,7 +56,7 @@ def measure(block: str, model: PPO) -> dict[str, float]:
     """Return the measures of the policy on worlds that no training uses."""
     agents = {block: eb.policy_agent(model, clip=True)}
     scenario = BLOCKS[block.partition("-")[0]][0]
-    asked = "pushed_m,pushed_mps,sampled_harm"
+    asked = "pushed_m,pushed_mps"
     columns = eb.evaluate(scenario, agents, episodes=WORLDS, measures=asked)[block]
     values = {name: float(columns[name].mean()) for name, _, _ in MEASURES.values() if name in columns}
     return values | {"moving": float((columns["ended"] == "horizon").mean())}

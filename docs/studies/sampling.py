@@ -2,15 +2,16 @@
 
     .venv/bin/python docs/studies/sampling.py docs/figures/sampled-convergence.png
 
-The map and the exact physics move the same worlds under the same constant commands, up to the scenario's horizon. An
-agent drives Vehicle 2, all others brake fully. Error: harm in the map minus exact harm.
+The same agent drives the same worlds in the map (``physics: paper-map``) and in the exact physics, up to the scenario's
+horizon. It drives Vehicle 2, all others brake fully. Error: harm in the map minus exact harm.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,7 +19,6 @@ from matplotlib.figure import Figure
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.identity import versions, worlds_sha256
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style, write_picture
-from ethbrake_marl.extensions.reproduction.paper_map import advance_sampled
 
 SCENARIO, WORLDS, SEED = "paper-random", 2000, 7
 STEPS_S = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
@@ -58,17 +58,17 @@ class Convergence:
         return float(np.polyfit(np.log(steps[steps <= FITTED_UP_TO_S]), np.log(np.abs(errors)), 1)[0])
 
 
-def convergence(alert: eb.State, agent: str, steps_s: Sequence[float] = STEPS_S) -> Convergence:
-    """Compute exact harm and harm in the map of worlds at the alert."""
-    _, game = eb.open_game(SCENARIO)
-    driver = eb.make_agent(agent)
-    exact = eb.drive(game, alert, eb.Team.of({"vehicle_2": driver}, agent))
-    wanted = alert.wanted.copy()
-    wanted[:, 1:] = -alert.braking_capacity_mps2
-    wanted[:, 2] = driver.begin(alert, 2)
-    errors = []
+def driven(agent: str, worlds: int, changes: Mapping[str, Any]) -> eb.State:
+    """Return the ends of the first worlds of the list under a changed scenario, with an agent as Vehicle 2."""
+    scenario, game = eb.open_game(eb.load_scenario(SCENARIO).replace(**changes))
+    return eb.drive(game, scenario.sample(worlds, SEED), eb.Team.of({"vehicle_2": eb.make_agent(agent)}, agent))
+
+
+def convergence(agent: str, worlds: int = WORLDS, steps_s: Sequence[float] = STEPS_S) -> Convergence:
+    """Compute exact harm and harm in the map."""
+    exact, errors = driven(agent, worlds, {}), []
     for step_s in steps_s:
-        last = advance_sampled(alert._replace(wanted=wanted), game.rules.horizon_s, step_s)
+        last = driven(agent, worlds, {"physics": "paper-map", "time_step_s": step_s})
         first, total = (last.harm(count) - exact.harm(count) for count in ("first", "total"))
         medians = [np.median(np.abs(each)) for each in (first, total)]
         far, other = np.abs(total) > FAR_OFF, (last.pair_hit != exact.pair_hit).any(axis=1)
@@ -111,8 +111,8 @@ def draw(studies: Sequence[Convergence]) -> Figure:
 
 
 if __name__ == "__main__":
-    worlds = eb.load_scenario(SCENARIO).sample(WORLDS, SEED)
-    studies = [convergence(worlds, agent) for agent in AGENTS]
+    studies = [convergence(agent) for agent in AGENTS]
     write_picture(sys.argv[1], draw(studies), force=True)
+    worlds = eb.load_scenario(SCENARIO).sample(WORLDS, SEED)
     software = ", ".join(f"{name} {number}" for name, number in versions().items())
     print("\n\n".join([*map(table, studies), f"Worlds: SHA-256 {worlds_sha256(worlds)}; {software}."]))

@@ -61,7 +61,7 @@ def evaluate_command(
     A name can be followed by a shield, +episode or +step; for instance full_brake+step or policy@PATH+step, where PATH
     is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
     total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving
-    before the first impact and for motion at the horizon. --set measures=injury,sampled_harm adds measures to the
+    before the first impact and for motion at the horizon. --set measures=injury,pushed_m adds measures to the
     results.
     """
     with Out(as_json=as_json, force=force) as out:

@@ -121,7 +121,7 @@ def evaluate(
         worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State``, whose recordings are not known.
         agents: name in tables -> team, which drives all learners of the game.
         game: game of the worlds' scenario.
-        measures: measures beside the usual ones, for instance ``measures_called("sampled_harm,injury")``.
+        measures: measures beside the usual ones, for instance ``measures_called("pushed_m,injury")``.
         jobs: number of processes.
         about: what else tables and files should say (``identity.about_scenario``).
         on_done: called with the number of worlds that all teams have driven so far.

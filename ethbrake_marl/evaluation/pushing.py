@@ -1,4 +1,4 @@
-"""Measures of what harm does not count: pushes, driving before the first impact, motion at the end; sampled harm."""
+"""Measures of what harm does not count: pushes, driving before the first impact, and motion at the end."""
 
 from __future__ import annotations
 
@@ -10,36 +10,21 @@ from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Step, advance_worlds
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.evaluation.summary_row import PUSHED_FAR_M
-from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.impact import TOUCH_MPS
-from ethbrake_marl.motion.layout import (
-    BRAKE_RATE,
-    FAR_M,
-    GAP,
-    LATENCY,
-    LIMIT,
-    MASS,
-    PUSHED,
-    RELEASE_RATE,
-    RESTITUTION,
-    SPEED,
-    Floats,
-    scratch_for,
-)
+from ethbrake_marl.motion.layout import FAR_M, GAP, PUSHED, Floats, scratch_for
 from ethbrake_marl.registry import Part
 
 POST_M = 1e5  # distance of a post that nobody reaches, from which ways are measured to 1e-10 m
 HARD_MPS2 = 1.0  # a command above this is hard driving
-ON_SAMPLE = 1e-6  # part of a step: times this close count as one sample, because times are rounded
 
 
-def alone(alert: State, body: int, until_s: Floats) -> tuple[Floats, Floats]:
-    """Return speed (m/s) and way (m) of a vehicle at ``until_s`` [n], if nobody touches it, [n] each."""
+def own_way_m(alert: State, body: int, until_s: float) -> Floats:
+    """Return the way of a vehicle until ``until_s``, if nobody touches it, [n] m."""
     check_exact(alert, "pushed_m")
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
-    advance_worlds(line, alert.car[:, :, [0, body]], alert.time_s.copy(), until_s, wanted, scratch_for(2))
-    return line[:, SPEED, 1], POST_M - line[:, GAP, 0]
+    end_s = np.full(alert.n, until_s)
+    advance_worlds(line, alert.car[:, :, [0, body]], alert.time_s.copy(), end_s, wanted, scratch_for(2))
+    return POST_M - line[:, GAP, 0]
 
 
 def with_post(state: State) -> Floats:
@@ -56,8 +41,7 @@ class PushedAway:
     """
 
     def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
-        until_s = np.full(alert.n, game.rules.horizon_s)
-        self.own_way_m = {body: alone(alert, body, until_s)[1] for body in bodies}
+        self.own_way_m = {body: own_way_m(alert, body, game.rules.horizon_s) for body in bodies}
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
@@ -132,96 +116,6 @@ def still_moving(game: Game, alert: State, last: State) -> Given:
     return ~last.at_rest
 
 
-@kernel
-def held_motion(speed, command, limit, step):
-    """Return speed (m/s) and way (m) after a step of the paper's map: ``v + h u`` and ``h v + h^2 u / 2``.
-
-    The command u is first limited so that the speed does not pass 0 or the speed limit. An impact can leave a negative
-    speed, which the brakes bring back to 0.
-    """
-    after = speed
-    if command < 0.0:
-        after = max(speed + command * step, 0.0) if speed >= 0.0 else min(speed - command * step, 0.0)
-    elif command > 0.0 and speed < limit:
-        after = min(speed + command * step, limit)
-    return after, 0.5 * (speed + after) * step
-
-
-@large
-def sample_worlds(speed, gap, car, commands, samples, step, out):
-    """Write the sampled harm of every world from its first sample on to ``out`` [n]; ``speed`` and ``gap`` are used up.
-
-    ``speed`` [n, N + 1] and ``gap`` [n, N + 1] are those at the first sample, ``commands`` [T, n, N + 1] those from
-    sample t on; the last repeats.
-    """
-    for k in range(len(out)):
-        out[k] = 0.0
-        for t in range(samples[k]):
-            for p in range(speed.shape[1] - 2, 0, -1):  # from the rear pair to the front pair
-                closing = speed[k, p + 1] - speed[k, p]
-                if gap[k, p] > 0.0 or closing <= 0.0:
-                    continue
-                front, rear = car[k, MASS, p], car[k, MASS, p + 1]
-                impulse = (1.0 + car[k, RESTITUTION, p]) * closing / (front + rear)
-                speed[k, p] += rear * impulse
-                speed[k, p + 1] -= front * impulse
-                if closing > TOUCH_MPS:
-                    out[k] += closing * closing
-            now = car[k, LATENCY, 2] + (t + ON_SAMPLE) * step
-            ahead = 0.0
-            for i in range(1, speed.shape[1]):
-                command = commands[min(t, commands.shape[0] - 1), k, i] if car[k, LATENCY, i] <= now else 0.0
-                speed[k, i], way = held_motion(speed[k, i], command, car[k, LIMIT, i], step)
-                if i > 1:
-                    gap[k, i - 1] += ahead - way
-                ahead = way
-
-
-class Sampled:
-    """The paper's eq. Jharm: the agents' commands, applied again in its fixed-step map (eq. dynamics2).
-
-    Samples are at ``tau_2 + t h``, with the latency tau_2 of Vehicle 2 and the time step h, up to the horizon. At a
-    sample every pair that overlaps and closes adds its squared closing speed, and its speeds change by eq. (13), from
-    the rear pair to the front pair. Then each vehicle moves with the command in force at the sample. Before the first
-    sample no impact is detected. Commands of an episode that has ended remain in force.
-    """
-
-    def __init__(self, game: Game, alert: State) -> None:
-        self.alert, self.rules = alert, game.rules
-        self.commands: list[Floats] = []
-
-    def see(self, before: State, step: Step | None, after: State) -> None:
-        """Keep the commands of a step."""
-        if step is not None:
-            ended = before.ended[:, np.newaxis]
-            earlier = self.commands[-1] if self.commands else after.wanted
-            self.commands.append(np.where(ended, earlier, after.wanted))
-
-    def result(self, last: State) -> Given:
-        """Return the sampled harm, [n] m2/s2."""
-        alert, rules, start_s = self.alert, self.rules, np.ascontiguousarray(self.alert.car[:, LATENCY, 2])
-        speed, gap = alert.line[:, SPEED].copy(), alert.line[:, GAP].copy()
-        ways = np.zeros(speed.shape)
-        for body in range(1, speed.shape[1]):
-            speed[:, body], ways[:, body] = alone(alert, body, start_s)
-        gap[:, 1:-1] += ways[:, 1:-1] - ways[:, 2:]
-        samples = np.ceil((rules.horizon_s - start_s) / rules.time_step_s - ON_SAMPLE).astype(np.int64)
-        harm = np.empty(alert.n)
-        sample_worlds(speed, gap, alert.car, np.stack(self.commands), samples, rules.time_step_s, harm)
-        return harm
-
-
-def sampled(game: Game, alert: State) -> Sampled | None:
-    """Harm as a sum over time samples (the paper's eq. Jharm): every pair that overlaps and closes at a sample adds its
-    squared closing speed, so pushing adds harm for as long as it lasts. Defined if only Vehicle 2 learns, without
-    obstacle, build-up of brakes, and scripts that look at the state.
-    """
-    usual = game.rules.learners.tolist() == [2] and not game.scripts
-    obstacle = (alert.line[:, GAP, 0] < FAR_M).any()
-    builds = np.isfinite(alert.car[:, [BRAKE_RATE, RELEASE_RATE], 1:]).any()
-    return Sampled(game, alert) if usual and not obstacle and not builds else None
-
-
 PUSHED_M = Part(
     watch=pushed_m, unit="m",
     shown=(
@@ -240,4 +134,3 @@ DROVE_TOWARDS = Part(
 STILL_MOVING = Part(
     still_moving, unit="", shown=(Statistic("still_moving_rate", "rate", "Still moving", "Still\nmoving"),)
 )  # fmt: skip
-SAMPLED = Part(watch=sampled, unit="m2/s2", shown=(Statistic("sampled_harm", "mean", "Sampled harm", "Sampled\nharm"),))

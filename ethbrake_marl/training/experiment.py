@@ -66,7 +66,7 @@ class Report(Protocol):
 class Tables:
     """The report where no extension has one: the tables of the evaluation."""
 
-    measures: tuple[str, ...] = ("sampled_harm", "pushed_m")
+    measures: tuple[str, ...] = ("pushed_m",)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
         """Write nothing more."""

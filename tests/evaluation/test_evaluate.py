@@ -39,7 +39,7 @@ from tests.refused import refused
 
 
 def test_measures__of_one_impact_by_hand() -> None:
-    result = evaluated(PAIR, 2, [FULL_BRAKE], ["sampled_harm", "pushed_m", "injury_lr4s", "own", "maximin"])
+    result = evaluated(PAIR, 2, [FULL_BRAKE], ["pushed_m", "injury_lr4s", "own", "maximin"])
     # 10.6458 m to the impact, 27.9533 m after it; alone 33.3333 m
     changes = {
         1: 4.888 - 0.177 * 1.815,
@@ -48,7 +48,7 @@ def test_measures__of_one_impact_by_hand() -> None:
     injuries = {body: 1000.0 / (1.0 + math.exp(exponent)) for body, exponent in changes.items()}
     expected = {
         "collided": 1.0, "impacts": 1.0, "first_impact_harm": 9.0, "total_harm": 9.0, "total_harm_1": 4.95,
-        "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "sampled_harm": 9.0, "pushed_m_1": 5.26575,
+        "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "pushed_m_1": 5.26575,
         "pushed_m_1_far": 1.0, "injury_lr4s_1": injuries[1], "injury_lr4s_2": injuries[2],
         "injury_lr4s": sum(injuries.values()), "own_first_1": 4.95, "own_total_2": 4.05, "maximin_total_2": 4.95,
         "end_s": 3.7,
@@ -273,22 +273,21 @@ def test_measures__with_one_statistic_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "missing"),
+    ("scenario", "pushed"),
     [
-        (PAIR, {"predicted_harm", "replaced"}),
-        ("paper-random-obstacle", {"predicted_harm", "replaced", "sampled_harm"}),
-        (
-            {**PAIR, "roles": {"vehicle_1": "learner"}, "obstacle_gap_m": 60.0},
-            {"predicted_harm", "replaced", "sampled_harm"},
-        ),
+        (PAIR, {"pushed_m_1", "pushed_m_1_far"}),
+        ("paper-random-obstacle", {"pushed_m_1", "pushed_m_1_far", "pushed_m_3"}),
+        ({**PAIR, "roles": {"vehicle_1": "learner", "vehicle_2": "learner"}, "obstacle_gap_m": 60.0}, set()),
     ],
 )
-def test_measures__that_are_not_asked_for_or_not_defined_have_no_column(scenario: Any, missing: set[str]) -> None:
-    asked = ["injury_lr4s", "sampled_harm", "pushed_m"]
-    result = evaluated(scenario, 2, measures=asked)
+def test_measures__that_are_not_asked_for_or_not_defined_have_no_column(scenario: Any, pushed: set[str]) -> None:
+    asked = ["injury_lr4s", "pushed_m"]
+    result = eb.evaluate(scenario, "full_brake", episodes=2, measures=asked)
     names = {each.name for each in result.measures if each.name not in result["full_brake"]}
-    assert names == {*missing, "pushed_m"}  # which has columns of vehicles alone
-    assert not any(column.startswith(tuple(asked)) for column in evaluated(scenario, 2)["full_brake"])
+    assert names == {"predicted_harm", "replaced", "pushed_m"}  # pushed_m has columns of vehicles alone
+    assert {column for column in result["full_brake"] if column.startswith("pushed_m")} == pushed
+    usual = eb.evaluate(scenario, "full_brake", episodes=2)["full_brake"]
+    assert not any(column.startswith(tuple(asked)) for column in usual)
 
 
 def test_terms_of_ones_own__are_summed_and_names_are_used_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -309,8 +308,8 @@ def test_terms_of_ones_own__are_summed_and_names_are_used_once(monkeypatch: pyte
     assert [each.name for each in measures_called("injury,injury_gidas,total_harm")] == [
         "injury_lr4s", "injury_reference", "injury_gidas", "total_harm",
     ]  # fmt: skip
-    with refused("unknown measure 'sampled_ham'; did you mean 'sampled_harm'?", UnknownName):
-        measures_called(["sampled_ham"])
+    with refused("unknown measure 'pushed_n'; did you mean 'pushed_m'?", UnknownName):
+        measures_called(["pushed_n"])
     with refused("social needs an angle from 0 to 90"):
         evaluated(PAIR, 2, measures=["social:99"])
 
@@ -319,7 +318,7 @@ def test_terms_of_ones_own__are_summed_and_names_are_used_once(monkeypatch: pyte
 
 
 def test_result__is_the_same_in_chunks_of_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    measures, done = ["sampled_harm", "pushed_m", "risk"], list[int]()
+    measures, done = ["pushed_m", "risk"], list[int]()
     whole = evaluated("paper-random", 50, measures=measures)
     monkeypatch.setattr(evaluating, "CHUNK", 17)
     parts = evaluated("paper-random", 50, measures=measures, on_done=done.append)
@@ -468,13 +467,6 @@ def test_failed_physics__raises_with_the_number_of_the_world() -> None:
     line[2, GAP, 1] = np.nan
     with refused("world 102: a check of the physics failed", PhysicsError):
         evaluate(worlds._replace(line=line), teams(FULL_BRAKE), game)
-
-
-@pytest.mark.parametrize(("gap_m", "gap_after_m", "harm"), [(1.0, 0.25, 9.0), (5.0, 4.25, 0.0)])
-def test_sampled_harm__needs_an_overlap_and_a_closing_speed(gap_m: float, gap_after_m: float, harm: float) -> None:
-    """From 0.5 s on both brake alike and close with 3 m/s, until the front one rests 2.83 s later, 8.2 m ahead."""
-    far = {**PAIR, "gaps_m": gap_m, "horizon_s": 0.5 + (0.9 * gap_after_m / 3.0 if harm == 0.0 else 1.0)}
-    assert evaluated(far, 1, [FULL_BRAKE], ["sampled_harm"])["full_brake"]["sampled_harm"].tolist() == [harm]
 
 
 class Touching(Careless):

@@ -19,7 +19,7 @@ from ethbrake_marl.files.sheet import terminal_text
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Foreteller, evaluated, recorded
 from tests.refused import refused
 
-EXPENSIVE = ["sampled_harm", "pushed_m"]
+EXPENSIVE = ["pushed_mps", "pushed_m"]
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def test_estimates__are_those_of_the_columns(result: Result) -> None:
         "collision_rate": statistics.rate(mine["collided"]),
         "total_harm": statistics.mean(mine["total_harm"]),
         "total_harm_3": statistics.mean(mine["total_harm_3"]),
-        "sampled_harm": statistics.mean(mine["sampled_harm"]),
+        "pushed_mps": statistics.mean(mine["pushed_mps"]),
         "pushed_far_rate": statistics.rate(mine["pushed_m_1"] > 5.0),
         "first_impact_harm_difference": statistics.difference(mine["first_impact_harm"], other["first_impact_harm"]),
         "harm_decrease_total": statistics.decrease(mine["total_harm"], other["total_harm"]),
@@ -89,10 +89,10 @@ def test_terminal_of_80__shows_both_harms_with_intervals_and_what_was_asked_for(
 ) -> None:
     text = at(80, summarise(result), monkeypatch)
     head = " ".join(text.splitlines()[0].split())
-    assert head == "Agent, First-impact Total Sampled Pushed Pushed"
+    assert head == "Agent, First-impact Total Push Pushed Pushed Decrease"
     assert "constant:4.0 ‡" in text and "own sensors" in text and "95 % interval" in text
     narrow = at(56, summarise(result), monkeypatch)
-    assert "Total" in narrow and "First-impact" in narrow and "Sampled" not in narrow
+    assert "Total" in narrow and "First-impact" in narrow and "Push" not in narrow
     assert "Decrease" in at(120, summarise(result), monkeypatch)
 
 
@@ -121,8 +121,8 @@ def test_documents(result: Result) -> None:
     assert f" {harm} " in markdown and "Worlds: paper-random: 100 worlds, seed 7" in markdown
     assert latex.startswith(r"\begin{tabular}{llrrr") and r"full\_brake & own sensors & " in latex
     assert harm.replace("[", "{[}").replace("]", "{]}") in latex and latex.count(r"\\") == 4
-    assert "<caption>paper-random: 100 worlds, seed 7</caption>" in html and "Sampled" not in html
-    assert "Decrease" in table.meanings() and "eq. Jharm" in table.meanings()["Sampled harm"]
+    assert "<caption>paper-random: 100 worlds, seed 7</caption>" in html and "Push" not in html
+    assert "Decrease" in table.meanings() and "closing speed" in table.meanings()["Push (m/s)"]
 
 
 def test_data_frame(result: Result) -> None:

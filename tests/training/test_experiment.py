@@ -45,7 +45,7 @@ def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: 
     saved = eb.read_result(run / "results.json")
     assert [*saved.agents] == names and saved.rows is not None and len(saved.rows["world"]) == len(names) * EPISODES
     assert ("pushed_mps" in saved.agents["hybrid"]) == (count == "honest")
-    assert {"sampled_harm", "pushed_m_1"} <= saved.agents["hybrid"].keys()
+    assert "pushed_m_1" in saved.agents["hybrid"]
     end = status(run)
     assert (end["status"], end["stage"], end["steps"], end["reason"]) == ("finished", "evaluation", UPDATE, None)
     assert end["written"] == ["results.json", "worlds.csv"] and end["started_utc"]
