@@ -119,11 +119,11 @@ def reproduce_distance(settings: Settings) -> Made:
 
 def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]:
     """Return what the paper says of its figure: statement -> the comparisons that it needs."""
-    reverse = dict(reversed([*groups.items()]))
+    ends = dict([*groups.items()][:: 1 - len(groups)] if len(groups) > 1 else groups)  # the longest, the shortest
     return {
         "non-ethical harm grows with the distance": growing(groups, NON_E),
         "E-V2X-BM does less harm than non-ethical": less_in_each(groups, E_V2X_BM, NON_E),
-        "E-V2X-BM still does much harm at short distances: it falls with the distance": growing(reverse, E_V2X_BM),
+        "E-V2X-BM still does much harm at the shortest distance": growing(ends, E_V2X_BM),
         "SAC and PPO do less harm than E-V2X-BM over the whole range": [
             part for policy in policies for part in less_in_each(groups, policy, E_V2X_BM)
         ],

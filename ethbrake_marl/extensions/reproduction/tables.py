@@ -23,13 +23,14 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     of_the_process,
     strategies,
 )
-from ethbrake_marl.extensions.reproduction.verdicts import HARM, PERCENT, Claim, Less, judge, judge_number
+from ethbrake_marl.extensions.reproduction.verdicts import APART, HARM, PERCENT, Claim, Less, judge, judge_number
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.motion.layout import Bools, Floats
 
 RATE, AVERAGE, DECREASE = "collision rate", "average harm", "harm decrease"  # that the paper prints
 SHOW: Mapping[str, Column] = {RATE: PERCENT, AVERAGE: HARM, DECREASE: PERCENT}
 ALONE = "Standalone DRL"
+POINTS = Column("Difference of rates", digits=2, scale=100.0, unit=" %", sign="+")
 HARMS = {"first": "first-impact harm", "total": "total harm"}
 STOPPED_WORLDS = 5_000
 
@@ -71,7 +72,7 @@ def number_claims(
             keys = (row.agent, quantity), (row.agent, ""), ("", quantity), ("", "")
             why = next(WHY[key] for key in keys if key in WHY)
             if outcome == "cannot be":
-                why = f"whoever drives, it is at least {show.show(proven[quantity]).in_words} (proven)"
+                why = f"it is at least {show.show(proven[quantity]).in_words}, whoever drives (proven)"
             text = f"{row.agent}, {quantity} {show.scale * number:.6g}{show.unit}"
             shown = show.show(own).in_words, f"{show.show(near).in_words}, {judge_number(number, near)}"
             claims.append(Claim(where, text, *shown, outcome, "" if outcome == "agrees" else why))
@@ -172,7 +173,8 @@ def reproduce_random_table(settings: Settings) -> Made:
     for (text, parts), others in zip(
         conclusions(found, policies).items(), conclusions(near, policies).values(), strict=True
     ):
-        claims.append(judge("Table III", text, parts, others, why=whys.get(text.partition(":")[0], "")))
+        show = POINTS if text.endswith("collisions of the baseline") else APART
+        claims.append(judge("Table III", text, parts, others, why=whys.get(text.partition(":")[0], ""), show=show))
     process = of_the_process(STATED, episodes, settings)
     if process:
         for text, pair in {
