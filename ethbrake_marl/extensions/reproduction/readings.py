@@ -1,4 +1,4 @@
-"""Readings of the paper: what its text leaves open, as a value; and the paper's strategies under a reading."""
+"""A reading of the paper as a value: a choice for each quantity that its text leaves open."""
 
 from __future__ import annotations
 

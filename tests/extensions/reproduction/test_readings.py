@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.agents.pairwise import pairwise, predicted_harm
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.reproduction import register, search
@@ -21,14 +22,16 @@ from ethbrake_marl.extensions.reproduction.random_test import (
     reported,
     table_of,
 )
-from ethbrake_marl.extensions.reproduction.readings import EARLY, RANDOM, STATED, Reading, drive
-from ethbrake_marl.extensions.reproduction.search import GRID, NEAREST, differences, numbers_of, readings_of
+from ethbrake_marl.extensions.reproduction.readings import RANDOM, STATED, Reading
+from ethbrake_marl.extensions.reproduction.search import GRID, NEAREST, differences, distance, numbers_of, readings_of
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
+from ethbrake_marl.names import open_game, teams_of
 from tests.refused import refused
 
 WORLDS = 100
 SETTINGS = Settings(Path("unused"), episodes=20)
 
+EARLY = Reading(acts_s=0.2)
 DRIVEN_EARLY = register.EARLY_DRIVEN
 ROWS = {
     "stated": STATED,
@@ -95,7 +98,10 @@ def test_baselines__are_what_the_agents_do(reading: Reading) -> None:
 
 
 def test_predicted__harm_of_the_hybrid_is_what_algorithm_1_expects() -> None:
-    expected = drive(STATED.scenario(RANDOM), {"x": "ppo+episode:pairwise"}, WORLDS)["x"]["expected_harm"]
+    scenario, game = open_game(RANDOM)
+    team = teams_of("ppo+episode:pairwise", scenario)["ppo+episode:pairwise"]
+    memory = drive(game, scenario.sample(WORLDS, 7), team).memories["shield"]
+    expected = np.minimum(memory.policy_harm, memory.bound_harm)
     collided, harm = reported(HYBRID_PPO, STATED._replace(hybrid="predicted"), WORLDS, "ppo")
     assert np.array_equal(harm, expected) and np.array_equal(collided, expected > 0.0)
 
@@ -169,9 +175,9 @@ def test_search__finds_the_reading_of_a_table() -> None:
     readings, numbers = search.search(SMALL, 40)
     assert len({each.tobytes() for each in numbers}) == len(readings) < len([*readings_of(SMALL)])
     for planted in (NEAREST, STATED, STATED._replace(hybrid="realised, by the coupled H*")):
-        distance = differences(numbers, numbers_of(table_of(planted, 40))).mean(axis=1)
-        assert readings[int(distance.argmin())] == planted and distance.min() == 0.0
-        assert np.sort(distance)[1] > 0.0
+        distances = distance(numbers, numbers_of(table_of(planted, 40)))
+        assert readings[int(distances.argmin())] == planted and distances.min() == 0.0
+        assert np.sort(distances)[1] > 0.0
 
 
 def test_difference__by_hand() -> None:
@@ -179,7 +185,7 @@ def test_difference__by_hand() -> None:
     ours = printed.copy()
     ours[0, 1], ours[3, 0] = 11.0, 0.05
     assert differences(ours, printed) == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0])
-    assert differences(np.stack([ours, printed]), printed).mean(axis=1) == pytest.approx([0.075, 0.0])
+    assert distance(np.stack([ours, printed]), printed) == pytest.approx([((0.1**2 + 0.5**2) / 8) ** 0.5, 0.0])
 
 
 def test_chance__is_how_near_readings_come_to_tables_of_mixed_readings() -> None:
@@ -187,7 +193,8 @@ def test_chance__is_how_near_readings_come_to_tables_of_mixed_readings() -> None
     assert not search.by_chance(one[np.newaxis]).any()
     two = search.by_chance(np.stack([one, 2.0 * one]))
     # k of 8 numbers are of the other reading: half of it, or twice as much
-    assert {round(float(each), 6) for each in two} <= {round(k / 8 * off, 6) for k in range(9) for off in (0.5, 1.0)}
+    possible = [round(off * (k / 8) ** 0.5, 6) for k in range(9) for off in (0.5, 1.0)]
+    assert {round(float(each), 6) for each in two} <= {*possible}
     assert two.max() > 0.0
 
 
@@ -203,7 +210,7 @@ def test_reproduce_search__shows_the_nearest_and_says_that_it_is_a_hypothesis(mo
     assert fixed.rows[1][0] == "Vehicle 2 acts at 0.2 s" and "Vehicle 2 acts at 0.2 s" in fixed.rows[1][2]
     assert min(row[1] for row in fixed.rows) == distances[0]
     asked = {row[0]: row for row in nearest.rows}
-    assert asked["as stated"][3:] == pytest.approx(numbers_of(table_of(STATED, 20)).T.ravel())
+    assert asked["as stated"][4:] == pytest.approx(numbers_of(table_of(STATED, 20)).T.ravel())
 
 
 def test_register__shows_every_alternative() -> None:
@@ -218,7 +225,7 @@ def test_register__shows_every_alternative() -> None:
     for reading in (STATED, DRIVEN_EARLY, NEAREST):
         (row,) = (row for row in measured.rows if row[1] == reading.name)
         numbers = numbers_of(table_of(reading, 20))
-        assert row[2] == differences(numbers).mean()
+        assert row[2] == distance(numbers)
         assert [each.value for each in row[3:7]] == numbers[:, 1].tolist() and [*row[7:]] == numbers[:, 0].tolist()
 
 
