@@ -15,10 +15,10 @@ from ethbrake_marl.files.sheet import Estimate
 Curve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
 
 
-def over_seeds(trainings: Sequence[Mapping[int, float]]) -> Curve:
+def over_seeds(trainings: Sequence[Mapping[Any, float]]) -> Curve:
     """Return the mean of several training runs, with plus and minus one standard deviation over the seeds.
 
-    ``trainings`` has a mapping from training step to value for each run. The curve has the steps that all runs have.
+    ``trainings`` has a mapping from step or progress to value for each run. The curve has those that all runs have.
     """
     curve = {}
     for step in sorted(set.intersection(*map(set, trainings))):

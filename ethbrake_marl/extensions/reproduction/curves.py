@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -111,19 +111,23 @@ def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Grou
 def reproduce_distance(settings: Settings) -> Made:
     """Reproduce the figure of harm against the sum of both gaps."""
     readings = distances(settings, settings.policies)
-    claims = {
-        "non-ethical harm grows with the distance": lambda groups: growing(groups, NON_E),
-        "E-V2X-BM does less harm than non-ethical": lambda groups: less_in_each(groups, E_V2X_BM, NON_E),
-        "E-V2X-BM still does much harm at short distances: it falls with the distance": lambda groups: growing(
-            dict(reversed(groups.items())), E_V2X_BM
-        ),
-        "SAC and PPO do less harm than E-V2X-BM over the whole range": lambda groups: [
-            part for policy in settings.policies for part in less_in_each(groups, policy, E_V2X_BM)
+    stated, nearest = (statements(groups, settings.policies) for groups in readings.values())
+    claims = [judge("Fig. 4", text, parts, nearest[text]) for text, parts in stated.items()]
+    shown = over_distance("harm-distance", readings, [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN])
+    return shown._replace(claims=claims, notes=[POLICIES])
+
+
+def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]:
+    """Return what the paper says of its figure: statement -> the comparisons that it needs."""
+    ends = {name: groups[name] for name in ([*groups][-1], [*groups][0])}  # the longest, the shortest
+    return {
+        "non-ethical harm grows with the distance": growing(groups, NON_E),
+        "E-V2X-BM does less harm than non-ethical": less_in_each(groups, E_V2X_BM, NON_E),
+        "E-V2X-BM still does much harm at the shortest distance": growing(ends, E_V2X_BM),
+        "SAC and PPO do less harm than E-V2X-BM over the whole range": [
+            part for policy in policies for part in less_in_each(groups, policy, E_V2X_BM)
         ],
     }
-    judged = [judge("Fig. 4", text, *(parts(each) for each in readings.values())) for text, parts in claims.items()]
-    shown = over_distance("harm-distance", readings, [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN])
-    return shown._replace(claims=judged, notes=[POLICIES])
 
 
 def growing(groups: Groups, name: str) -> list[Less]:
@@ -166,10 +170,11 @@ def reproduce_illustration(settings: Settings) -> Made:
         lines = next(iter(groups.values()))[0]
         worse = lines[hybrid] > np.minimum(lines[ALONE], lines[E_V2X_BM]) + 1e-9
         texts.append(f"not in {int(worse.sum()):,} of {len(worse):,} worlds")
+    ours, nearest = texts
     why = (
         "it compares the policy's harm with the harm that E-V2X-BM predicts, which is about half of what E-V2X-BM does;"
         " with the simulated H* it always takes the lower one"
     )
-    claim = Claim("Fig. 8", "the hybrid consistently selects the strategy of lower harm", *texts, "differs", why)
+    claim = Claim("Fig. 8", "the hybrid consistently selects the strategy of lower harm", ours, nearest, "differs", why)
     shown = over_distance("hybrid-illustration", readings, [E_V2X_BM, COUPLED, ALONE, hybrid, f"{hybrid}, {SIMULATED}"])
     return shown._replace(claims=[claim])

@@ -147,7 +147,7 @@ class Course(NamedTuple):
     def converged(self) -> Floats:
         """Progress at which nine tenths of the rise are behind, [seeds] %."""
         risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
-        return np.array([*self.returns[0]])[risen.argmax(axis=1)]
+        return np.asarray(np.array([*self.returns[0]])[risen.argmax(axis=1)])
 
     @property
     def unrest(self) -> Floats:
@@ -193,7 +193,7 @@ def reproduce_curves(delay: str, settings: Settings) -> Made:
         (name, len(each.harm), *(mean(np.array([each.harm[k][100.0] for k in range(len(each.harm))])), mean(each.last)))
         for name, each in own.items()
     ]
-    note = "Harm: first-impact, m²/s², 1,000 worlds of seed 1007. Return: of the last tenth. Means over seeds, t intervals."
+    note = "Harm: first-impact, m²/s², 1,000 worlds of seed 1007. Return: of the last tenth. t intervals over seeds."
     sheet = Sheet(title, ("Algorithm", Column("Seeds"), Column("Last policy, harm"), Column("Last return")), rows, note)
     return Made(judged(delay, courses), [sheet], [figure])
 

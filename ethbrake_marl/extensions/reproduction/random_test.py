@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, lru_cache
 from types import MappingProxyType
 from typing import Any
 
@@ -20,7 +20,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import ENDED, State
 from ethbrake_marl.errors import Unfamiliar
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.extensions.reproduction.readings import RANDOM, Reading
+from ethbrake_marl.extensions.reproduction.readings import Reading
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import BRAKING, HIT, LATENCY, Bools, Floats
 from ethbrake_marl.names import open_game, teams_of
@@ -30,15 +30,7 @@ VEHICLE_2 = 2  # body
 NON_E, E_V2X_BM, HYBRID_SAC, HYBRID_PPO = "Non-E", "E-V2X-BM", "Hybrid SAC", "Hybrid PPO"  # rows of the paper
 SHIPPED: Mapping[str, str] = MappingProxyType({"SAC": "sac", "PPO": "ppo"})  # specs of the policies
 
-WORLDS = (
-    "base",
-    "acts_s",
-    "rear_s",
-    "step_s",
-    "restitution",
-    "others",
-    "seed",
-)  # fields that change worlds or their physics
+WORLDS = ("base", "acts_s", "rear_s", "step_s", "restitution", "others", "seed")  # fields that change worlds, physics
 PLANS = ("base", "acts_s", "rear_s", "others", "seed", "plans_as_stated", "star")  # that change what E-V2X-BM plans
 DEPENDS = {  # row -> fields on which it depends
     NON_E: (*WORLDS, "counted", "after_impact"),
@@ -80,7 +72,7 @@ def estimate(row: str, reading: Reading, episodes: int, spec: str) -> tuple[Esti
 def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
     """Return whether there is a collision, and the harm (m2/s2), in each world, [n], as a reading reports them.
 
-    ``spec`` is the policy of a hybrid (Algorithm 1): where it does more harm than H*, E-V2X-BM drives the episode.
+    ``spec`` is the policy of a hybrid.
     """
     worlds, counted = reading.only(*WORLDS), reading.counted
     if row == NON_E:
@@ -91,13 +83,22 @@ def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple
     if row == E_V2X_BM:
         return choose(reading.baseline, baseline["collided"], baseline[counted], bound)
     policy = drive_all(worlds, spec, "first", episodes)
+    if reading.hybrid == "policy alone":
+        return policy["collided"], policy[counted]
     if reading.hybrid == "realised, by the coupled H*":
         baseline = drive_all(worlds, "e_v2x_bm", counted, episodes)
         bound = baseline[counted]
-    own, other = policy[counted], baseline[counted]
-    follows = (own <= bound) | (reading.hybrid == "policy alone")
-    collided = np.where(follows, policy["collided"], baseline["collided"])
-    return choose(reading.hybrid, collided, np.where(follows, own, other), np.minimum(own, bound))
+    both = algorithm_1(policy, baseline, bound, counted)
+    return choose(reading.hybrid, both["collided"], both[counted], np.minimum(policy[counted], bound))
+
+
+def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str = "first") -> Outcome:
+    """Return what the hybrid does: where the policy does more harm than H*, E-V2X-BM drives the whole episode.
+
+    ``bound`` is H*, [n] m2/s2.
+    """
+    follows = policy[counted] <= bound
+    return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
 
 
 def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
@@ -107,7 +108,7 @@ def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tu
     return collided, predicted if numbers == "predicted harm, realised collisions" else harm
 
 
-@cache
+@lru_cache(16)  # a search needs the worlds of one reading, and those for which E-V2X-BM plans
 def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
     """Return scenario, game and worlds at the alert."""
     scenario, game = open_game(worlds.scenario(worlds.base))

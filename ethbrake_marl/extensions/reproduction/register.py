@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import DEPENDS, table_of
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
-from ethbrake_marl.extensions.reproduction.search import NEAREST, differences, numbers_of
+from ethbrake_marl.extensions.reproduction.search import NEAREST, distance, numbers_of
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.progress import Progress
@@ -99,13 +99,7 @@ def reproduce_gaps(settings: Settings) -> Made:
         table = table_of(reading, episodes, settings.policies)
         rates, harms = zip(*table.values(), strict=True)
         rows.append(
-            (
-                gap.name,
-                reading.name,
-                float(differences(numbers_of(table)).mean()),
-                *harms,
-                *(rate.value for rate in rates),
-            )
+            (gap.name, reading.name, float(distance(numbers_of(table))), *harms, *(rate.value for rate in rates))
         )
     register = [
         (gap.name, gap.paper, gap.ours, "; ".join(each.name for each in gap.alternatives) or gap.otherwise)
@@ -113,11 +107,12 @@ def reproduce_gaps(settings: Settings) -> Made:
     ]
     collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in DEPENDS]
     note = (
-        f"{episodes:,} worlds. Distance: mean of |ours / printed - 1| over the eight numbers. Then mean harm (m²/s²)"
-        f" with its 95 % interval, and the collision rate. {POLICIES} They are not trained anew for an alternative."
+        f"{episodes:,} worlds. Distance: root mean square of ours / printed - 1 over the eight numbers. Then mean harm"
+        f" (m²/s²) with its 95 % interval, and the collision rate. {POLICIES} They are not trained anew for an"
+        " alternative."
     )
-    distance = replace(PERCENT, heading="Distance")
-    columns: list[Column | str] = ["Quantity", "Value", distance, *map(Column, DEPENDS), *collisions]
+    far = replace(PERCENT, heading="Distance")
+    columns: list[Column | str] = ["Quantity", "Value", far, *map(Column, DEPENDS), *collisions]
     sheets = [
         Sheet(
             "Register of what the paper leaves open",

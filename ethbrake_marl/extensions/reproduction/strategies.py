@@ -15,6 +15,7 @@ from ethbrake_marl.extensions.reproduction.random_test import (
     PLANS,
     WORLDS,
     Outcome,
+    algorithm_1,
     brake,
     drive_all,
     opened,
@@ -37,8 +38,8 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
     """
     worlds, plans = reading.only(*WORLDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
-    found = {NON_E: brake(worlds, None, "brakes on", episodes), E_V2X_BM: baseline}
-    hybrids = {"": baseline}
+    found: dict[str, Outcome] = {NON_E: brake(worlds, None, "brakes on", episodes), E_V2X_BM: baseline}
+    hybrids: dict[str, Outcome] = {"": baseline}
     if reading.step_s is None:
         coupled = drive_all(worlds, "e_v2x_bm", "first", episodes)
         found[COUPLED] = {**coupled, PREDICTED: coupled["first"]}
@@ -46,15 +47,9 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
     found |= {name: drive_all(worlds, spec, "first", episodes) for name, spec in policies.items()}
     for name in policies:
         for ending, bound in hybrids.items():
-            found[f"Hybrid {name}{ending}"] = algorithm_1(found[name], bound)
+            least = {PREDICTED: np.minimum(found[name]["first"], bound[PREDICTED])}
+            found[f"Hybrid {name}{ending}"] = {**algorithm_1(found[name], bound, bound[PREDICTED]), **least}
     return found
-
-
-def algorithm_1(policy: Outcome, bound: Outcome) -> Outcome:
-    """Return what the hybrid of a policy and E-V2X-BM does."""
-    follows = policy["first"] <= bound[PREDICTED]
-    least = {PREDICTED: np.minimum(policy["first"], bound[PREDICTED])}
-    return {key: np.where(follows, policy[key], bound[key]) for key in policy} | least
 
 
 def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[str, list[dict[str, Outcome]]]:

@@ -49,8 +49,8 @@ class Claim(NamedTuple):
 
 def claims_sheet(claims: Sequence[Claim]) -> Sheet:
     """Return the table."""
-    rows = [(f"{each.where}: {each.paper}", each.ours, each.nearest, each.verdict) for each in claims]
-    headings = "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
+    rows = [(each.where, each.paper, each.ours, each.nearest, each.verdict) for each in claims]
+    headings = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
     return Sheet("", [Column(heading, text=True) for heading in headings], rows)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.paper_rows import PaperRow
-from ethbrake_marl.extensions.reproduction import curves, register, tables, trajectories
+from ethbrake_marl.extensions.reproduction import curves, tables, trajectories
 from ethbrake_marl.extensions.reproduction.made import Settings
 from ethbrake_marl.extensions.reproduction.readings import (
     COUPLED,
@@ -187,34 +187,3 @@ def test_figures__of_positions_and_commands_are_those_of_the_records() -> None:
         assert line.get_xdata() == pytest.approx(at) and {*line.get_ydata()} == {i + 1}
     profile = trajectories.profiles_figure({title: {"stated": record} for title in "abcd"}, "c").axes[0]
     assert np.array_equal(profile.lines[1].get_ydata(), record.command_mps2[:, 1])
-
-
-def test_register__alternatives_are_measured_as_they_say() -> None:
-    episodes = 20
-    _, base = register.measure(register.Alternative(""), episodes)
-    named = {f"{gap.name}: {each.value}": each for gap in register.GAPS for each in gap.alternatives}
-    assert len(named) == 23 and all(bool(gap.alternatives) != bool(gap.otherwise) for gap in register.GAPS)
-
-    def harm_of(row: str) -> dict[str, np.ndarray]:
-        return register.measure(next(each for name, each in named.items() if name.startswith(row)), episodes)[1]
-
-    plain = eb.evaluate(RANDOM, "ppo", episodes=episodes, measures="sampled_harm")["ppo"]
-    assert np.array_equal(base[PPO], plain["first_impact_harm"])
-    assert np.array_equal(harm_of("which impacts count: every impact")[PPO], plain["total_harm"])
-    assert np.array_equal(harm_of("impacts at samples or exact: the paper")[PPO], plain["sampled_harm"])
-    predicted = harm_of("H* of E-V2X-BM, predicted or realised: predicted, pair by pair")
-    assert predicted[REALISED].mean() < base[REALISED].mean() and np.array_equal(predicted[PPO], base[PPO])
-    for row, spec, seed in (("seed of the test: 8", "ppo", 8),
-                            ("H* inside the hybrid: hybrid with predicted", "ppo+episode:pairwise", 7)):  # fmt: skip
-        other = eb.evaluate(RANDOM, spec, episodes=episodes, seed=seed)[spec]
-        assert np.array_equal(harm_of(row)[PPO], other["first_impact_harm"])
-    assert harm_of("when Vehicle 2 may act: 0.2 s")[NON_ETHICAL].mean() > base[NON_ETHICAL].mean()
-
-
-def test_register__shows_every_alternative_and_whether_the_order_stays() -> None:
-    made = register.reproduce_gaps(replace(SETTINGS, episodes=10))
-    listed, measured = made.sheets
-    assert len(listed.rows) == len(register.GAPS) and len(measured.rows) == 24
-    assert measured.rows[0][:2] == ("our defaults", "")
-    order = made.verdicts[-1]
-    assert "what Vehicle 1 brakes for: an obstacle" in order.because and order.outcome == "differs"

@@ -1,0 +1,250 @@
+"""Readings of the paper: what they change, the random test under each, and the search over all of them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.agents.drive import drive
+from ethbrake_marl.agents.pairwise import pairwise, predicted_harm
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.reproduction import register, search
+from ethbrake_marl.extensions.reproduction.made import Settings
+from ethbrake_marl.extensions.reproduction.random_test import (
+    E_V2X_BM,
+    HYBRID_PPO,
+    HYBRID_SAC,
+    NON_E,
+    brake,
+    plan,
+    reported,
+    table_of,
+)
+from ethbrake_marl.extensions.reproduction.readings import RANDOM, STATED, Reading
+from ethbrake_marl.extensions.reproduction.search import GRID, NEAREST, differences, distance, numbers_of, readings_of
+from ethbrake_marl.motion.layout import BRAKING, LATENCY
+from ethbrake_marl.names import open_game, teams_of
+from tests.refused import refused
+
+WORLDS = 100
+SETTINGS = Settings(Path("unused"), episodes=20)
+
+EARLY = Reading(acts_s=0.2)
+DRIVEN_EARLY = register.EARLY_DRIVEN
+ROWS = {
+    "stated": STATED,
+    "early": EARLY,
+    "rear": STATED._replace(rear_s=0.95),
+    "map": STATED._replace(step_s=0.25),
+    "plastic": STATED._replace(restitution=0.0),
+    "coasts": STATED._replace(after_impact="coasts"),
+    "ends": STATED._replace(after_impact="ends"),
+    "coasts in the map": STATED._replace(after_impact="coasts", step_s=0.2),
+    "planned": DRIVEN_EARLY._replace(star="low end"),
+    "total": STATED._replace(counted="total", hybrid="realised, by the coupled H*"),
+    "predicted": STATED._replace(baseline="predicted", hybrid="predicted"),
+    "nearest": NEAREST,
+}
+GOLDEN = {  # in the first 100 worlds: collision rate and mean harm of Non-E, E-V2X-BM, Hybrid SAC, Hybrid PPO
+    "stated": [0.8, 21.011164, 0.6, 17.195163, 0.6, 7.068346, 0.6, 6.934062],
+    "early": [0.96, 31.741475, 0.49, 16.739087, 0.49, 3.928278, 0.49, 3.463971],
+    "rear": [0.94, 31.125701, 0.75, 24.794984, 0.74, 9.486244, 0.74, 9.289192],
+    "map": [0.96, 34.530865, 0.91, 28.875307, 0.79, 20.510552, 0.77, 22.396755],
+    "plastic": [0.8, 20.655952, 0.6, 16.679115, 0.6, 6.880712, 0.6, 6.794417],
+    "coasts": [0.8, 33.539506, 0.6, 17.195163, 0.6, 7.068346, 0.6, 6.934062],
+    "ends": [0.8, 13.001568, 0.6, 17.195163, 0.6, 7.068346, 0.6, 6.934062],
+    "coasts in the map": [0.9, 40.473706, 0.77, 21.57445, 0.71, 13.036153, 0.68, 13.529591],
+    "planned": [0.96, 31.741475, 0.84, 8.559601, 0.49, 3.628675, 0.49, 3.477837],
+    "total": [0.8, 22.464132, 0.6, 18.491603, 0.6, 6.468591, 0.6, 6.310893],
+    "predicted": [0.8, 21.011164, 0.6, 8.559601, 0.6, 6.182318, 0.6, 6.055781],
+    "nearest": [0.96, 31.966079, 0.83, 8.559601, 0.54, 5.251315, 0.49, 4.982125],
+}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_numbers__are_as_recorded(name: str) -> None:
+    assert numbers_of(table_of(ROWS[name], WORLDS)).ravel() == pytest.approx(GOLDEN[name], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("reading", "spec"),
+    [
+        (STATED, "ppo+episode:pairwise"),
+        (EARLY._replace(hybrid="realised, by the coupled H*"), "ppo+episode"),
+        (STATED._replace(hybrid="policy alone", step_s=0.2), "ppo"),
+        (STATED._replace(hybrid="realised, by the coupled H*", counted="total"), "ppo+episode"),
+    ],
+    ids=lambda each: each if isinstance(each, str) else each.name,
+)
+def test_hybrid__is_what_the_shield_does(reading: Reading, spec: str) -> None:
+    scenario = reading.scenario(RANDOM)
+    shield = eb.evaluate(scenario, spec, episodes=WORLDS, harm_count=reading.counted)[spec]
+    collided, harm = reported(HYBRID_PPO, reading, WORLDS, "ppo")
+    column = "total_harm" if reading.counted == "total" else "first_impact_harm"
+    assert np.array_equal(harm, shield[column]) and np.array_equal(collided, shield["collided"])
+
+
+@pytest.mark.parametrize("reading", [STATED, STATED._replace(step_s=0.2), EARLY], ids=lambda reading: reading.name)
+def test_baselines__are_what_the_agents_do(reading: Reading) -> None:
+    result = eb.evaluate(reading.scenario(RANDOM), "full_brake,e_v2x_bm:pairwise", episodes=WORLDS)
+    for row, name in ((NON_E, "full_brake"), (E_V2X_BM, "e_v2x_bm:pairwise")):
+        collided, harm = reported(row, reading, WORLDS)
+        assert np.array_equal(harm, result[name]["first_impact_harm"])
+        assert np.array_equal(collided, result[name]["collided"])
+    predicted = reported(E_V2X_BM, reading._replace(baseline="predicted"), WORLDS)[1]
+    assert np.array_equal(predicted, result["e_v2x_bm:pairwise"]["predicted_harm"])
+
+
+def test_predicted__harm_of_the_hybrid_is_what_algorithm_1_expects() -> None:
+    scenario, game = open_game(RANDOM)
+    team = teams_of("ppo+episode:pairwise", scenario)["ppo+episode:pairwise"]
+    memory = drive(game, scenario.sample(WORLDS, 7), team).memories["shield"]
+    expected = np.minimum(memory.policy_harm, memory.bound_harm)
+    collided, harm = reported(HYBRID_PPO, STATED._replace(hybrid="predicted"), WORLDS, "ppo")
+    assert np.array_equal(harm, expected) and np.array_equal(collided, expected > 0.0)
+
+
+def test_mixed__report_has_the_collisions_that_happen_and_the_harm_that_was_predicted() -> None:
+    collided, harm = reported(E_V2X_BM, DRIVEN_EARLY, WORLDS)
+    assert np.array_equal(harm, plan(DRIVEN_EARLY, WORLDS).harm)
+    assert np.array_equal(collided, reported(E_V2X_BM, DRIVEN_EARLY._replace(baseline="realised"), WORLDS)[0])
+    assert collided.sum() > (harm > 0.0).sum()
+
+
+def test_ends_of_a_star__do_equally_little_harm_and_nothing_beyond_them_does() -> None:
+    low, middle, high = (
+        plan(STATED._replace(star=star), WORLDS).deceleration_mps2 for star in ("low end", "middle", "high end")
+    )
+    alert = eb.load_scenario(RANDOM).sample(WORLDS, 7)
+    harm = pairwise(alert, 2).harm
+    assert (low <= middle).all() and (middle <= high).all()
+    assert np.array_equal(low == high, harm > 0.0)
+    for k in np.flatnonzero(harm == 0.0):
+        car = alert.car[k].copy()
+
+        def at(deceleration: float, k: int = k, car: np.ndarray = car) -> float:
+            return predicted_harm(alert.line[k], car[BRAKING], car[LATENCY], 2, deceleration)
+
+        assert max(at(low[k]), at(high[k])) < 1e-9
+        assert at(low[k] - 1e-3) > 0.0 and (high[k] == 7.0 or at(high[k] + 1e-3) > 0.0)
+
+
+def test_after_an_impact__vehicles_coast_or_the_episode_ends() -> None:
+    on, coasts, ends = (brake(STATED, None, each, WORLDS) for each in ("brakes on", "coasts", "ends"))
+    impacts = eb.evaluate(RANDOM, "full_brake", episodes=WORLDS)["full_brake"]["impacts"]
+    assert np.array_equal(on["collided"], coasts["collided"]) and np.array_equal(on["collided"], ends["collided"])
+    one = impacts <= 1
+    assert ends["first"][one] == pytest.approx(on["first"][one], rel=1e-9) and one.sum() > on["collided"].sum() - 80
+    assert (ends["first"] < on["first"] + 1e-9).all() and (coasts["first"] > ends["first"] - 1e-9).all()
+    assert coasts["first"].mean() > on["first"].mean() > ends["first"].mean()
+
+
+def test_names__say_what_differs() -> None:
+    assert (STATED.name, EARLY.name) == ("as stated", "Vehicle 2 acts at 0.2 s")
+    both = STATED._replace(step_s=0.25, others=(("horizon_s", 5.0), ("speed_limit_mps", 25.0)), star="low end")
+    assert both.name == "the paper's map at 0.25 s; horizon_s = 5.0, speed_limit_mps = 25.0; a* at the low end"
+    names = {reading.name for reading in readings_of(GRID)}
+    assert len(names) == 27 * (5 + 4 * 4) * 2 * 2 * 3 * 2 * 3 * 3 == 122_472
+
+
+def test_scenario__has_what_the_reading_says() -> None:
+    scenario = Reading(RANDOM, 0.25, 1.1, 0.5, 0.3, (("horizon_s", 5.0),)).scenario("paper-delay-low", gaps_m=[7, 7])
+    assert scenario.latency_s == (0.0, 0.25, 1.1) and (scenario.physics, scenario.time_step_s) == ("paper-map", 0.5)
+    assert (scenario.restitution, scenario.horizon_s, scenario.gaps_m) == (0.3, 5.0, (7.0, 7.0))
+    assert STATED.scenario("paper-delay-low").latency_s == (0.0, 0.1, 0.3)
+
+
+def test_map__has_no_coupled_bound() -> None:
+    with refused("needs exact impacts", InvalidInput):
+        table_of(STATED._replace(step_s=0.2, hybrid="realised, by the coupled H*"), 2)
+
+
+SMALL = {
+    "acts_s": (None, 0.2),
+    "step_s": (None, 0.2),
+    "plans_as_stated": (False, True),
+    "star": ("middle", "low end"),
+    "baseline": ("realised", "predicted harm, realised collisions"),
+    "hybrid": ("realised", "realised, by the coupled H*", "policy alone"),
+}
+
+
+def test_search__finds_the_reading_of_a_table() -> None:
+    readings, numbers = search.search(SMALL, 40)
+    assert len({each.tobytes() for each in numbers}) == len(readings) < len([*readings_of(SMALL)])
+    for planted in (NEAREST, STATED, STATED._replace(hybrid="realised, by the coupled H*")):
+        distances = distance(numbers, numbers_of(table_of(planted, 40)))
+        assert readings[int(distances.argmin())] == planted and distances.min() == 0.0
+        assert np.sort(distances)[1] > 0.0
+
+
+def test_difference__by_hand() -> None:
+    printed = np.array([[0.5, 10.0], [0.4, 8.0], [0.2, 5.0], [0.1, 4.0]])
+    ours = printed.copy()
+    ours[0, 1], ours[3, 0] = 11.0, 0.05
+    assert differences(ours, printed) == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0])
+    assert distance(np.stack([ours, printed]), printed) == pytest.approx([((0.1**2 + 0.5**2) / 8) ** 0.5, 0.0])
+
+
+def test_chance__is_how_near_readings_come_to_tables_of_mixed_readings() -> None:
+    one = numbers_of(table_of(STATED, 20))
+    assert not search.by_chance(one[np.newaxis]).any()
+    two = search.by_chance(np.stack([one, 2.0 * one]))
+    # k of 8 numbers are of the other reading: half of it, or twice as much
+    possible = [round(off * (k / 8) ** 0.5, 6) for k in range(9) for off in (0.5, 1.0)]
+    assert {round(float(each), 6) for each in two} <= {*possible}
+    assert two.max() > 0.0
+
+
+def test_reproduce_search__shows_the_nearest_and_says_that_it_is_a_hypothesis(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(search, "GRID", SMALL)
+    assert search.reproduce_search(SETTINGS).notes == ["The search needs `--full`."]
+    made = search.reproduce_search(replace(SETTINGS, full=True))
+    nearest, fixed = made.sheets
+    assert nearest.rows[0][:2] == ("printed", 0.0) and nearest.rows[-1][0] == "as stated"
+    distances = [row[1] for row in nearest.rows[1:-1]]
+    assert len(distances) == search.SHOWN and distances == sorted(distances)
+    assert len(fixed.rows) == sum(map(len, SMALL.values())) and "is a hypothesis" in made.notes[1]
+    assert fixed.rows[1][0] == "Vehicle 2 acts at 0.2 s" and "Vehicle 2 acts at 0.2 s" in fixed.rows[1][2]
+    assert min(row[1] for row in fixed.rows) == distances[0]
+    asked = {row[0]: row for row in nearest.rows}
+    assert asked["as stated"][4:] == pytest.approx(numbers_of(table_of(STATED, 20)).T.ravel())
+
+
+def test_register__shows_every_alternative() -> None:
+    made = register.reproduce_gaps(SETTINGS)
+    listed, measured = made.sheets
+    alternatives = [reading for gap in register.GAPS for reading in gap.alternatives]
+    assert len(listed.rows) == len(register.GAPS)
+    assert len(measured.rows) == 1 + len(alternatives) + len(register.COMBINED.alternatives)
+    assert len({row[1] for row in measured.rows}) == len(measured.rows)
+    assert all(bool(gap.alternatives) != bool(gap.otherwise) for gap in register.GAPS)
+    assert measured.rows[0][:2] == ("our defaults", "as stated")
+    for reading in (STATED, DRIVEN_EARLY, NEAREST):
+        (row,) = (row for row in measured.rows if row[1] == reading.name)
+        numbers = numbers_of(table_of(reading, 20))
+        assert row[2] == distance(numbers)
+        assert [each.value for each in row[3:7]] == numbers[:, 1].tolist() and [*row[7:]] == numbers[:, 0].tolist()
+
+
+@pytest.mark.parametrize(
+    "reading",
+    [
+        *(STATED._replace(others=((key, value),)) for key, value in
+          (("horizon_s", 5.0), ("horizon_s", 16.0), ("speed_limit_mps", 25.0), ("early_impacts", "keep"))),
+        *(STATED._replace(star=star) for star in ("low end", "high end")),
+    ],
+    ids=lambda reading: reading.name,
+)  # fmt: skip
+def test_register__quantities_without_effect_have_none(reading: Reading) -> None:
+    assert np.array_equal(numbers_of(table_of(reading, WORLDS)), numbers_of(table_of(STATED, WORLDS)))
+
+
+def test_policies__can_be_others() -> None:
+    table = table_of(STATED._replace(hybrid="policy alone"), 20, {"SAC": "coast", "PPO": "full_brake"})
+    assert table[HYBRID_PPO] == table[NON_E] != table[HYBRID_SAC]
+    settings = replace(SETTINGS, policies={"SAC": "coast", "PPO": "full_brake"})
+    row = register.reproduce_gaps(settings).sheets[1].rows[0]
+    assert row[5] == table_of(STATED, 20, settings.policies)[HYBRID_SAC][1]
