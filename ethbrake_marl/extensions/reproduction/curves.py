@@ -119,7 +119,8 @@ def reproduce_distance(settings: Settings) -> Made:
 
 def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]:
     """Return what the paper says of its figure: statement -> the comparisons that it needs."""
-    ends = {name: groups[name] for name in ([*groups][-1], [*groups][0])}  # the longest, the shortest
+    shortest, *_, longest = (*groups, *groups)
+    ends = {longest: groups[longest], shortest: groups[shortest]}
     return {
         "non-ethical harm grows with the distance": growing(groups, NON_E),
         "E-V2X-BM does less harm than non-ethical": less_in_each(groups, E_V2X_BM, NON_E),
