@@ -35,8 +35,7 @@ HARMS = {"first": "first-impact harm", "total": "total harm"}
 STOPPED_WORLDS = 5_000
 
 WHY = {  # (row, quantity) -> why ours differs; "": each
-    (NON_E, RATE): "Vehicle 2 acts 0.5 s after the alert; if it acts after 0.2 s, the printed number comes out",
-    (NON_E, AVERAGE): "Vehicle 2 acts 0.5 s after the alert; if it acts after 0.2 s, the printed number comes out",
+    (NON_E, ""): "Vehicle 2 acts 0.5 s after the alert; if it acts after 0.2 s, the printed number comes out",
     (E_V2X_BM, RATE): "nothing that the paper states gives so many; plans for other latencies than those driven would",
     (E_V2X_BM, AVERAGE): "this is what braking as planned does; the printed number is near what the plan predicts",
     (ALONE, ""): "the policy that has not converged is ours, and depends on when one stops",
@@ -114,26 +113,21 @@ def process_sheet(settings: Settings, reading: Reading, episodes: int) -> Sheet 
 def compared(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less]:
     """Compare both harms of a strategy with those of others, in the same worlds."""
     return [
-        Less.of_worlds(f"{smaller} minus {other}, {HARMS[count]}", found[smaller][count], found[other][count])
+        Less.of_worlds(f"{smaller} minus {other}, {harm}", found[smaller][count], found[other][count])
         for other in larger
-        for count in ("first", "total")
+        for count, harm in HARMS.items()
     ]
 
 
 def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: str, larger: str) -> list[Less]:
     """Compare both harms of two strategies of the paper's process, ``{}`` for the policy, over its seeds."""
-    return [
-        Less(
-            f"{smaller.format(name)} minus {larger.format(name)}, {HARMS[count]}",
-            mean(
-                np.array(
-                    [(each[smaller.format(name)][count] - each[larger.format(name)][count]).mean() for each in seeds]
-                )
-            ),
-        )
-        for name, seeds in process.items()
-        for count in ("first", "total")
-    ]
+    parts = []
+    for name, seeds in process.items():
+        one, other = smaller.format(name), larger.format(name)
+        for count, harm in HARMS.items():
+            apart = [(each[one][count] - each[other][count]).mean() for each in seeds]
+            parts.append(Less(f"{one} minus {other}, {harm}", mean(np.array(apart))))
+    return parts
 
 
 def conclusions(found: Mapping[str, Outcome], policies: Iterable[str]) -> dict[str, list[Less]]:
