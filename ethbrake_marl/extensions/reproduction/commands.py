@@ -78,7 +78,7 @@ def reproduce_command(
 
 def chosen_policies(text: str) -> dict[str, str]:
     """Return the specs of SAC and PPO; ``text`` replaces some. Raises ``InvalidInput`` for something else."""
-    chosen = {"SAC": "sac", "PPO": "ppo"}
+    chosen = {"PPO": "ppo", "SAC": "sac"}
     for part in filter(None, text.split(",")):
         name, _, spec = part.partition("=")
         if name.upper() not in chosen or not spec:

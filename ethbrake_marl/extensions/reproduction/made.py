@@ -28,7 +28,7 @@ class Settings:
     full: bool = False  # train by the paper's own process, and search over the readings
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
     tell: OnProgress = lambda progress: None
-    policies: Mapping[str, str] = field(default_factory=lambda: {"SAC": "sac", "PPO": "ppo"})  # name -> spec
+    policies: Mapping[str, str] = field(default_factory=lambda: {"PPO": "ppo", "SAC": "sac"})  # name -> spec
 
 
 class Drawn(NamedTuple):
