@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import TRUNCATED, Step, driven_again
 from ethbrake_marl.motion.layout import COUNT, DROVE, NEXT_TIME, PUSHED, Floats
 
 
 def push(before: State, step: Step, after: State) -> Floats:
     """Return the term push, [n]: minus the push of all contacts (m/s), the obstacle's included (``motion.push``)."""
+    check_exact(before, "the term push")
     return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
 
 
 def drove(before: State, step: Step, after: State) -> Floats:
     """Return the term drove, [n, N]: minus what a positive command adds to the speed before the first impact (m/s)."""
+    check_exact(before, "the term drove")
     return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
 
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
     """Return the term still_moving, [n]: -1 for an end at the horizon with a vehicle in motion."""
+    check_exact(before, "the term still_moving")
     return 0.0 - step.out[TRUNCATED]
 
 

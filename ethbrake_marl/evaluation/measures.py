@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import PHYSICS, State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.motion.layout import COUNT, FIRST
@@ -116,7 +116,9 @@ def collided(game: Game, alert: State, last: State) -> Given:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> Given:
-    """Return the harm of the line, and what each vehicle bears of it."""
+    """Return the harm of the line, and what each vehicle bears of it; no honest cost where impacts are not exact."""
+    if count == "honest" and PHYSICS in last.memories:
+        return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
     return {"": last.harm(count), **borne}
 

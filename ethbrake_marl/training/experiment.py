@@ -94,8 +94,14 @@ def run_experiment(
     ``KeyboardInterrupt``; the folder keeps the policy. ``run.json`` records how the run ended. The other arguments are
     those of ``train`` and ``evaluate``, and so are the errors.
 
-    Returns the experiment, and the tables and the text of the report.
+    Returns the experiment, and the tables and the text of the report. Raises ``InvalidInput``, before any work, for a
+    scenario without exact impacts, which shields and reports need.
     """
+    if scenario.physics is not None:
+        raise InvalidInput(
+            f"scenario {scenario.name!r}: ethbrake run compares shields, which need exact impacts, and physics:"
+            f" {scenario.physics} has none; use ethbrake train and ethbrake evaluate"
+        )
     started, tell = time.monotonic(), on_progress or (lambda progress: None)
     shown: Report = report or Tables()
     count = recipe.reward.harm_count
