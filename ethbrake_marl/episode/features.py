@@ -73,7 +73,7 @@ LISTS = {  # a name for several features of different groups
     "paper": (
         *("own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration"),
         *("rear_1.gap", "rear_1.closing_speed", "rear_1.acceleration"),
-    )
+    ),
 }
 SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 

@@ -99,10 +99,7 @@ def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, unt
     ``until_s`` is the horizon: what still moves then counts as it does there. ``tried`` [n, C, B] are C commands of the
     bodies (m/s2); the others hold ``wanted`` [n, N + 1].
     """
-    check_exact(
-        state,
-        "a plan of constant commands (e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping)",
-    )
+    check_exact(state, "a plan of constant commands (e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping)")
     out, counts = np.empty((2, *tried.shape[:2])), (weights_of(count), weights_of(other_count(count)))
     hold_worlds(
         state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(tried),

@@ -16,15 +16,7 @@ if TYPE_CHECKING:
 WORDS = ("title", "description", "source")
 
 _OWN = ("name", *WORDS, "mixture")  # keys of the mixture itself; every other key applies to all members
-_ONE_FOR_ALL = (
-    "vehicles",
-    "time_step_s",
-    "horizon_s",
-    "roles",
-    "objective",
-    "observation",
-    "physics",
-)  # must not differ
+_ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "roles", "objective", "observation", "physics")  # must not differ
 _SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them if all members agree
 
 

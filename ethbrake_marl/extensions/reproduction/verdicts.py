@@ -106,7 +106,13 @@ def judge_statement(parts: Sequence[Less], show: Column = HARM) -> tuple[str, Ou
 
 
 def judge(
-    where: str, paper: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, why: str = "", show: Column = HARM
+    where: str,
+    paper: str,
+    stated: Sequence[Less],
+    nearest: Sequence[Less] = (),
+    *,
+    why: str = "",
+    show: Column = HARM,
 ) -> Claim:
     """Return a statement as a claim; ``why`` follows what the numbers say."""
     ours, outcome, numbers = judge_statement(stated, show)
