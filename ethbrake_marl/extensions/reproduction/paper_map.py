@@ -111,7 +111,8 @@ def collision(params: RewardParams, before: State, step: Step, after: State) -> 
     speed, gap = before.line[:, SPEED], before.line[:, GAP]
     closing = np.diff(speed[:, 1:], axis=1)
     squares = np.where(gap[:, 1:-1] <= 0.0, closing * closing, 0.0)
-    return -(pair_energies(params, before.vehicles)[1:-1] * squares).sum(axis=1)
+    penalty: Floats = -(pair_energies(params, before.vehicles)[1:-1] * squares).sum(axis=1)
+    return penalty
 
 
 class MappedGame(Game):
