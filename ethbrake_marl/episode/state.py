@@ -198,7 +198,7 @@ class State(NamedTuple):
         return out + own[:, :-1]
 
     def _check_count(self, count: Count) -> None:
-        if count == "honest":
+        if PHYSICS in self.memories and weights_of(count)[2:].any():  # more than harm of impacts
             check_exact(self, "the honest cost")
 
 
