@@ -183,7 +183,9 @@ def reproduce_random_table(settings: Settings) -> Made:
         }.items():
             claims.append(judge("Table III", text, over_seeds(process, *pair)))
     sheets = [printed_sheet(RANDOM_TEST), outcomes_sheet("The random test, as stated", found, least)]
-    return Made(claims, [*sheets, *filter(None, [process_sheet(settings, STATED, episodes)])], notes=[settings.who_drives])
+    return Made(
+        claims, [*sheets, *filter(None, [process_sheet(settings, STATED, episodes)])], notes=[settings.who_drives]
+    )
 
 
 def reproduce_hybrid_table(settings: Settings) -> Made:

@@ -43,7 +43,9 @@ def test_reproduce__writes_page_figures_and_tables(ethbrake: Command, empty_fold
     for name in ("accelerations.svg", "accelerations.pdf", "commands-of-vehicle-2.csv", "commands-of-vehicle-2.tex"):
         assert (folder / name).stat().st_size > 200
     assert [row["The paper"] for row in rows_of(folder / "claims.csv")] == [each["paper"] for each in result["claims"]]
-    assert (folder / "claims.tex").read_text("utf-8").startswith("\\begin{tabular}{lllll}\n\\toprule\nWhere & The paper")
+    assert (
+        (folder / "claims.tex").read_text("utf-8").startswith("\\begin{tabular}{lllll}\n\\toprule\nWhere & The paper")
+    )
     assert done.err.endswith("page: out/README.md\n")
 
 
