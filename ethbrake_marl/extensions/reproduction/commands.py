@@ -77,16 +77,21 @@ def reproduce_command(
 
 
 def chosen_policies(text: str) -> dict[str, str]:
-    """Return the specs of SAC and PPO; ``text`` replaces some. Raises ``InvalidInput`` for something else."""
-    chosen = {"PPO": "ppo", "SAC": "sac"}
+    """Return the specs of SAC and PPO; ``text`` replaces some. Raises the errors of ``make_agent``."""
+    from ethbrake_marl.extensions.reproduction.random_test import SHIPPED
+    from ethbrake_marl.extensions.reproduction.readings import RANDOM
+    from ethbrake_marl.names import make_agent
+
+    replaced = dict[str, str]()
     for part in filter(None, text.split(",")):
         name, _, spec = part.partition("=")
-        if name.upper() not in chosen or not spec:
+        if name.upper() not in SHIPPED or name.upper() in replaced or not spec:
             raise InvalidInput(
-                f"--policies {text}: {part!r}: must be ppo=AGENT or sac=AGENT, for instance ppo=policy@RUN"
+                f"--policies {text}: {part!r}: must be ppo=AGENT or sac=AGENT, each once, for instance ppo=policy@RUN"
             )
-        chosen[name.upper()] = spec
-    return chosen
+        make_agent(spec, scenario=RANDOM)  # so that a wrong name is refused before a training
+        replaced[name.upper()] = spec
+    return {**SHIPPED, **replaced}
 
 
 REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))

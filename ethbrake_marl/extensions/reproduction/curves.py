@@ -11,7 +11,7 @@ from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.curves import curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.learning import unconverged
-from ethbrake_marl.extensions.reproduction.made import POLICIES, Drawn, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, WORLDS, opened
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
 from ethbrake_marl.extensions.reproduction.search import NEAREST
@@ -24,7 +24,7 @@ from ethbrake_marl.extensions.reproduction.strategies import (
     of_the_process,
     strategies,
 )
-from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, Outcome, judge
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.motion.layout import Floats
 
@@ -114,7 +114,7 @@ def reproduce_distance(settings: Settings) -> Made:
     stated, nearest = (statements(groups, settings.policies) for groups in readings.values())
     claims = [judge("Fig. 4", text, parts, nearest[text]) for text, parts in stated.items()]
     shown = over_distance("harm-distance", readings, [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN])
-    return shown._replace(claims=claims, notes=[POLICIES])
+    return shown._replace(claims=claims, notes=[settings.who_drives])
 
 
 def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]:
@@ -159,23 +159,25 @@ def reproduce_delays(settings: Settings) -> Made:
     claim = judge("Fig. 5", "SAC and PPO do the least harm at every delay", parts, why=why)
     shown = [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN]
     made = show_harm("harm-delays", "Gaps of 7 m, speeds of 20, 18 and 20 m/s", {"as stated": groups}, shown, "Delay")
-    return made._replace(claims=[claim], notes=[f"One world: no intervals. {POLICIES}"])
+    return made._replace(claims=[claim], notes=[f"One world: no intervals. {settings.who_drives}"])
 
 
 def reproduce_illustration(settings: Settings) -> Made:
     """Reproduce the illustration of the hybrid, which "consistently selects the strategy [of] lower harm"."""
     readings = distances(settings, {ALONE: unconverged(settings.folder)})
     hybrid = f"Hybrid {ALONE}"
-    texts = []
+    counts, texts = [], []
     for groups in readings.values():
         lines = next(iter(groups.values()))[0]
         worse = lines[hybrid] > np.minimum(lines[ALONE], lines[E_V2X_BM]) + 1e-9
-        texts.append(f"not in {int(worse.sum()):,} of {len(worse):,} worlds")
+        counts.append(int(worse.sum()))
+        texts.append(f"not in {counts[-1]:,} of {len(worse):,} worlds")
     ours, nearest = texts
     why = (
         "it compares the policy's harm with the harm that E-V2X-BM predicts, which is about half of what E-V2X-BM does;"
         " with the simulated H* it always takes the lower one"
     )
-    claim = Claim("Fig. 8", "the hybrid consistently selects the strategy of lower harm", ours, nearest, "differs", why)
+    outcome: Outcome = "differs" if counts[0] else "agrees"
+    claim = Claim("Fig. 8", "the hybrid consistently selects the strategy of lower harm", ours, nearest, outcome, why)
     shown = over_distance("hybrid-illustration", readings, [E_V2X_BM, COUPLED, ALONE, hybrid, f"{hybrid}, {SIMULATED}"])
     return shown._replace(claims=[claim])

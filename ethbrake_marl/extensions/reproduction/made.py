@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.extensions.reproduction.random_test import SHIPPED
 from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.progress import OnProgress
@@ -28,7 +29,14 @@ class Settings:
     full: bool = False  # train by the paper's own process, and search over the readings
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
     tell: OnProgress = lambda progress: None
-    policies: Mapping[str, str] = field(default_factory=lambda: {"PPO": "ppo", "SAC": "sac"})  # name -> spec
+    policies: Mapping[str, str] = field(default_factory=lambda: SHIPPED)  # name -> spec
+
+    @property
+    def who_drives(self) -> str:
+        """One line about the policies."""
+        if self.policies == SHIPPED:
+            return POLICIES
+        return f"{', '.join(f'{name} is {spec}' for name, spec in self.policies.items())}."
 
 
 class Drawn(NamedTuple):

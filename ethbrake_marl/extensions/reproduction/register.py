@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import DEPENDS, table_of
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
 from ethbrake_marl.extensions.reproduction.search import NEAREST, distance, numbers_of
@@ -75,8 +75,8 @@ GAPS = (
     Gap("state of the policy", "MDP formulation: positions, speeds, actions of the others",
         "also capacities, masses, latencies, e and derived features",
         otherwise="not measured: it needs trainings that converge"),
-    Gap("seeds of the training", "multiple training tests with different random seeds", "0, 1, 2",
-        otherwise="--full trains three"),
+    Gap("seeds of the training", "multiple training tests with different random seeds", "0 to 4",
+        otherwise="--full trains five"),
     Gap("ends of the cosine, number of decisions", "table:params: cosine, no numbers", "3e-4 to 3e-5; in the recipes",
         otherwise="not measured: one training each takes minutes; docs/train.md compares recipes"),
 )  # fmt: skip
@@ -108,7 +108,7 @@ def reproduce_gaps(settings: Settings) -> Made:
     collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in DEPENDS]
     note = (
         f"{episodes:,} worlds. Distance: root mean square of ours / printed - 1 over the eight numbers. Then mean harm"
-        f" (m²/s²) with its 95 % interval, and the collision rate. {POLICIES} They are not trained anew for an"
+        f" (m²/s²) with its 95 % interval, and the collision rate. {settings.who_drives} They are not trained anew for an"
         " alternative."
     )
     far = replace(PERCENT, heading="Distance")

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
-from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import DEPENDS, SHIPPED, Table, table_of
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading, say
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
@@ -143,7 +143,7 @@ def reproduce_search(settings: Settings) -> Made:
         f" {len(readings):,} readings with different numbers some come near by chance. For {FAKES} tables that nobody"
         " has printed, whose numbers are each drawn from a reading at random, the nearest reading has a distance of"
         f" {100.0 * np.median(fakes):.1f} % in the median; for {100.0 * (fakes <= distances.min()).mean():.1f} % of"
-        f" them it is as near as to the printed table. {POLICIES}"
+        f" them it is as near as to the printed table. {settings.who_drives}"
     )
     part = replace(PERCENT, heading="Distance")
     columns: list[Column | str] = [

@@ -9,7 +9,7 @@ import numpy as np
 from ethbrake_marl.evaluation.statistics import decrease, mean, rate
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, PaperRow, printed_sheet
 from ethbrake_marl.extensions.reproduction.learning import unconverged
-from ethbrake_marl.extensions.reproduction.made import POLICIES, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, Outcome, reported
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
 from ethbrake_marl.extensions.reproduction.search import NEAREST
@@ -177,7 +177,9 @@ def reproduce_random_table(settings: Settings) -> Made:
         }.items():
             claims.append(judge("Table III", text, over_seeds(process, *pair)))
     sheets = [printed_sheet(RANDOM_TEST), outcomes_sheet("The random test, as stated", found, least)]
-    return Made(claims, [*sheets, *filter(None, [process_sheet(settings, STATED, episodes)])], notes=[POLICIES])
+    return Made(
+        claims, [*sheets, *filter(None, [process_sheet(settings, STATED, episodes)])], notes=[settings.who_drives]
+    )
 
 
 def reproduce_hybrid_table(settings: Settings) -> Made:

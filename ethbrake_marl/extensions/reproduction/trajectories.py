@@ -12,7 +12,7 @@ from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
 from ethbrake_marl.extensions.reproduction.learning import process
-from ethbrake_marl.extensions.reproduction.made import POLICIES, Drawn, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
 from ethbrake_marl.extensions.reproduction.search import NEAREST
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
@@ -120,7 +120,7 @@ def reproduce_trajectories(settings: Settings) -> Made:
         for (policy, number), record in records.items()
     ]
     numbers = ("Impacts", "First-impact harm", "Total harm", "Last gap 1 (m)", "Last gap 2 (m)")
-    note = f"One world each: no intervals. Exact physics; harm in m²/s². {POLICIES}"
+    note = f"One world each: no intervals. Exact physics; harm in m²/s². {settings.who_drives}"
     sheet = Sheet("How the episodes end", ("Reading", "Scenario", "Policy", *map(Column, numbers)), rows, note)
     return Made(claims_of("Fig. 6", parts, " m"), [sheet], figures)
 

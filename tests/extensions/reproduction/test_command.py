@@ -7,43 +7,62 @@ import pytest
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.extensions.reproduction import items
 from ethbrake_marl.extensions.reproduction.made import Item, Made, Settings
-from ethbrake_marl.extensions.reproduction.verdicts import Verdict
+from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
-from tests.fixtures.commands import Command, Refuse, told_json
+from tests.fixtures.commands import Command, Refuse, rows_of, told_json
 from tests.refused import refused
 
 
 def test_list__has_the_items_in_the_order_of_the_paper(ethbrake: Command) -> None:
-    rows = told_json(ethbrake("reproduce", "gaps", "random-table", "learning-low", "--list", "--json"))
-    assert [row["Item"] for row in rows] == ["learning-low", "random-table", "gaps"]
-    assert [row["Label in the paper"] for row in rows] == ["fig:ppo_sac_low_latency", "Table:Random", ""]
+    rows = told_json(ethbrake("reproduce", "gaps", "learning-low", "random-table", "--list", "--json"))
+    assert [row["Item"] for row in rows] == ["random-table", "learning-low", "gaps"]
+    assert [row["Label in the paper"] for row in rows] == ["Table:Random", "fig:ppo_sac_low_latency", ""]
 
 
 def test_cost__counts_the_trainings_that_are_missing(ethbrake: Command, empty_folder: Path) -> None:
     quick = ethbrake("reproduce", "hybrid-table", "learning-low", "--cost").err
-    assert "to do: 2 items, at most about 16 s of one core; trainings before them about 0.1 min" in quick
-    assert "trainings before them about 18.4 min" in ethbrake("reproduce", "--full", "--cost").err
-    assert "trainings" not in ethbrake("reproduce", "gaps", "--cost").err
+    assert "to do: 2 items, at most about 6 s of one core; trainings before them about 0.1 min" in quick
+    full = ethbrake("reproduce", "hybrid-table", "learning-low", "readings", "--full", "--cost").err
+    assert "3 items, at most about 247 s of one core; trainings before them about 66.8 min" in full  # 2 x 2 x 5 x 200 s
+    assert "about 66.7 min" in ethbrake("reproduce", "learning-high", "--full", "--cost").err
+    assert "about 33.3 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
+    assert "trainings" not in ethbrake("reproduce", "gaps", "trajectories", "--cost").err
     assert not list(empty_folder.iterdir())
 
 
 def test_reproduce__writes_page_figures_and_tables(ethbrake: Command, empty_folder: Path) -> None:
     done = ethbrake("reproduce", "accelerations", "--episodes", "3", "--output", "out", "--json")
     (result,) = told_json(done)
-    assert result["name"] == "accelerations" and result["verdict"]["outcome"] == "differs"
-    assert len(result["comparisons"]) == 8 and len(result["tables"]["Commands of Vehicle 2"]) == 16
+    assert result["name"] == "accelerations" and len(result["tables"]["Commands of Vehicle 2"]) == 8
+    assert [each["outcome"] for each in result["claims"]] == ["differs", "agrees", "agrees", "differs"]
     page = Path("out/README.md").read_text("utf-8")
     assert "Made by `ethbrake reproduce accelerations --quick --episodes 3` on 20" in page
-    assert "](accelerations/accelerations.svg)" in page and "**differs**: of 8 comparisons 3 differ, 5 agree" in page
+    assert f"version {result['version']}, physics {result['physics_digest']})" in page
+    assert "](accelerations/accelerations.svg)" in page and "need `--full`" in page
+    folder = Path("out/accelerations")
     for name in ("accelerations.svg", "accelerations.pdf", "commands-of-vehicle-2.csv", "commands-of-vehicle-2.tex"):
-        assert Path("out/accelerations", name).stat().st_size > 200
+        assert (folder / name).stat().st_size > 200
+    assert [row["The paper"] for row in rows_of(folder / "claims.csv")] == [each["paper"] for each in result["claims"]]
+    assert (
+        (folder / "claims.tex").read_text("utf-8").startswith("\\begin{tabular}{lllll}\n\\toprule\nWhere & The paper")
+    )
     assert done.err.endswith("page: out/README.md\n")
 
 
-def planted(because: str) -> Item:
+def test_policies__of_the_user_drive_and_the_page_says_so(ethbrake: Command, empty_folder: Path) -> None:
+    done = ethbrake("reproduce", "harm-delays", "--policies", "ppo=full_brake", "--output", "out", "--json")
+    ((rows,),) = (result["tables"].values() for result in told_json(done))
+    harm = {row.pop("Strategy"): row for row in rows}
+    assert harm["PPO"] == harm["Non-E"] != harm["SAC"]
+    page = Path("out/README.md").read_text("utf-8")
+    assert "SAC is sac, PPO is full_brake." in page and "shipped" not in page
+    assert "`ethbrake reproduce harm-delays --quick --policies sac=sac,ppo=full_brake` on" in page
+
+
+def planted(why: str) -> Item:
     """An item that needs no time."""
     sheet = Sheet("A table, 1 m/s", ("Who", Column("Harm")), [("PPO | H*", Estimate(1.5, (1.25, 1.75)))], "Of 24.")
-    made = Made([Verdict("w", "agrees", because)], [sheet], notes=["A note."])
+    made = Made([Claim("Fig. 9", "H* is less", "holds", "", "agrees", why)], [sheet], notes=["A note."])
     return Item("gaps", ("Fig:x",), "A title", "What it is.", lambda settings: made, 1.0)
 
 
@@ -51,18 +70,18 @@ def test_page__by_hand_and_results_are_replaced_by_force_alone(tmp_path: Path) -
     settings = Settings(tmp_path / "out", episodes=24)
     items.reproduce(settings, [planted("b")], "a machine")
     text = (tmp_path / "out/README.md").read_text("utf-8")
-    _, rest = text.split("| Item | Verdict | Because |\n| --- | --- | --- |\n")
+    _, rest = text.split("| Where | The paper | Ours, as stated | Ours, nearest reading | Why |\n")
     assert rest == (
-        "| gaps | agrees | w: b |\n\n## A title\n\nWhat it is. In the paper's source: `Fig:x`.\n\n**agrees**: w: b\n\n"
-        "A note.\n\n### A table, 1 m/s\n\n| Who | Harm |\n| --- | ---: |\n| PPO \\| H\\* | 1.50 [1.25, 1.75] |\n\n"
-        "Of 24.\n\n### Comparisons\n\n| Comparison | Verdict | Because |\n| --- | --- | --- |\n| w | agrees | b |\n"
+        "| --- | --- | --- | --- | --- |\n| Fig. 9 | H\\* is less | holds |  | agrees: b |\n\n"
+        "## A title\n\nWhat it is. In the paper's source: `Fig:x`.\n\nA note.\n\n"
+        "### A table, 1 m/s\n\n| Who | Harm |\n| --- | ---: |\n| PPO \\| H\\* | 1.50 [1.25, 1.75] |\n\nOf 24.\n"
     )
     table = tmp_path / "out/gaps/a-table-1-m-s.csv"
     assert table.read_text() == "Who,Harm,Harm_low,Harm_high\nPPO | H*,1.5,1.25,1.75\n"
     with refused("README.md: already exists", AlreadyExists):
         items.reproduce(settings, [planted("c")], "m")
     items.reproduce(settings, [planted("d")], "m", force=True)
-    assert "w: d" in (settings.folder / items.PAGE).read_text()
+    assert "agrees: d" in (settings.folder / items.PAGE).read_text()
 
 
 def test_interrupted__training_makes_no_item(tmp_path: Path, monkeypatch, ethbrake: Command) -> None:
@@ -78,6 +97,10 @@ def test_interrupted__training_makes_no_item(tmp_path: Path, monkeypatch, ethbra
         ("gasp", "unknown item 'gasp'; did you mean 'gaps'?"),
         ("--quick --full", "--quick and --full cannot be combined"),
         ("--episodes 1", "--episodes"),
+        ("--policies dqn=ppo", "--policies dqn=ppo: 'dqn=ppo': must be ppo=AGENT or sac=AGENT"),
+        ("--policies ppo", "'ppo': must be ppo=AGENT"),
+        ("--policies ppo=sac,PPO=ppo", "'PPO=ppo': must be ppo=AGENT or sac=AGENT, each once"),
+        ("--policies sac=full_brek --full", "unknown agent 'full_brek'; did you mean 'full_brake'?"),
     ],
 )
 def test_refusals(refuse: Refuse, line: str, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Learning curves and trainings: measures by hand, tiny trainings."""
+"""Learning curves and trainings: measures by hand, planted runs, tiny trainings by the paper's process."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -8,73 +8,135 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.reproduction import learning
-from ethbrake_marl.extensions.reproduction.learning import HIGH, LOW, STOPPED, Course, Plan, judge, reproduce_curves
+from ethbrake_marl.extensions.reproduction.learning import HIGH, LOW, RANDOM, STOPPED, Course, Plan
 from ethbrake_marl.extensions.reproduction.made import Settings
-from tests.fixtures.commands import TINY_RECIPE
+from ethbrake_marl.extensions.reproduction.readings import STATED
+from ethbrake_marl.extensions.reproduction.tables import process_sheet
+from ethbrake_marl.extensions.reproduction.trajectories import all_records
 
 pytest.importorskip("torch")
 
 
 def course(*returns) -> Course:
-    values = [dict(enumerate(map(float, each))) for each in returns]
+    values = [{100.0 * (k + 1) / len(each): float(value) for k, value in enumerate(each)} for each in returns]
     return Course(values, values)
 
 
 def test_course__by_hand() -> None:
-    one = course([-9.0, -4.0, -2.0, 0.0], [-9.0, -6.0, -4.0, -2.0])
-    assert one.last_returns.tolist() == [0.0, -2.0]
-    assert one.spread.tolist() == pytest.approx([2.0**0.5, 2.0**0.5])  # of the second half
-    assert course(range(20)).last_returns.tolist() == [18.5]  # the last tenth
+    two = course([-10.0, -4.0, -2.0, 0.0], [-10.0, -6.0, -4.0, -2.0])
+    assert two.last.tolist() == [0.0, -2.0] and two.rise.tolist() == [10.0, 8.0]
+    assert two.converged.tolist() == [100.0, 100.0]  # at -1 and -2.8
+    assert two.unrest.tolist() == two.spread.tolist() == pytest.approx([2.0**0.5, 2.0**0.5])  # of the second half
+    assert course(range(20)).last.tolist() == [18.5]  # the last tenth
+    assert course([0.0, 5.0, 9.1, 9.0, 10.0]).converged.tolist() == [60.0]
 
 
-def test_verdicts__compare_the_papers_two_recipes_at_both_delays() -> None:
-    high = {"ppo-paper": course([-9.0] * 4, [-9.1] * 4), "sac-paper": course([-8.0] * 4, [-8.1] * 4)}
-    low = {"ppo-paper": course([-1.0] * 4, [-1.01] * 4), "sac-paper": course([-2.0] * 4, [-2.5] * 4)}
-    higher, spread, others = judge(high, low)
-    assert higher.outcome == "agrees" and "holds in 2 of 2" in higher.because
-    assert spread.outcome == "differs" and "holds in 1 of 2; not so: ppo-paper, 0.064" in spread.because
-    assert others.outcome == "not run"
-    assert judge(low, high)[0].outcome == "differs"
-    assert {each.outcome for each in judge(high, {"ppo-paper": low["ppo-paper"]})} == {"not run"}
+def runs(*returns, apart: float = 0.001) -> Course:
+    """Three seeds, whose returns are this far apart."""
+    return course(*(np.array(returns) + apart * seed for seed in range(3)))
 
 
-def test_plans__are_of_shipped_recipes_and_scenarios() -> None:
-    for plans in learning.GROUPS.values():
+def test_statements__by_planted_courses() -> None:
+    high = {"SAC": runs(-90, -22, -21, -20, -19, -20, apart=0.002), "PPO": runs(-90, -40, -30, -21, -21, -21)}
+    three = course([-90, -40, -30, -10, -10, -10.1], [-90, -40, -30, -12, -12, -12.1], [-90, -40, -30, -14, -14, -14.2])
+    low = {"SAC": runs(-90, -10, -10, -8, -12, -8), "PPO": three}  # SAC is at nine tenths sooner, and restless
+
+    def outcomes(delay: str, high: dict[str, Course], low: dict[str, Course]) -> list[str]:
+        claims = learning.judged(delay, {HIGH: high, LOW: low})
+        assert [each.paper for each in claims] == [*learning.STATEMENTS[delay]]
+        assert {each.where for each in claims} == {learning.FIGURE[delay]}
+        return [each.outcome for each in claims]
+
+    assert outcomes(HIGH, high, low) == ["agrees"]  # 1 apart, of a rise by 69
+    assert outcomes(HIGH, {**high, "PPO": runs(-90, -40, -31, -31)}, low) == ["differs"]  # 11 apart, of 59
+    nearer = {**high, "SAC": runs(-90, -22, -21, -20, -19, -20, apart=0.0005)}
+    assert outcomes(LOW, nearer, low) == ["agrees"] * 4
+    assert outcomes(LOW, high, low) == ["agrees", "agrees", "agrees", "differs"]
+    assert outcomes(LOW, low, high) == ["differs", "agrees", "agrees", "differs"]
+    assert outcomes(LOW, high, {"SAC": low["PPO"], "PPO": low["SAC"]})[:3] == ["agrees", "differs", "differs"]
+
+
+def plant(run: Path, end: float, status: str = "finished") -> None:
+    """A run whose harm falls to ``end``; its table has the return in every row, and the harm in some."""
+    run.mkdir(parents=True)
+    (run / "run.json").write_text(f'{{"status": "{status}"}}')
+    rows = [f"{500 * k},{-9.0 + k},{'' if k % 2 else end + 4.0 - k}" for k in range(1, 5)]
+    (run / "progress.csv").write_text("\n".join([f"steps,{learning.RETURN},{learning.HARM}", *rows]))
+
+
+def test_curves__have_the_columns_of_the_runs(tmp_path: Path) -> None:
+    full = Settings(tmp_path, full=True)
+    for delay in (HIGH, LOW):
+        for number, plan in enumerate(learning.GROUPS[delay]):
+            for seed, run in enumerate(learning.runs_of(tmp_path, delay, plan)):
+                plant(run, 10.0 * number + seed)
+    made = learning.reproduce_curves(HIGH, full)
+    assert [row[:2] for row in made.sheets[0].rows] == [("PPO", 5), ("SAC", 5)]
+    assert [[cell.value for cell in row[2:]] for row in made.sheets[0].rows] == [[2.0, -5.0], [12.0, -5.0]]
+    returns, harm = made.figures[0].figure.axes
+    assert returns.lines[0].get_xdata().tolist() == [25.0, 50.0, 75.0, 100.0]
+    assert harm.lines[1].get_ydata().tolist() == [14.0, 12.0] and harm.get_xlabel() == "Training progress (%)"
+    (learning.runs_of(tmp_path, LOW, learning.GROUPS[LOW][1])[4] / "run.json").write_text('{"status": "interrupted"}')
+    assert [*learning.trained(tmp_path, LOW)] == ["ppo-paper"]  # one seed of five is not finished
+    assert learning.seconds_left(tmp_path, [HIGH, LOW]) == 200.0
+    for settings in (full, Settings(tmp_path)):
+        missing = learning.reproduce_curves(HIGH, settings)
+        assert [each.outcome for each in missing.claims] == ["not run"] and not missing.figures
+
+
+def test_plans__are_of_the_papers_map_and_shipped_recipes() -> None:
+    for group, plans in learning.GROUPS.items():
         for plan in plans:
             recipe, _ = eb.load_recipe(plan.recipe), eb.load_scenario(plan.scenario)
-            assert plan.decisions < recipe.total_steps and plan.seeds in (1, 3)
+            expected = (1, False, 100_000) if group == STOPPED else (5, True, None)
+            assert (plan.seeds, plan.mapped, plan.decisions) == expected
+            assert plan.decisions is None or plan.decisions < recipe.total_steps / 10
 
 
-def test_trainings__are_done_once_continue_and_give_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+TINY = {"n_steps": 16, "batch_size": 64, "n_epochs": 1, "total_steps": 1024, "network": {"policy": [8], "value": [8]},
+        "evaluation": {"every_updates": 4, "worlds": 10, "seed": 7}}  # fmt: skip
+
+
+@pytest.fixture
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
     load = eb.load_recipe
-    monkeypatch.setattr(eb, "load_recipe", lambda name: load({**TINY_RECIPE, "n_steps": 128, "name": name}))
-    plans = {group: (Plan("paper-delay-high", "ppo-paper", 2048, 1, 2, 128),) for group in (HIGH, LOW)}
-    monkeypatch.setattr(learning, "GROUPS", {STOPPED: (Plan("paper-random", "ppo", 2048, 1, 1, 16),), **plans})
-    tiny = Settings(tmp_path, full=True, episodes=5)
-    assert learning.seconds_left(tiny.folder, [HIGH, LOW]) == 4 * 16.0
+    monkeypatch.setattr(eb, "load_recipe", lambda name: load("ppo-paper").replace(name=name, **TINY))
+    stopped, process = (
+        Plan("paper-random", "ppo", 1, 6.0, 512, mapped=False),
+        Plan("paper-random", "ppo-paper", 2, 200.0),
+    )
+    monkeypatch.setattr(learning, "GROUPS", {STOPPED: (stopped,), RANDOM: (process,)})
+    return Settings(tmp_path, full=True, episodes=20)
 
+
+def test_trainings__stop_and_continue(tiny: Settings) -> None:
     def stop(progress: eb.Progress) -> None:
         if progress.done:
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
         learning.train(replace(tiny, tell=stop), [STOPPED])
-    assert learning.trained(tiny.folder, STOPPED) == {}
-    assert learning.train(tiny, [STOPPED, HIGH])
+    assert learning.trained(tiny.folder, STOPPED) == {} and learning.seconds_left(tiny.folder, [STOPPED]) == 6.0
+    assert learning.train(tiny, [STOPPED]) and learning.seconds_left(tiny.folder, [STOPPED]) == 0.0
     agent = eb.make_agent(learning.unconverged(tiny.folder), scenario="paper-random")
-    assert agent.policy.manifest.steps == 2048
-    runs = learning.trained(tiny.folder, HIGH)["ppo-paper"]
-    before = [(run / "run.json").stat().st_mtime_ns for run in runs]
-    assert learning.seconds_left(tiny.folder, [HIGH, LOW]) == 2 * 16.0
-    assert learning.train(tiny, [HIGH]) and before == [(run / "run.json").stat().st_mtime_ns for run in runs]
-    made = reproduce_curves(HIGH, tiny)
-    assert [drawn.stem for drawn in made.figures] == ["learning-high-paper"]
-    name, seeds, decisions, kept, last, _ = made.sheets[0].rows[0]
-    assert (name, seeds, decisions) == ("ppo-paper", 2, "2,048")
-    final = [learning.column(run, learning.HARM)[2048] for run in runs]
-    assert last.value == pytest.approx(np.mean(final)) and kept.value <= last.value
-    assert final[0] != final[1]  # other seeds
-    (runs[1] / "run.json").write_text('{"status": "interrupted"}')
-    assert learning.trained(tiny.folder, HIGH) == {}  # one seed of two is not finished
-    nothing = reproduce_curves(HIGH, replace(tiny, full=False))
-    assert nothing.verdict.outcome == "not run" and not nothing.figures
+    assert agent.policy.manifest.steps == 512
+
+
+@pytest.mark.filterwarnings("error")
+def test_process__is_trained_once_in_the_papers_map_and_shown(tiny: Settings) -> None:
+    assert process_sheet(tiny, STATED, 20) is None
+    assert learning.train(tiny, [RANDOM])
+    seeds = learning.trained(tiny.folder, RANDOM)["ppo-paper"]
+    before = [(run / "run.json").stat().st_mtime_ns for run in seeds]
+    assert learning.train(tiny, [RANDOM]) and before == [(run / "run.json").stat().st_mtime_ns for run in seeds]
+    mapped = eb.load_scenario("paper-random").replace(physics="paper-map")
+    for run in seeds:
+        assert '"physics": "paper-map"' in (run / "config.json").read_text("utf-8")
+    specs = [f"policy@{run / 'policy'}" for run in seeds]
+    assert learning.process(tiny) == {"PPO": specs} and learning.process(replace(tiny, full=False)) == {}
+    result = eb.evaluate(mapped, specs, episodes=20)
+    harm = [result[spec]["first_impact_harm"].mean() for spec in specs]
+    assert harm[0] != harm[1]  # other seeds
+    (row,) = (row for row in process_sheet(tiny, STATED, 20).rows if row[0] == "PPO")
+    assert row[2].value == pytest.approx(np.mean(harm))
+    assert [*all_records(replace(tiny, policies={"PPO": "coast"}))["paper's process"]] == [("PPO", 1), ("PPO", 2)]

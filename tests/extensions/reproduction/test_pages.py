@@ -1,19 +1,20 @@
-"""The pages about the reproduction: their numbers are those of the code."""
+"""The pages about the reproduction: their numbers and claims are those of today's code."""
 
 import re
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-import ethbrake_marl as eb
-from ethbrake_marl.agents.pairwise import pairwise
-from ethbrake_marl.evaluation.statistics import mean, rate
+from ethbrake_marl import __version__
+from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.report.style import picture_bytes
+from ethbrake_marl.extensions.reproduction import curves, strategies, tables
 from ethbrake_marl.extensions.reproduction.items import ITEMS
-from ethbrake_marl.extensions.reproduction.readings import NON_ETHICAL, READINGS, drive
-from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
-from tests.docs.printed import rows as table_of
+from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Settings
+from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED, reported
+from ethbrake_marl.extensions.reproduction.readings import STATED
+from ethbrake_marl.extensions.reproduction.search import NEAREST
+from ethbrake_marl.extensions.reproduction.verdicts import claims_sheet
+from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.site import DOCS, load
 
 PAGE = (DOCS / "extensions" / "reproduction.md").read_text("utf-8")
@@ -39,33 +40,30 @@ def test_map__example_of_the_page_runs_and_prints_its_figures(capsys: pytest.Cap
     assert "23.48 m²/s² with steps of 0.1 s (85.4 %" in " ".join(PAGE.split())
 
 
-def committed(heading: str, agent: str) -> list[str]:
-    """An agent's row in the table below a heading of the results page, without intervals."""
-    (row,) = (row for row in table_of("results/reproduction", heading) if row[0] == agent)
-    return [cell.split(" [")[0] for cell in row[1:]]
+def claims_of(page: str) -> list[str]:
+    """The rows of the table of claims of a page, as Markdown."""
+    table = page.split("| Where | The paper | Ours, as stated | Ours, nearest reading | Why |\n")[1]
+    return table.split("\n\n")[0].splitlines()[1:]
 
 
-def test_results__are_as_committed() -> None:
-    for name, heading, predicted in (("paper-distance", "### Speeds 20, 18, 20 m/s, as stated", "3.07"),
-                                     ("paper-random", "### Speeds 18 to 22 m/s, as stated", "9.38")):  # fmt: skip
-        assert f"{pairwise(eb.load_scenario(name).sample(5_000, 7), 2).harm.mean():.2f}" == predicted
-        assert committed(heading, "E-V2X-BM, realised")[3] == predicted
-    for reading, heading in zip(READINGS, ("### As stated", "### Vehicle 2 acts at 0.2 s"), strict=True):
-        own = drive(reading.scenario("paper-random"), {NON_ETHICAL: "full_brake"}, 10_000)[NON_ETHICAL]
-        told = PERCENT.show(rate(own["collided"])).value, f"{mean(own['first_impact_harm']).value:.2f}"
-        assert tuple(committed(heading, NON_ETHICAL)[:2]) == told
-    scenario = eb.load_scenario("paper-distance")
-    groups = np.digitize(scenario.sample(5_000, 7).gaps_m.sum(axis=1), (12.0, 14.0, 16.0, 18.0))
-    harm = drive(scenario, {NON_ETHICAL: "full_brake"}, 5_000)[NON_ETHICAL]["first_impact_harm"]
-    told = committed("### Harm by total distance, as stated", NON_ETHICAL)
-    assert told == [f"{harm[groups == group].mean():.2f}" for group in range(5)]
+def test_results__have_every_claim_that_the_code_makes_and_no_other(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strategies, "process", lambda settings: {name: [spec] for name, spec in SHIPPED.items()})
+    for module in (curves, tables):
+        monkeypatch.setattr(module, "unconverged", lambda folder: "ppo-obstacle")
+    settings = Settings(tmp_path, episodes=20)
+    made = [claim for item in ITEMS for claim in item.make(settings).claims]
+    committed = [re.split(r" ?\| ?", row)[1:3] for row in claims_of(RESULTS)]
+    assert committed == [[each.where, each.paper.replace("H*", r"H\*")] for each in made]
 
 
-def test_pages__show_every_item_and_figures_that_exist() -> None:
-    assert [line for line in RESULTS.splitlines() if line.startswith("## ")] == [f"## {item.title}" for item in ITEMS]
+def test_results__are_those_of_this_version_and_the_non_ethical_row_of_today() -> None:
+    assert f"version {__version__}, physics {physics_digest()})" in " ".join(RESULTS.split())
+    stated, nearest = ({NON_E: reported(NON_E, reading, PAPER_EPISODES)} for reading in (STATED, NEAREST))
+    own = tables.number_claims("Table III", RANDOM_TEST[:1], stated, nearest, 0.0 * stated[NON_E][1])
+    rows = claims_sheet(own).markdown().splitlines()[2:]
+    assert rows == [row for row in claims_of(RESULTS) if row.startswith(f"| Table III | {NON_E}, ")]
+
+
+def test_pages__name_every_figure_and_table_of_the_paper() -> None:
     for label in (label for item in ITEMS for label in item.labels):
-        assert f"`{label}`" in PAGE
-    for name in re.findall(r"\]\(\.\./figures/([^)]+)\)", RESULTS + PAGE):
-        assert (DOCS / "figures" / name).is_file()
-    shown = {Path(name).name for name in re.findall(r"figures/(reproduction-[^)]+)\)", RESULTS)}
-    assert {path.name for path in (DOCS / "figures").glob("reproduction-*")} == shown
+        assert f"`{label}`" in RESULTS
