@@ -55,7 +55,7 @@ def test_policies__of_the_user_drive_and_the_page_says_so(ethbrake: Command, emp
     harm = {row.pop("Strategy"): row for row in rows}
     assert harm["PPO"] == harm["Non-E"] != harm["SAC"]
     page = Path("out/README.md").read_text("utf-8")
-    assert "SAC is sac, PPO is full_brake." in page and "shipped" not in page
+    assert "PPO is full_brake, SAC is sac." in page and "shipped" not in page
     assert "`ethbrake reproduce harm-delays --quick --policies sac=sac,ppo=full_brake` on" in page
 
 

@@ -1,6 +1,5 @@
 """The paper's fixed-step map: impacts by hand, a slow reference, figures of version 0.5, reward, what it refuses."""
 
-
 import numpy as np
 import pytest
 
