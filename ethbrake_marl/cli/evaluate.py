@@ -78,8 +78,8 @@ def evaluate_command(
                 )
         if report and (physics := chosen.change_scenario(scenario).physics) is not None:
             raise InvalidInput(
-                f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave --report"
-                " out"
+                f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave"
+                " --report out"
             )
         count = (GROUP_EPISODES if names else 10_000) if episodes is None else episodes
         every = {name: _compared(out, name, chosen, agents, count, seed, jobs) for name in names or [scenario]}
