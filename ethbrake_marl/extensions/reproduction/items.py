@@ -100,7 +100,7 @@ LEAD = (
     " nearest together (found by a search, so a hypothesis). *Why* begins with the verdict on the row as stated:"
     " agrees, differs because, cannot be because (with a proof), undecided (too few worlds)."
 )
-QUICK = "The figures 2 and 3, the paper's process and the search over the readings need `--full`."
+QUICK = "Figures 2 and 3, the paper's own process and the search over the readings need --full."
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:

@@ -38,7 +38,7 @@ def test_reproduce__writes_page_figures_and_tables(ethbrake: Command, empty_fold
     page = Path("out/README.md").read_text("utf-8")
     assert "Made by `ethbrake reproduce accelerations --quick --episodes 3` on 20" in page
     assert f"version {result['version']}, physics {result['physics_digest']})" in page
-    assert "](accelerations/accelerations.svg)" in page and "need `--full`" in page
+    assert "](accelerations/accelerations.svg)" in page and "need --full" in page
     folder = Path("out/accelerations")
     for name in ("accelerations.svg", "accelerations.pdf", "commands-of-vehicle-2.csv", "commands-of-vehicle-2.tex"):
         assert (folder / name).stat().st_size > 200
