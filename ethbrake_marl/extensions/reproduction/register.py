@@ -108,8 +108,8 @@ def reproduce_gaps(settings: Settings) -> Made:
     collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in DEPENDS]
     note = (
         f"{episodes:,} worlds. Distance: root mean square of ours / printed - 1 over the eight numbers. Then mean harm"
-        f" (m²/s²) with its 95 % interval, and the collision rate. {settings.who_drives} They are not trained anew for an"
-        " alternative."
+        f" (m²/s²) with its 95 % interval, and the collision rate. {settings.who_drives} They are not trained anew for"
+        " an alternative."
     )
     far = replace(PERCENT, heading="Distance")
     columns: list[Column | str] = ["Quantity", "Value", far, *map(Column, DEPENDS), *collisions]

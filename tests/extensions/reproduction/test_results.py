@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.extensions.report.paper_rows import PaperRow
 from ethbrake_marl.extensions.reproduction import curves, strategies, tables, trajectories
 from ethbrake_marl.extensions.reproduction.curves import DISTANCE, EXPECTED, PROVEN
 from ethbrake_marl.extensions.reproduction.made import Made, Settings
@@ -14,7 +15,6 @@ from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, HYBRID_P
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import COUPLED, PREDICTED
 from ethbrake_marl.extensions.reproduction.verdicts import Outcome, judge_statement
-from ethbrake_marl.extensions.report.paper_rows import PaperRow
 
 SETTINGS = Settings(Path("unused"), episodes=100)
 
@@ -49,6 +49,13 @@ def test_strategies__have_the_numbers_of_version_0_5(reading: Reading) -> None:
         assert (PREDICTED in own) == (predicted is not None)
         assert predicted is None or own[PREDICTED].mean() == pytest.approx(predicted, **close)
     assert all((least <= own["first"] + 1e-9).all() for own in found.values()) and least.mean() > 0.0
+
+
+def test_hybrid__with_the_simulated_bound_always_takes_the_better_one() -> None:
+    found = strategies.strategies(STATED, 100, {"policy": "ppo-obstacle"})
+    alone, baseline, hybrid = (found[name]["first"] for name in ("policy", COUPLED, "Hybrid policy, simulated H*"))
+    assert np.array_equal(hybrid, np.minimum(alone, baseline))
+    assert (hybrid < alone).any() and (hybrid < baseline).any()
 
 
 def outcomes(**harm: float) -> dict[str, dict[str, np.ndarray]]:
