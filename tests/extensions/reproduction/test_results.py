@@ -51,6 +51,13 @@ def test_strategies__have_the_numbers_of_version_0_5(reading: Reading) -> None:
     assert all((least <= own["first"] + 1e-9).all() for own in found.values()) and least.mean() > 0.0
 
 
+def test_hybrid__with_the_simulated_bound_always_takes_the_better_one() -> None:
+    found = strategies.strategies(STATED, 100, {"policy": "ppo-obstacle"})
+    alone, baseline, hybrid = (found[name]["first"] for name in ("policy", COUPLED, "Hybrid policy, simulated H*"))
+    assert np.array_equal(hybrid, np.minimum(alone, baseline))
+    assert (hybrid < alone).any() and (hybrid < baseline).any()
+
+
 def outcomes(**harm: float) -> dict[str, dict[str, np.ndarray]]:
     """What strategies do in 4 worlds with this harm; names of the paper without blanks."""
     names = {"NonE": NON_E, "EV2X": E_V2X_BM, "HSAC": "Hybrid SAC", "HPPO": HYBRID_PPO}
