@@ -115,7 +115,7 @@ def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
     }
 
 
-NAMES = {"sac-paper": "SAC", "ppo-paper": "PPO"}
+NAMES = {"ppo-paper": "PPO", "sac-paper": "SAC"}
 RETURN, HARM = "rollout/ep_rew_mean", "eval/first_impact_harm"  # columns of progress.csv
 ALIKE, RISEN = 0.1, 0.9  # parts of the rise of a return: what counts as nearly identical, and as converged
 
