@@ -76,6 +76,10 @@ def evaluate_command(
                 raise InvalidInput(
                     f"{option}: cannot be used with {scenario}, a group of {len(names)} scenarios; name one scenario"
                 )
+        if report and (physics := chosen.change_scenario(scenario).physics) is not None:
+            raise InvalidInput(
+                f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
+            )
         count = (GROUP_EPISODES if names else 10_000) if episodes is None else episodes
         every = {name: _compared(out, name, chosen, agents, count, seed, jobs) for name in names or [scenario]}
         if report and output is not None:

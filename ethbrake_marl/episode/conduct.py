@@ -23,6 +23,7 @@ def drove(before: State, step: Step, after: State) -> Floats:
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
     """Return the term still_moving, [n]: -1 for an end at the horizon with a vehicle in motion."""
+    check_exact(before, "the term still_moving")
     return 0.0 - step.out[TRUNCATED]
 
 

@@ -180,26 +180,34 @@ class State(NamedTuple):
 
     def harm(self, count: Count = "first") -> Floats:
         """Return the harm of each world so far, [n] m2/s2, as ``count`` says (``episode.counts``)."""
+        self._check_count(count)
         out = np.empty(self.n)
         _harm(self.line, weights_of(count), out)
         return out
 
     def pair_harm(self, count: Count = "first") -> Floats:
         """Return the harm of each pair of neighbours so far, [n, N - 1] m2/s2."""
+        self._check_count(count)
         return pair_amounts(self.line, count)[:, 1:-1]
 
     def borne_harm(self, count: Count = "first") -> Floats:
         """Return the harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
+        self._check_count(count)
         own, out = own_amounts(self.line, count), np.empty((self.n, self.vehicles))
         split_harm(pair_amounts(self.line, count) - own, self.car[:, MASS], out)
         return out + own[:, :-1]
+
+    def _check_count(self, count: Count) -> None:
+        if PHYSICS in self.memories and weights_of(count)[2:].any():  # more than harm of impacts
+            check_exact(self, "the honest cost")
 
 
 def check_exact(state: State, what: str) -> None:
     """Raise ``InvalidInput`` if the impacts of these worlds are not exact: ``what`` needs them."""
     if PHYSICS in state.memories:
         raise InvalidInput(
-            f"{what} needs exact impacts, and these worlds have another physics (key physics of their scenario)"
+            f"{what} needs exact impacts, and these worlds have another physics (key physics of their scenario);"
+            " physics=null has exact impacts"
         )
 
 

@@ -35,7 +35,7 @@ from ethbrake_marl.episode.counts import ROWS, own_amounts, pair_amounts
 from ethbrake_marl.episode.functions import called, check_finite, described
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.play import descend
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Rules, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
@@ -101,7 +101,8 @@ BUILT_IN = {  # name -> (unit, meaning)
 
 
 def collision(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Return the term collision, [n]; ``params`` are ``RewardParams``."""
+    """Return the term collision, [n]; ``params`` are ``RewardParams``. Another physics brings its own."""
+    check_exact(before, "the sum of the term collision")
     if isinstance(params.k_energy, float):
         return -params.k_energy * step.total_harm
     return -(pair_energies(params, after.vehicles) * (after.line[:, TOTAL] - before.line[:, TOTAL])).sum(axis=1)

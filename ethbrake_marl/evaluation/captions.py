@@ -47,7 +47,8 @@ def caption(parameters: Mapping[str, Any]) -> str:
             parts.append(f"{symbol}{STAY}={STAY}{value}{f'{STAY}{unit}' if unit else ''}")
     seed = "" if parameters.get("seed") is None else f", seed {parameters['seed']}"
     worlds = f"{count_of(parameters['count'], 'world')}{seed}{by_recording(parameters.get('recordings', 0))}"
-    return f"{parameters['scenario']}: {worlds}; {'; '.join(parts)}"
+    physics = f" (physics: {parameters['physics']})" if "physics" in parameters else ""
+    return f"{parameters['scenario']}{physics}: {worlds}; {'; '.join(parts)}"
 
 
 def by_recording(recordings: int) -> str:

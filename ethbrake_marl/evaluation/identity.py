@@ -36,7 +36,8 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
     """Return what a result should say of a ``Scenario``, and of the seed of its worlds; for ``evaluate(about=...)``."""
     content = json.dumps(scenario.content(without=WORDS), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
-    return {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
+    about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
+    return about if scenario.physics is None else {**about, "physics": scenario.physics}
 
 
 def versions() -> dict[str, str]:

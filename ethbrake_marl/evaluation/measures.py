@@ -116,7 +116,7 @@ def collided(game: Game, alert: State, last: State) -> Given:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> Given:
-    """Return the harm of the line, and what each vehicle bears of it. The honest cost needs exact impacts."""
+    """Return the harm of the line, and what each vehicle bears of it; no honest cost where impacts are not exact."""
     if count == "honest" and PHYSICS in last.memories:
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}

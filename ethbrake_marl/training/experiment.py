@@ -92,15 +92,15 @@ def run_experiment(
     All compared agents minimise the count of harm that is trained for (``reward.harm_count``). Ctrl-C stops the
     training after the current update; what was learned so far is compared. A second Ctrl-C raises
     ``KeyboardInterrupt``; the folder keeps the policy. ``run.json`` records how the run ended. The other arguments are
-    those of ``train`` and ``evaluate``, and so are the errors. Raises ``InvalidInput`` for a scenario with another
-    physics, in which there is no shield to compare with.
+    those of ``train`` and ``evaluate``, and so are the errors.
 
-    Returns the experiment, and the tables and the text of the report.
+    Returns the experiment, and the tables and the text of the report. Raises ``InvalidInput``, before any work, for a
+    scenario without exact impacts, which shields and reports need.
     """
     if scenario.physics is not None:
         raise InvalidInput(
-            f"scenario {scenario.name!r}: physics = {scenario.physics}: ethbrake run compares with shields, which need"
-            " exact impacts; use ethbrake train and ethbrake evaluate"
+            f"scenario {scenario.name!r}: ethbrake run compares shields, which need exact impacts, and physics:"
+            f" {scenario.physics} has none; use ethbrake train and ethbrake evaluate"
         )
     started, tell = time.monotonic(), on_progress or (lambda progress: None)
     shown: Report = report or Tables()

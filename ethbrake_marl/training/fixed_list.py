@@ -27,9 +27,9 @@ OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not
 def measure_on_list(training: Training) -> Evaluate:
     """Return the function that measures policies on the fixed list of worlds of the recipe's key ``evaluation``.
 
-    Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (where impacts are
-    exact), ``collision_rate``, ``horizon_rate`` (a vehicle still moves at the horizon) and, where a learner's objective
-    is not the harm of the line, the ``objective`` of each learner (``objective_vehicle_2``) and the mean of these.
+    Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (of exact impacts only),
+    ``collision_rate``, ``horizon_rate`` (a vehicle still moves at the horizon) and, where a learner's objective is not
+    the harm of the line, the ``objective`` of each learner (``objective_vehicle_2``) and the mean of these.
     """
     plan, (scenario, game) = training.recipe.evaluation, open_game(training.scenario)
     worlds = scenario.sample(plan.worlds, plan.seed)
@@ -47,9 +47,8 @@ def metrics_of(training: Training, last: State) -> dict[str, float]:
     """Return the metrics of episodes whose last state is ``last``."""
     reward, scenario = training.recipe.reward, training.scenario
     counts = sorted(COLUMN, key=lambda count: count != reward.harm_count)  # what is counted comes first
-    if PHYSICS in last.memories:
-        counts.remove("honest")
-    metrics = {COLUMN[count]: mean(last.harm(count)) for count in counts}
+    known = [count for count in counts if count != "honest" or PHYSICS not in last.memories]
+    metrics = {COLUMN[count]: mean(last.harm(count)) for count in known}
     metrics["collision_rate"] = float(last.collided.mean())
     metrics["horizon_rate"] = float((~last.at_rest).mean())
     objectives = objectives_of(reward.objective or scenario.objective, scenario.vehicles)

@@ -28,9 +28,8 @@ def check_whole(scenario: Scenario) -> None:
     _check_channel(scenario)
     _check_roles(scenario)
     if scenario.physics is not None:
-        names = [*PHYSICS]
-        right = f"{suggestion(scenario.physics, names)}; known: {', '.join(names)}".removeprefix("; ")
-        require(scenario.physics in names, ("physics",), scenario.physics, right)
+        known = scenario.physics in PHYSICS
+        require(known, ("physics",), UNSHOWN, "" if known else str(PHYSICS.unknown(scenario.physics)))
         PHYSICS[scenario.physics].check(scenario)
     ends = world_values(scenario, scenario.ends)
     low, high = ({key: each[row : row + 1] for key, each in ends.items()} for row in (0, 1))

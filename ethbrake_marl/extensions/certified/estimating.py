@@ -24,7 +24,7 @@ from ethbrake_marl.agents.drive import ESTIMATED, Agent
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines, without_channel
@@ -152,6 +152,7 @@ class EstimatedEV2XBM:
 
     def begin(self, alert: State, body: int) -> Estimate:
         """Return the median line, and no command."""
+        check_exact(alert, self.name)
         if body not in self.lines:
             self.lines[body] = Lines.of(self.scenario, body, corners=False)
         median = self.lines[body].at_alert(alert, alert)._replace(memories={})

@@ -133,10 +133,13 @@ class Scene(NamedTuple):
 
 
 class Motion:
-    """One world from one decision to the next. Every moment of it is computed with the physics of the episode."""
+    """One world from one decision to the next. Every moment of it is computed with the exact physics.
+
+    Raises ``InvalidInput`` for worlds with another physics.
+    """
 
     def __init__(self, game: Game, state: State, row: int) -> None:
-        check_exact(state, "a picture of the motion")
+        check_exact(state, "a picture")
         self.game, self.row, self.road_m = game, row, whole_road(state, row)
         self.line, self.car, self.wanted = state.line[row].copy(), state.car[row], state.wanted[row].copy()
         self.start_s = self.until_s = float(state.time_s[row])

@@ -40,7 +40,7 @@ def curves_figure(
     """Draw curves with a band between the ends of their intervals, in a panel for each title.
 
     Args:
-        panels: title -> label of a curve -> curve.
+        panels: title -> label of a curve -> curve. The first panel, whose labels the legend has, has all of them.
         x_label: label of the horizontal axes.
         caption: text below the figure.
         lines: title -> label -> value of a horizontal line.
@@ -48,13 +48,14 @@ def curves_figure(
 
     """
     figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
+    labels = [*dict.fromkeys(label for curves in panels.values() for label in curves)]
     for axes, (title, curves) in zip(every, panels.items(), strict=True):
-        for number, (label, curve) in enumerate(curves.items()):
-            style, x = series_style(number), list(curve)
+        for label, curve in curves.items():
+            style, x = series_style(labels.index(label)), list(curve)
             axes.plot(x, [each.value for each in curve.values()], label=label_text(label), **style)
             low, high = zip(*(each.ends for each in curve.values()), strict=True)
             band(axes, x, low, high, style)
-        for number, (label, value) in enumerate((lines or {}).get(title, {}).items(), len(curves)):
+        for number, (label, value) in enumerate((lines or {}).get(title, {}).items(), len(labels)):
             style = series_style(number) | {"marker": ""}
             axes.axhline(value, label=label_text(label), **style)
         axes.set(title=title, xlabel=x_label)
@@ -64,4 +65,4 @@ def curves_figure(
         if axes.dataLim.ymin >= 0.0:
             axes.set_ylim(bottom=0.0)
     every[0].set_ylabel(y_label)
-    return finish(figure, caption, every[0], columns=5)
+    return finish(figure, caption, every[0], columns=5 if len(panels) > 1 else 3)

@@ -73,6 +73,8 @@ def reproduce_command(
         if results is None:
             out.interrupted(f"interrupted; {REMAINS}")
         out.result(items.plain(results), items.overview(results))
+        if not full:
+            out.note(items.QUICK)
         out.note(f"page: {output / items.PAGE}")
 
 

@@ -22,7 +22,7 @@ from ethbrake_marl.extensions.reproduction.learning import (
     seconds_left,
     train,
 )
-from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Item, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Drawn, Item, Made, Settings
 from ethbrake_marl.extensions.reproduction.register import reproduce_gaps
 from ethbrake_marl.extensions.reproduction.search import SEARCH_S, reproduce_search
 from ethbrake_marl.extensions.reproduction.tables import reproduce_hybrid_table, reproduce_random_table
@@ -100,7 +100,7 @@ LEAD = (
     " nearest together (found by a search, so a hypothesis). *Why* begins with the verdict on the row as stated:"
     " agrees, differs because, cannot be because (with a proof), undecided (too few worlds)."
 )
-QUICK = "The figures 2 and 3, the paper's process and the search over the readings need `--full`."
+QUICK = "Figures 2 and 3, the paper's own process and the search over the readings need --full."
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
@@ -143,7 +143,8 @@ def reproduce(
     for number, item in enumerate(items):
         settings.tell(Progress(f"items: {item.name}", number, len(items)))
         results[item] = made = item.make(settings)
-        write_item(folder / item.name, made)
+        write_item(folder / item.name, made.sheets, made.figures)
+    write_item(folder, [overview(results)])
     today = datetime.now(UTC).date().isoformat()
     made_by = f"`{command(settings, items)}` on {today} ({machine}; version {__version__}, physics {physics_digest()})"
     write_output(folder / PAGE, page(made_by, results, settings).encode(), force=True)
@@ -159,13 +160,14 @@ def command(settings: Settings, items: Sequence[Item]) -> str:
     return " ".join(["ethbrake reproduce", *names, "--full" if settings.full else "--quick", *fewer, *policies])
 
 
-def write_item(place: Path, made: Made) -> None:
+def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[Drawn] = ()) -> None:
     """Write figures as SVG and PDF, tables as CSV and LaTeX."""
-    place.mkdir(parents=True, exist_ok=True)
-    for drawn in made.figures:
+    if figures or sheets:
+        place.mkdir(parents=True, exist_ok=True)
+    for drawn in figures:
         for ending in (".svg", ".pdf"):
             write_picture(place / f"{drawn.stem}{ending}", drawn.figure, force=True)
-    for sheet in (*made.sheets, *([claims_sheet(made.claims)] if made.claims else [])):
+    for sheet in sheets:
         stem = re.sub(r"[^a-z0-9]+", "-", sheet.title.lower()).strip("-") or "claims"
         write_output(place / f"{stem}.csv", sheet.csv().encode(), force=True)
         write_output(place / f"{stem}.tex", f"{sheet.latex()}\n".encode(), force=True)

@@ -16,10 +16,14 @@ where f(n) is its speed after the impacts of sample n. Where the gap of a pair i
 * Before the first decision worlds move exactly, and have no impact, as the paper assumes.
 * The command of a step is that in force at its first sample (zero-order hold).
 * ``0 <= v <= v_max`` is a constraint on u in the paper: commands are limited so that the speed keeps it at the next
-  sample. An impact can leave a negative speed, which the brakes bring back to 0.
+  sample. An impact can leave a negative speed, which brakes bring back to 0 with the commanded deceleration, or one
+  above v_max, at which engines do nothing; a coasting vehicle keeps both.
+* A sample is on a vehicle's latency if it is at most 1e-6 of a step before it, because times are rounded.
 
-The term ``collision`` of a reward is then the paper's r_collision. Gaps are negative while vehicles overlap; nothing
-pushes them apart. Source: the paper, sections "Optimization Problem" and "MDP formulation".
+The term ``collision`` of a reward is then the paper's r_collision, of the sample at which the step begins; the overlap
+at an episode's last sample does not count. The term ``risk`` is of the sample at which the step ends, and ``jerk`` has
+the commands before they are limited, as in the exact physics. Gaps are negative while vehicles overlap; nothing pushes
+them apart. Source: the paper, sections "Optimization Problem" and "MDP formulation".
 """
 
 from __future__ import annotations
@@ -107,7 +111,8 @@ def collision(params: RewardParams, before: State, step: Step, after: State) -> 
     speed, gap = before.line[:, SPEED], before.line[:, GAP]
     closing = np.diff(speed[:, 1:], axis=1)
     squares = np.where(gap[:, 1:-1] <= 0.0, closing * closing, 0.0)
-    return np.asarray(-(pair_energies(params, before.vehicles)[1:-1] * squares).sum(axis=1))
+    penalty: Floats = -(pair_energies(params, before.vehicles)[1:-1] * squares).sum(axis=1)
+    return penalty
 
 
 class MappedGame(Game):
@@ -116,14 +121,23 @@ class MappedGame(Game):
     __slots__ = ()
 
     def first_decision(self, alert: State) -> State:
-        """Return the episodes at the first sample. Raises ``InvalidInput`` for worlds with an impact before it."""
+        """Return the episodes at the first sample.
+
+        Raises ``InvalidInput`` for worlds with an impact before it, and for those of a scenario with exact impacts:
+        agents would plan with them.
+        """
+        if PHYSICS not in alert.memories:
+            raise InvalidInput(
+                f"scenario {self.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
+                " a scenario that has physics: paper-map"
+            )
         state = super().first_decision(alert)
         if state.collided.any():
             raise InvalidInput(
                 f"scenario {self.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
                 " which physics: paper-map does not know; early_impacts: reject draws such worlds again"
             )
-        return state._replace(memories={**state.memories, PHYSICS: None})
+        return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """Return the state one sample later, and what the step did. The memory of ``state`` is not reused."""

@@ -28,7 +28,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 VEHICLE_2 = 2  # body
 NON_E, E_V2X_BM, HYBRID_SAC, HYBRID_PPO = "Non-E", "E-V2X-BM", "Hybrid SAC", "Hybrid PPO"  # rows of the paper
-SHIPPED: Mapping[str, str] = MappingProxyType({"SAC": "sac", "PPO": "ppo"})  # specs of the policies
+SHIPPED: Mapping[str, str] = MappingProxyType({"PPO": "ppo", "SAC": "sac"})  # specs of the policies
 
 WORLDS = ("base", "acts_s", "rear_s", "step_s", "restitution", "others", "seed")  # fields that change worlds, physics
 PLANS = ("base", "acts_s", "rear_s", "others", "seed", "plans_as_stated", "star")  # that change what E-V2X-BM plans

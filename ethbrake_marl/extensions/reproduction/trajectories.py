@@ -87,10 +87,9 @@ def reproduce_trajectories(settings: Settings) -> Made:
     """Reproduce the trajectories."""
     every, parts = all_records(settings), []
     figures = []
-    for name, records in every.items():
+    for number, (name, records) in enumerate(every.items(), 1):
         text = f"Positions of the vehicles, {name}; an arrow every second, dashed lines join equal times."
-        stem = f"trajectories-{name.partition(' ')[0].replace(chr(39), '')}"
-        figures.append(Drawn(stem, f"Trajectories, {name}", text, road_figure(records, text)))
+        figures.append(Drawn(f"trajectories-{number}", f"Trajectories, {name}", text, road_figure(records, text)))
     for records in (every["as stated"], every["nearest reading"]):
         one, two = (apart(records, k, "positions_m") for k in SCENARIOS)
         (ppo_1, sac_1), (ppo_2, sac_2) = (

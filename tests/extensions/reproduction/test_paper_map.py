@@ -1,7 +1,5 @@
 """The paper's fixed-step map: impacts by hand, a slow reference, figures of version 0.5, reward, what it refuses."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -161,7 +159,7 @@ def test_observation__is_the_state_of_the_paper() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"physics": "paper-mop"}, "physics = paper-mop: did you mean paper-map?; known: paper-map"),
+        ({"physics": "paper-mop"}, "physics: unknown physics 'paper-mop'; did you mean 'paper-map'?"),
         ({"obstacle_margin_m": 1.7}, "obstacle_margin_m: is not known to physics: paper-map"),
         ({"brake_rate_mps3": 10.0}, "brake_rate_mps3: is not known to physics: paper-map"),
         ({"v2x": {"preset": "nominal", "persistence": "periodic"}}, "v2x: is not known to physics: paper-map"),
@@ -178,7 +176,9 @@ def test_early_impacts__are_refused() -> None:
         eb.evaluate(early, "full_brake", episodes=3)
 
 
-@pytest.mark.parametrize("agent", ["e_v2x_bm", "ppo+episode", "ppo+step", "best_harm", "universal"])
+@pytest.mark.parametrize(
+    "agent", ["e_v2x_bm", "e_v2x_bm:estimated", "ppo+episode", "ppo+step", "best_harm", "universal"]
+)
 def test_agents__that_plan_with_exact_impacts_are_refused(agent: str) -> None:
     with refused("needs exact impacts, and these worlds have another physics"):
         eb.evaluate(MAPPED, agent, episodes=3)
@@ -190,7 +190,7 @@ def test_agents__that_drive_here() -> None:
 
 
 MEASURES = (
-    *("pushed_mps", "pushed_m", "push", "drove", "drove_towards", "injury_gidas"),
+    *("pushed_mps", "pushed_m", "push", "drove", "collision", "drove_towards", "injury_gidas"),
     *("proven_harm", "avoidable", "limits"),
 )
 
@@ -221,14 +221,8 @@ def test_record__is_refused() -> None:
         eb.record_episode(scenario.sample(1, 7), eb.Team.of({"vehicle_2": eb.make_agent("coast")}, "coast"), game)
 
 
-def test_run__is_refused_before_it_trains(tmp_path: Path) -> None:
-    with refused("physics = paper-map: ethbrake run compares with shields, which need exact impacts"):
-        run_experiment(eb.load_recipe("ppo-paper"), MAPPED, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 def test_watch__is_refused() -> None:
-    with refused("a picture of the motion needs exact impacts"):
+    with refused("a picture needs exact impacts"):
         eb.EthBrakeEnv(MAPPED, render_mode="ansi").reset(seed=1)
 
 
@@ -239,3 +233,40 @@ def test_mixture__has_one_physics() -> None:
         eb.Scenario(name="mixed", mixture=[exact, mapped])
     both = eb.Scenario(name="mixed", physics="paper-map", mixture=[exact, mapped])
     assert eb.evaluate(both, "full_brake", episodes=10).n == 10
+
+
+def test_honest_cost__of_exact_impacts_is_missing() -> None:
+    assert "honest_cost" not in eb.evaluate(MAPPED, "coast", episodes=3)["coast"]
+    assert "honest_cost" in eb.evaluate(MAPPED.replace(physics=None), "coast", episodes=3)["coast"]
+    for refusing in (MAPPED.sample(1, 7).harm, MAPPED.sample(1, 7).pair_harm, MAPPED.sample(1, 7).borne_harm):
+        with refused("the honest cost needs exact impacts"):
+            refusing("honest")
+
+
+def test_pictures__of_motion_between_samples_are_refused() -> None:
+    env = eb.EthBrakeEnv(MAPPED, render_mode="ansi")
+    with refused("a picture needs exact impacts"):
+        env.reset(seed=7)
+
+
+def test_worlds__of_exact_impacts_are_refused() -> None:
+    """Agents that plan with exact impacts would drive in them, and nobody would see it."""
+    exact = eb.load_scenario("paper-random").sample(3, 7)
+    with refused("scenario 'paper-random-map': these worlds belong to a scenario with exact impacts"):
+        eb.evaluate(exact, "full_brake", scenario=MAPPED)
+
+
+def test_tables__name_the_physics() -> None:
+    exact = eb.load_scenario("paper-random")
+    captions = [
+        eb.summarise(eb.evaluate(scenario, "full_brake", episodes=3)).tables()[0].note
+        for scenario in (exact.replace(physics="paper-map"), exact)
+    ]
+    assert "Worlds: paper-random (physics: paper-map): 3 worlds" in captions[0]
+    assert "Worlds: paper-random: 3 worlds" in captions[1]
+
+
+def test_run__is_refused_before_the_training(tmp_path) -> None:
+    with refused("ethbrake run compares shields, which need exact impacts, and physics: paper-map has none"):
+        run_experiment(eb.load_recipe("ppo-paper"), MAPPED, tmp_path / "run")
+    assert not (tmp_path / "run").exists()

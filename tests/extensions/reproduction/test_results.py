@@ -136,7 +136,7 @@ def test_random_table__has_every_printed_number_and_the_papers_process() -> None
     assert rows["least possible (proven)"][1] == pytest.approx(strategies.least_harm(STATED, 100).mean())
     driven = eb.evaluate("paper-random-map", "full_brake,ppo", episodes=100)
     rows = {name: cells for name, *cells in process.rows}
-    assert [*rows] == [NON_E, E_V2X_BM, "SAC", "Hybrid SAC", "PPO", HYBRID_PPO]
+    assert [*rows] == [NON_E, E_V2X_BM, "PPO", HYBRID_PPO, "SAC", "Hybrid SAC"]
     assert rows[NON_E][1] == driven["full_brake"]["first_impact_harm"].mean() and rows["PPO"][3] is None
     assert [each.value for each in rows["PPO"][:3]] == pytest.approx(
         [driven["ppo"][key].mean() for key in ("collided", "first_impact_harm", "total_harm")]
