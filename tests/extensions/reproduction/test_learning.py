@@ -78,7 +78,7 @@ def test_curves__have_the_columns_of_the_runs(tmp_path: Path) -> None:
     assert harm.lines[1].get_ydata().tolist() == [13.0, 11.0] and harm.get_xlabel() == "Training progress (%)"
     (learning.runs_of(tmp_path, LOW, learning.GROUPS[LOW][1])[2] / "run.json").write_text('{"status": "interrupted"}')
     assert [*learning.trained(tmp_path, LOW)] == ["ppo-paper"]  # one seed of three is not finished
-    assert learning.seconds_left(tmp_path, [HIGH, LOW]) == 225.0
+    assert learning.seconds_left(tmp_path, [HIGH, LOW]) == 240.0
     for settings in (full, Settings(tmp_path)):
         missing = learning.reproduce_curves(HIGH, settings)
         assert [each.outcome for each in missing.claims] == ["not run"] and not missing.figures
