@@ -23,9 +23,8 @@ def test_cost__counts_the_trainings_that_are_missing(ethbrake: Command, empty_fo
     quick = ethbrake("reproduce", "hybrid-table", "learning-low", "--cost").err
     assert "to do: 2 items, at most about 6 s of one core; trainings before them about 0.1 min" in quick
     full = ethbrake("reproduce", "hybrid-table", "learning-low", "readings", "--full", "--cost").err
-    assert (
-        "3 items, at most about 247 s of one core; trainings before them about 45.1 min" in full
-    )  # 2 x 3 x (210 + 240) s
+    # trainings: 2 x 3 x (210 + 240) s, and 6 s
+    assert "3 items, at most about 247 s of one core; trainings before them about 45.1 min" in full
     assert "about 45.0 min" in ethbrake("reproduce", "learning-high", "--full", "--cost").err
     assert "about 37.5 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
     assert "trainings" not in ethbrake("reproduce", "gaps", "trajectories", "--cost").err
