@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.pairwise import pairwise
-from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.search.tables import SHIPPED, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
@@ -161,31 +159,6 @@ def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -
 
 
 COOPERATION = (DOCS / "cooperation.md").read_text("utf-8")
-
-
-def committed(heading: str, agent: str) -> list[str]:
-    """An agent's row in the table below a heading of the page of the reproduction, without intervals."""
-    (row,) = (row for row in table_of("results/reproduction/README", heading) if row[0] == agent)
-    return [cell.split(" [")[0] for cell in row[1:]]
-
-
-def test_paper__its_5000_worlds_cannot_come_from_the_speeds_of_the_figure_of_distances() -> None:
-    predicted = {
-        name: f"{pairwise(eb.load_scenario(name).sample(5_000, 7), 2).harm.mean():.2f}"
-        for name in ("paper-distance", "paper-random")
-    }
-    assert committed("### The 5,000 worlds, as stated", "E-V2X-BM")[3] == predicted["paper-random"] == "9.38"
-    assert f"predicts {predicted['paper-distance']}." in PAPER_NOTE
-
-
-@pytest.mark.parametrize(("spec", "name"), [("full_brake", "Non-E"), ("ppo", "PPO")])
-def test_paper__harms_at_three_delays_are_as_committed(spec: str, name: str) -> None:
-    row = committed("### Gaps of 7 m, speeds of 20, 18 and 20 m/s, as stated", name)
-    state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}
-    for told, delay in zip(row, ("low", "middle", "high"), strict=True):
-        scenario = eb.load_scenario(f"paper-delay-{delay}")
-        result = eb.evaluate(eb.worlds_from_table(scenario, state), spec, scenario=scenario)
-        assert told == f"{result[spec]['first_impact_harm'].mean():.2f}"
 
 
 def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,9 +23,10 @@ def test_cost__counts_the_trainings_that_are_missing(ethbrake: Command, empty_fo
     quick = ethbrake("reproduce", "hybrid-table", "learning-low", "--cost").err
     assert "to do: 2 items, at most about 6 s of one core; trainings before them about 0.1 min" in quick
     full = ethbrake("reproduce", "hybrid-table", "learning-low", "readings", "--full", "--cost").err
-    assert "3 items, at most about 247 s of one core; trainings before them about 66.8 min" in full  # 2 x 2 x 5 x 200 s
-    assert "about 66.7 min" in ethbrake("reproduce", "learning-high", "--full", "--cost").err
-    assert "about 33.3 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
+    # trainings: 2 x 3 x (210 + 240) s, and 6 s
+    assert "3 items, at most about 247 s of one core; trainings before them about 45.1 min" in full
+    assert "about 45.0 min" in ethbrake("reproduce", "learning-high", "--full", "--cost").err
+    assert "about 37.5 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
     assert "trainings" not in ethbrake("reproduce", "gaps", "trajectories", "--cost").err
     assert not list(empty_folder.iterdir())
 

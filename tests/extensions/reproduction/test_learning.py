@@ -71,14 +71,14 @@ def test_curves__have_the_columns_of_the_runs(tmp_path: Path) -> None:
             for seed, run in enumerate(learning.runs_of(tmp_path, delay, plan)):
                 plant(run, 10.0 * number + seed)
     made = learning.reproduce_curves(HIGH, full)
-    assert [row[:2] for row in made.sheets[0].rows] == [("PPO", 5), ("SAC", 5)]
-    assert [[cell.value for cell in row[2:]] for row in made.sheets[0].rows] == [[2.0, -5.0], [12.0, -5.0]]
+    assert [row[:2] for row in made.sheets[0].rows] == [("PPO", 3), ("SAC", 3)]
+    assert [[cell.value for cell in row[2:]] for row in made.sheets[0].rows] == [[1.0, -5.0], [11.0, -5.0]]
     returns, harm = made.figures[0].figure.axes
     assert returns.lines[0].get_xdata().tolist() == [25.0, 50.0, 75.0, 100.0]
-    assert harm.lines[1].get_ydata().tolist() == [14.0, 12.0] and harm.get_xlabel() == "Training progress (%)"
-    (learning.runs_of(tmp_path, LOW, learning.GROUPS[LOW][1])[4] / "run.json").write_text('{"status": "interrupted"}')
-    assert [*learning.trained(tmp_path, LOW)] == ["ppo-paper"]  # one seed of five is not finished
-    assert learning.seconds_left(tmp_path, [HIGH, LOW]) == 200.0
+    assert harm.lines[1].get_ydata().tolist() == [13.0, 11.0] and harm.get_xlabel() == "Training progress (%)"
+    (learning.runs_of(tmp_path, LOW, learning.GROUPS[LOW][1])[2] / "run.json").write_text('{"status": "interrupted"}')
+    assert [*learning.trained(tmp_path, LOW)] == ["ppo-paper"]  # one seed of three is not finished
+    assert learning.seconds_left(tmp_path, [HIGH, LOW]) == 240.0
     for settings in (full, Settings(tmp_path)):
         missing = learning.reproduce_curves(HIGH, settings)
         assert [each.outcome for each in missing.claims] == ["not run"] and not missing.figures
@@ -88,7 +88,7 @@ def test_plans__are_of_the_papers_map_and_shipped_recipes() -> None:
     for group, plans in learning.GROUPS.items():
         for plan in plans:
             recipe, _ = eb.load_recipe(plan.recipe), eb.load_scenario(plan.scenario)
-            expected = (1, False, 100_000) if group == STOPPED else (5, True, None)
+            expected = (1, False, 100_000) if group == STOPPED else (5 if group == RANDOM else 3, True, None)
             assert (plan.seeds, plan.mapped, plan.decisions) == expected
             assert plan.decisions is None or plan.decisions < recipe.total_steps / 10
 

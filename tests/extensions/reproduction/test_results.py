@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.report.paper_rows import PaperRow
+from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PaperRow
 from ethbrake_marl.extensions.reproduction import curves, strategies, tables, trajectories
 from ethbrake_marl.extensions.reproduction.curves import DISTANCE, EXPECTED, PROVEN
 from ethbrake_marl.extensions.reproduction.made import Made, Settings
-from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, HYBRID_PPO, NON_E, SHIPPED, reported
-from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
+from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, HYBRID_PPO, NON_E, SHIPPED, plan, reported
+from ethbrake_marl.extensions.reproduction.readings import RANDOM, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import COUPLED, PREDICTED
 from ethbrake_marl.extensions.reproduction.verdicts import Outcome, judge_statement
 
@@ -217,6 +217,18 @@ def test_delays__in_the_world_of_the_figure() -> None:
         PROVEN: ["0.00", "0.00", "15.28"],
     }
     assert {name: rows[name] for name in golden} == golden
+    state = {"gap_1_m": [7], "gap_2_m": [7], "speed_1_mps": [20], "speed_2_mps": [18], "speed_3_mps": [20]}
+    for k, delay in enumerate(("low", "middle", "high")):
+        scenario = eb.load_scenario(f"paper-delay-{delay}")
+        result = eb.evaluate(eb.worlds_from_table(scenario, state), "full_brake,ppo", scenario=scenario)
+        assert rows[NON_E][k] == f"{result['full_brake']['first_impact_harm'].mean():.2f}"
+        assert rows["PPO"][k] == f"{result['ppo']['first_impact_harm'].mean():.2f}"
+
+
+def test_5000_worlds__cannot_be_driven_at_the_speeds_of_the_figure_of_distances() -> None:
+    predicted = [plan(Reading(base), 5_000).harm.mean() for base in (DISTANCE, RANDOM)]
+    assert [f"{each:.2f}" for each in predicted] == ["3.07", "9.38"]  # printed: 9.85
+    assert "the closed form predicts 3.07" in " ".join(PAPER_NOTE.split())
 
 
 def test_trajectories_and_accelerations__have_these_numbers() -> None:
