@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
@@ -34,6 +35,7 @@ from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.progress import Progress
 
 PROCESS = (RANDOM,)  # trainings that most items show, where there are some
+PROCESS_S = 10.0  # processor time of an item for the policies of the paper's process
 
 ITEMS = (
     Item(
@@ -124,7 +126,8 @@ def groups_of(settings: Settings, items: Sequence[Item]) -> list[str]:
 def cost(settings: Settings, items: Sequence[Item]) -> str:
     """Return what is to do, and how long it takes."""
     training_s = seconds_left(settings.folder, groups_of(settings, items))
-    seconds = sum(item.most_s + (SEARCH_S if item.make is reproduce_search and settings.full else 0) for item in items)
+    more_s = {item.name: PROCESS_S for item in items if RANDOM in item.trained} | {"readings": SEARCH_S}
+    seconds = sum(item.most_s + (more_s.get(item.name, 0.0) if settings.full else 0.0) for item in items)
     text = f"to do: {count_of(len(items), 'item')}, at most about {seconds:.0f} s of one core"
     return f"{text}; trainings before them about {training_s / 60.0:.1f} min of one core" if training_s else text
 
@@ -157,7 +160,7 @@ def command(settings: Settings, items: Sequence[Item]) -> str:
     fewer = ["--episodes", str(settings.episodes)] if settings.episodes < PAPER_EPISODES else []
     given = ",".join(f"{name.lower()}={spec}" for name, spec in settings.policies.items())
     policies = ["--policies", given] if settings.policies != Settings(settings.folder).policies else []
-    return " ".join(["ethbrake reproduce", *names, "--full" if settings.full else "--quick", *fewer, *policies])
+    return shlex.join(["ethbrake", "reproduce", *names, "--full" if settings.full else "--quick", *fewer, *policies])
 
 
 def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[Drawn] = ()) -> None:

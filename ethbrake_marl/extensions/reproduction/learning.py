@@ -145,9 +145,9 @@ class Course(NamedTuple):
 
     @property
     def converged(self) -> Floats:
-        """Progress at which nine tenths of the rise are behind, [seeds] %."""
+        """Progress at which nine tenths of the rise are behind, [seeds] %; 100 without a rise."""
         risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
-        return np.asarray(np.array([*self.returns[0]])[risen.argmax(axis=1)])
+        return np.where(self.rise > 0.0, np.array([*self.returns[0]])[risen.argmax(axis=1)], 100.0)
 
     @property
     def unrest(self) -> Floats:
@@ -156,8 +156,9 @@ class Course(NamedTuple):
 
     @property
     def spread(self) -> Floats:
-        """Standard deviation of the return over the seeds, at each of k steps of the second half, [k]."""
-        return np.asarray(self.values[:, self.values.shape[1] // 2 :].std(axis=0, ddof=1))
+        """Mean distance of the return from the mean of all seeds over the second half of the progress, [seeds]."""
+        half = self.values[:, self.values.shape[1] // 2 :]
+        return np.asarray(np.abs(half - half.mean(axis=0)).mean(axis=1))
 
 
 def column(run: Path, name: str) -> dict[float, float]:
