@@ -112,7 +112,8 @@ def reproduce_distance(settings: Settings) -> Made:
     """Reproduce the figure of harm against the sum of both gaps."""
     readings = distances(settings, settings.policies)
     stated, nearest = (statements(groups, settings.policies) for groups in readings.values())
-    claims = [judge("Fig. 4", text, parts, nearest[text]) for text, parts in stated.items()]
+    why = "where gaps are short, the deceleration that E-V2X-BM plans does far more harm than it predicts"
+    claims = [judge("Fig. 4", text, parts, nearest[text], why=why) for text, parts in stated.items()]
     shown = over_distance("harm-distance", readings, [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN])
     return shown._replace(claims=claims, notes=[settings.who_drives])
 
@@ -155,8 +156,7 @@ def reproduce_delays(settings: Settings) -> Made:
         for other in (NON_E, E_V2X_BM, COUPLED)
         for part in less_in_each(groups, policy, other)
     ]
-    why = "the paper does not state its delays: ours, and at two of the three everybody but non-ethical does no harm"
-    claim = judge("Fig. 5", "SAC and PPO do the least harm at every delay", parts, why=why)
+    claim = judge("Fig. 5", "SAC and PPO do the least harm at every delay (the delays are ours)", parts)
     shown = [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN]
     made = show_harm("harm-delays", "Gaps of 7 m, speeds of 20, 18 and 20 m/s", {"as stated": groups}, shown, "Delay")
     return made._replace(claims=[claim], notes=[f"One world: no intervals. {settings.who_drives}"])

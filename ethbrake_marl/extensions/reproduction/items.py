@@ -100,7 +100,7 @@ LEAD = (
     "Each row is a number or a statement of the paper. *As stated*: with the parameters that the paper states, and our"
     " defaults for the others. *Nearest reading*: the values of what it leaves open that bring all numbers of Table III"
     " nearest together (found by a search, so a hypothesis). *Why* begins with the verdict on the row as stated:"
-    " agrees, differs because, cannot be because (with a proof), undecided (too few worlds)."
+    " agrees (within 2 %), differs because, cannot be because (with a proof), undecided (too few worlds)."
 )
 QUICK = "Figures 2 and 3, the paper's own process and the search over the readings need --full."
 
@@ -204,7 +204,7 @@ def page(made_by: str, results: Mapping[Item, Made], settings: Settings) -> str:
     parts = ["# The paper, reproduced", lead, LEAD, *([] if settings.full else [QUICK]), overview(results).markdown()]
     for item, made in results.items():
         labels = f" In the paper's source: {', '.join(f'`{label}`' for label in item.labels)}." if item.labels else ""
-        parts += [f"## {item.title}", item.what + labels, *made.notes]
+        parts += [f"## {item.title}", f"{item.what}{labels} Command: `ethbrake reproduce {item.name}`.", *made.notes]
         parts += [f"![{each.title}. {each.text}]({item.name}/{each.stem}.svg)" for each in made.figures]
         for sheet in made.sheets:
             parts += [f"### {sheet.title}", sheet.markdown(), *filter(None, [sheet.note])]

@@ -183,12 +183,13 @@ def apart(records: Records, number: int, what: str) -> float:
 
 def claims_of(where: str, readings: list[dict[str, tuple[str, float]]], unit: str) -> list[Claim]:
     """Return claims about one world; each reading has: claim -> words, what should be smaller minus the larger one."""
-    show = Column("", unit=unit, sign="+")
+    show, why = Column("", unit=unit, sign="+"), "the policies are ours, not the paper's"
     return [
         judge(
             where,
             text,
             *([Less(words, Estimate(value, None))] for words, value in (each[text] for each in readings)),
+            why=why,
             show=show,
         )
         for text in readings[0]

@@ -3,8 +3,8 @@
 The *chance difference* is the largest difference between means of two random lists of worlds that is due to chance
 alone (95 %): sqrt(2) times half of the interval. A printed number
 
-- *agrees* if ours is within 2 % of it, or within the chance difference where that is at most 15 % of the larger one;
-- is *undecided* if ours is within a larger chance difference: too few worlds;
+- *agrees* if ours is within 2 % of it;
+- is *undecided* if ours is within the chance difference of it: too few worlds;
 - *cannot be* if a lower bound that is proven for every strategy is above it by more than the chance difference;
 - *differs* otherwise.
 
@@ -24,7 +24,7 @@ from ethbrake_marl.motion.layout import Floats
 
 Outcome = Literal["agrees", "differs", "cannot be", "undecided", "not run"]
 
-TOLERANCE, WIDE = 0.02, 0.15
+TOLERANCE = 0.02
 
 HARM, PERCENT = Column("Harm"), Column("Collision rate", digits=1, scale=100.0, unit=" %")
 APART = Column("Difference", sign="+")
@@ -64,8 +64,7 @@ def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) 
     """Compare a printed number, which is not 0, with ours. ``least``: a proven lower bound for all strategies."""
     if least is not None and least.value - printed > chance(least):
         return "cannot be"
-    by_chance = chance(ours) if chance(ours) <= WIDE * max(abs(printed), abs(ours.value)) else 0.0
-    if abs(ours.value - printed) <= max(by_chance, TOLERANCE * abs(printed)):
+    if abs(ours.value - printed) <= TOLERANCE * abs(printed):
         return "agrees"
     return "undecided" if abs(ours.value - printed) <= chance(ours) else "differs"
 
@@ -112,8 +111,8 @@ def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, O
 def judge(
     where: str, paper: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, why: str = "", show: Column = APART
 ) -> Claim:
-    """Return a statement as a claim; ``why``: the reason for what the numbers say."""
+    """Return a statement as a claim; ``why``: the reason if it differs."""
     ours, outcome, numbers = judge_statement(stated, show)
     other = judge_statement(nearest, show)[0] if nearest else ""
-    text = f"{why} ({numbers})" if why and numbers else why or numbers
+    text = f"{why} ({numbers})" if why and outcome == "differs" else numbers
     return Claim(where, paper, ours, other, outcome, text)

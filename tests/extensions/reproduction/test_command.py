@@ -72,7 +72,7 @@ def test_page__by_hand_and_results_are_replaced_by_force_alone(tmp_path: Path) -
     _, rest = text.split("| Where | The paper | Ours, as stated | Ours, nearest reading | Why |\n")
     assert rest == (
         "| --- | --- | --- | --- | --- |\n| Fig. 9 | H\\* is less | holds |  | agrees: b |\n\n"
-        "## A title\n\nWhat it is. In the paper's source: `Fig:x`.\n\nA note.\n\n"
+        "## A title\n\nWhat it is. In the paper's source: `Fig:x`. Command: `ethbrake reproduce gaps`.\n\nA note.\n\n"
         "### A table, 1 m/s\n\n| Who | Harm |\n| --- | ---: |\n| PPO \\| H\\* | 1.50 [1.25, 1.75] |\n\nOf 24.\n"
     )
     table = tmp_path / "out/gaps/a-table-1-m-s.csv"
