@@ -285,9 +285,9 @@ def step(
     decision. Raises ``InvalidInput`` for a bad action. ``state`` does not change, unless its memory is donated.
     """
     actions = numbers_of(rules, actions, state.n)
-    line, car, clock, know, wanted, memories = scripted(scripts, state, donate=donate)
+    line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
     if not donate:
-        line, clock = line.copy(), clock.copy()
+        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
     scratch = scratch_for(wanted.shape[1])
     refused, failed = step_worlds(line, car, clock, wanted, actions, scratch, out, reward, *rules)
