@@ -11,7 +11,7 @@ import numpy as np
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Rules, Step
 from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
@@ -103,7 +103,11 @@ class Game(NamedTuple):
         return self.rewarding.complete(state, step, after)
 
     def first_decision(self, alert: State) -> State:
-        """Return the episodes at their first decision, before shaping and shield. Scripts have decided."""
+        """Return the episodes at their first decision, before shaping and shield. Scripts have decided.
+
+        Raises ``InvalidInput`` for worlds of a scenario with another physics.
+        """
+        check_exact(alert, f"scenario {self.name!r}")
         return one_step.first_decision(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:

@@ -298,15 +298,11 @@ def step(
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
 
 
-def scripted(scripts: Mapping[int, Any], state: State, *, donate: bool = False) -> State:
+def scripted(scripts: Mapping[int, Any], state: State) -> State:
     """Return the state with new commands, in memory of their own, and memories of the scripts that look at it."""
-    wanted, memories, commands = state.wanted, state.memories, {}
-    if scripts:
-        memories = dict(memories)
-        for i, script in scripts.items():
-            commands[i], memories[i] = asked(script, state, memories[i], i)
-    if not donate:
-        wanted = wanted.copy()
+    wanted, memories, commands = state.wanted.copy(), dict(state.memories), {}
+    for i, script in scripts.items():
+        commands[i], memories[i] = asked(script, state, memories[i], i)
     running = ~state.ended  # nothing changes in an episode that has ended
     for i, command_mps2 in commands.items():
         np.copyto(wanted[:, i], command_mps2, where=running)
@@ -320,7 +316,7 @@ def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Flo
     """
     given = proposals(rules, numbers_of(rules, actions, state.n), state.n)
     if np.isnan(given).any():
-        raise InvalidInput(f"actions: row {np.isnan(given).any(axis=1).argmax()} is no number")
+        _check_actions(rules, given[np.isnan(given).any(axis=1).argmax()])
     state, learners = scripted(scripts, state), rules.learners
     capacity = np.where(given < 0.0, state.car[:, BRAKING, learners], state.car[:, DRIVING, learners])
     running = ~state.ended[:, np.newaxis]

@@ -145,9 +145,7 @@ class Scenario(Part):
         examples=["own", "weighted:1,4,1", "first:vehicle_3,then:total"],
     )
     physics: str | None = Field(
-        default=None,
-        exclude_if=not_,
-        description="physics other than exact impacts: paper-map, the paper's simulation with a fixed time step",
+        default=None, exclude_if=not_, description="name of a physics other than exact impacts, such as paper-map"
     )
     observation: Observation | None = Field(
         default=None,

@@ -79,10 +79,10 @@ def reproduce_command(
 
 
 def chosen_policies(text: str) -> dict[str, str]:
-    """Return the specs of SAC and PPO; ``text`` replaces some. Raises the errors of ``make_agent``."""
-    from ethbrake_marl.extensions.reproduction.random_test import SHIPPED
-    from ethbrake_marl.extensions.reproduction.readings import RANDOM
-    from ethbrake_marl.names import make_agent
+    """Return the specs of PPO and SAC; ``text`` replaces some. Raises ``InvalidInput`` for what cannot drive here."""
+    from ethbrake_marl.extensions.reproduction.random_test import SHIPPED, WORLDS, drive_all
+    from ethbrake_marl.extensions.reproduction.readings import STATED
+    from ethbrake_marl.extensions.reproduction.search import NEAREST
 
     replaced = dict[str, str]()
     for part in filter(None, text.split(",")):
@@ -91,7 +91,11 @@ def chosen_policies(text: str) -> dict[str, str]:
             raise InvalidInput(
                 f"--policies {text}: {part!r}: must be ppo=AGENT or sac=AGENT, each once, for instance ppo=policy@RUN"
             )
-        make_agent(spec, scenario=RANDOM)  # so that a wrong name is refused before a training
+        try:  # so that what cannot drive is refused before a training
+            for reading in (STATED, NEAREST):
+                drive_all(reading.only(*WORLDS), spec, "first", 2)
+        except InvalidInput as error:
+            raise InvalidInput(f"--policies {part}: {error}") from None
         replaced[name.upper()] = spec
     return {**SHIPPED, **replaced}
 

@@ -34,7 +34,7 @@ Groups = Mapping[str, tuple[Lines, Floats]]  # group of worlds, or delay -> line
 DISTANCE, DISTANCE_WORLDS = "paper-distance", 5_000
 ENDS_M = (10, 12, 14, 16, 18, 20)  # of the groups, for the sum of both gaps
 
-EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "policy alone"
+EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "PPO, not converged"
 
 
 def lines_of(reading: Reading, settings: Settings, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
@@ -113,19 +113,22 @@ def reproduce_distance(settings: Settings) -> Made:
     readings = distances(settings, settings.policies)
     stated, nearest = (statements(groups, settings.policies) for groups in readings.values())
     why = "where gaps are short, the deceleration that E-V2X-BM plans does far more harm than it predicts"
-    claims = [judge("Fig. 4", text, parts, nearest[text], why=why) for text, parts in stated.items()]
+    whys = {"E-V2X-BM does less harm than non-ethical": why}
+    claims = [judge("Fig. 4", text, parts, nearest[text], why=whys.get(text, "")) for text, parts in stated.items()]
     shown = over_distance("harm-distance", readings, [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN])
     return shown._replace(claims=claims, notes=[settings.who_drives])
 
 
 def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]:
     """Return what the paper says of its figure: statement -> the comparisons that it needs."""
-    names = [*groups]
-    ends = {name: groups[name] for name in (names[-1], names[0])}  # the longest, the shortest
+    lines, shortest = next(iter(groups.values()))
+    half = 0.5 * lines[NON_E][shortest]
     return {
         "non-ethical harm grows with the distance": growing(groups, NON_E),
         "E-V2X-BM does less harm than non-ethical": less_in_each(groups, E_V2X_BM, NON_E),
-        "E-V2X-BM still does much harm at the shortest distance": growing(ends, E_V2X_BM),
+        "E-V2X-BM still does much harm (more than half of non-ethical) at the shortest distance": [
+            Less.of_worlds("half of Non-E minus E-V2X-BM", half, lines[E_V2X_BM][shortest])
+        ],
         "SAC and PPO do less harm than E-V2X-BM over the whole range": [
             part for policy in policies for part in less_in_each(groups, policy, E_V2X_BM)
         ],

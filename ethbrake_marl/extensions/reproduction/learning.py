@@ -207,7 +207,7 @@ STATEMENTS = {
     ),
     LOW: (
         "both algorithms reach higher returns than at high delay",
-        "SAC converges faster than PPO",
+        "SAC converges faster than PPO (in % of the training, as in the figure; the lengths are ours)",
         "PPO converges more stably than SAC",
         "returns of different seeds vary more than at high delay",
     ),

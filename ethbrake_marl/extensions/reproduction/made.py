@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from ethbrake_marl.evaluation.captions import caption, ranges_of
-from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.extensions.reproduction.random_test import SHIPPED
 from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Sheet
@@ -67,8 +65,3 @@ class Item(NamedTuple):
     make: Callable[[Settings], Made]
     most_s: float  # processor time with as many worlds as in the paper, without trainings
     trained: tuple[str, ...] = ()  # groups of trainings; without ``full``, only what takes seconds is trained
-
-
-def about(result: Result) -> str:
-    """Return one line about the worlds of a result."""
-    return f"{caption({**result.about, **ranges_of(result.worlds)})}."

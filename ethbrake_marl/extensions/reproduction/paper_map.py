@@ -131,7 +131,8 @@ class MappedGame(Game):
                 f"scenario {self.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
                 " a scenario that has physics: paper-map"
             )
-        state = super().first_decision(alert)
+        rules = self.rules
+        state = one_step.first_decision(alert, self.deciders, rules.time_step_s, rules.horizon_s)
         if state.collided.any():
             raise InvalidInput(
                 f"scenario {self.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"

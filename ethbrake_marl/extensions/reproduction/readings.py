@@ -65,9 +65,9 @@ class Reading(NamedTuple):
         """Return the reading with defaults in all fields but these."""
         return Reading(**{field: getattr(self, field) for field in fields})
 
-    def scenario(self, name: str, **changes: Any) -> Scenario:
-        """Return a shipped scenario of three vehicles under this reading, with ``changes`` of other keys."""
-        scenario = load_scenario(name).replace(**changes)
+    def scenario(self, name: str) -> Scenario:
+        """Return a shipped scenario of three vehicles under this reading."""
+        scenario = load_scenario(name)
         keys = dict(self.others)
         latency_s = [*scenario.model_dump()["latency_s"]]
         if self.acts_s is not None:

@@ -74,7 +74,7 @@ GAPS = (
         "1, 0.1, 1e-5, 10 in ppo-paper", otherwise="not measured: each needs trainings that converge"),
     Gap("state of the policy", "MDP formulation: positions, speeds, actions of the others",
         "also capacities, masses, latencies, e and derived features",
-        otherwise="not measured: it needs trainings that converge"),
+        otherwise="--full trains ppo-paper and sac-paper, which observe the paper's state"),
     Gap("seeds of the training", "multiple training tests with different random seeds", "0 to 4",
         otherwise="--full trains five, and three for each learning curve"),
     Gap("ends of the cosine, number of decisions", "table:params: cosine, no numbers", "3e-4 to 3e-5; in the recipes",

@@ -50,6 +50,10 @@ WHY = {  # (row, quantity) -> why ours differs; "": each
     ("", DECREASE): "it follows from the two harms",
     ("", ""): REJECTS,
 }
+GIVEN = {  # what a proof assumes
+    "Table III": "with Vehicle 2 acting at 0.5 s",
+    "Table II": "with Vehicle 2 acting at 0.5 s and the speeds of Table III",
+}
 REPORTED = {E_V2X_BM: "predicted", "Hybrid": "policy alone"}  # what the nearest reading reports as harm of a row
 
 Reported = Mapping[str, tuple[Bools, Floats]]  # row of the paper -> collided, harm (m2/s2), [n] each
@@ -89,9 +93,7 @@ def number_claims(
             why = next(WHY[key] for key in keys if key in WHY)
             if outcome == "cannot be":
                 bound = show.show(proven[quantity]).in_words
-                why = (
-                    f"with Vehicle 2 acting at 0.5 s it is at least {bound}, whoever drives (proven for exact impacts)"
-                )
+                why = f"{GIVEN[where]} it is at least {bound}, whoever drives (proven for exact impacts)"
             elif why != OURS and (outcome != "differs" or (why == REJECTS and not_ours)):
                 why = ""
             text = f"{row.agent}, {quantity} {show.scale * number:.6g}{show.unit}"

@@ -15,8 +15,8 @@ from ethbrake_marl.extensions.reproduction.learning import process
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
 from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
 from ethbrake_marl.extensions.reproduction.search import NEAREST
-from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Outcome
+from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game, teams_of
 
@@ -122,7 +122,7 @@ def reproduce_trajectories(settings: Settings) -> Made:
     numbers = ("Impacts", "First-impact harm", "Total harm", "Last gap 1 (m)", "Last gap 2 (m)")
     note = f"One world each: no intervals. Exact physics; harm in m²/s². {settings.who_drives}"
     sheet = Sheet("How the episodes end", ("Reading", "Scenario", "Policy", *map(Column, numbers)), rows, note)
-    return Made(claims_of("Fig. 6", parts, " m"), [sheet], figures)
+    return Made(claims_of("Fig. 6", parts), [sheet], figures)
 
 
 def reproduce_accelerations(settings: Settings) -> Made:
@@ -132,7 +132,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
     figure = Drawn("accelerations", "Acceleration profiles", text, profiles_figure(every, text))
     for records in (every["as stated"], every["nearest reading"]):
         one, two = (apart(records, k, "command_mps2") for k in SCENARIOS)
-        (first, ppo_changes, _), (_, sac_changes, braking) = (asked(records[name, 2]) for name in ("PPO", "SAC"))
+        (first, ppo_changes, _), (_, sac_changes, braking) = (profile_of(records[name, 2]) for name in ("PPO", "SAC"))
         parts.append(
             {
                 "profiles of PPO and SAC are more alike in Scenario 1 than in 2": (
@@ -152,7 +152,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
         (*(name, str(number), policy, first), *(float(record.command_mps2[:, VEHICLE_2].min()), braking, changes))
         for name, records in every.items()
         for (policy, number), record in records.items()
-        for first, changes, braking in (asked(record),)
+        for first, changes, braking in (profile_of(record),)
     ]
     numbers = (
         Column("First command", sign="+"),
@@ -162,7 +162,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
     )
     note = "Commands of Vehicle 2 in m/s². One world each: no intervals."
     sheet = Sheet("Commands of Vehicle 2", ("Reading", "Scenario", "Policy", *numbers), rows, note)
-    return Made(claims_of("Fig. 7", parts, " m/s²"), [sheet], [figure])
+    return Made(claims_of("Fig. 7", parts), [sheet], [figure])
 
 
 def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
@@ -181,22 +181,19 @@ def apart(records: Records, number: int, what: str) -> float:
     return float(np.sqrt(np.mean((one - other) * (one - other))))
 
 
-def claims_of(where: str, readings: list[dict[str, tuple[str, float]]], unit: str) -> list[Claim]:
+def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
     """Return claims about one world; each reading has: claim -> words, what should be smaller minus the larger one."""
-    show, why = Column("", unit=unit, sign="+"), "the policies are ours, not the paper's"
-    return [
-        judge(
-            where,
-            text,
-            *([Less(words, Estimate(value, None))] for words, value in (each[text] for each in readings)),
-            why=why,
-            show=show,
-        )
-        for text in readings[0]
-    ]
+    claims = []
+    for text in readings[0]:
+        (words, stated), (_, nearest) = (each[text] for each in readings)
+        ours, near = ("holds" if value < 0.0 else "does not hold" for value in (stated, nearest))
+        outcome: Outcome = "agrees" if stated < 0.0 else "differs"
+        why = words if stated < 0.0 else f"the policies are ours, not the paper's ({words})"
+        claims.append(Claim(where, text, ours, near, outcome, why))
+    return claims
 
 
-def asked(record: EpisodeRecord) -> tuple[float, float, float]:
+def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
     """Return the first command of Vehicle 2 and the sum of its changes (m/s2), and how long it brakes while it moves.
 
     The last is a share of the time in which it moves after its latency.

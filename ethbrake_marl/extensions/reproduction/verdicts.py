@@ -98,14 +98,14 @@ def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, O
     failing = [part for part in compared if not part.holds]
     ties = f", both are 0 in {len(parts) - len(compared)} more" if len(compared) < len(parts) else ""
     text = f"holds in {len(compared) - len(failing)} of {len(compared)}{ties}"
-    if len(parts) == 1:
-        text = "does not hold" if failing else "holds"
-    if not failing:
-        worst = max(compared, key=lambda part: part.difference.value, default=None)
-        return text, "agrees", "" if worst is None else f"{worst.where}, {show.show(worst.difference).in_words}"
+    if not compared:
+        return "nothing to compare", "undecided", "both are 0 in all worlds" if parts else "too few worlds"
     undecided = all(part.difference.ends[0] < 0.0 for part in failing)
-    named = "; ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in failing)
-    return text, "undecided" if undecided else "differs", named
+    if len(parts) == 1:
+        text = ("not shown" if undecided else "does not hold") if failing else "holds"
+    named = failing or [max(compared, key=lambda part: part.difference.value)]
+    numbers = "; ".join(f"{part.where}, {show.show(part.difference).in_words}" for part in named)
+    return text, ("undecided" if undecided else "differs") if failing else "agrees", numbers
 
 
 def judge(
