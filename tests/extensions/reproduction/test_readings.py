@@ -150,7 +150,9 @@ def test_names__say_what_differs() -> None:
 
 
 def test_scenario__has_what_the_reading_says() -> None:
-    scenario = Reading(RANDOM, 0.25, 1.1, 0.5, 0.3, (("horizon_s", 5.0),)).scenario("paper-delay-low", gaps_m=[7, 7])
+    scenario = Reading(RANDOM, 0.25, 1.1, 0.5, 0.3, (("horizon_s", 5.0), ("gaps_m", (7, 7)))).scenario(
+        "paper-delay-low"
+    )
     assert scenario.latency_s == (0.0, 0.25, 1.1) and (scenario.physics, scenario.time_step_s) == ("paper-map", 0.5)
     assert (scenario.restitution, scenario.horizon_s, scenario.gaps_m) == (0.3, 5.0, (7.0, 7.0))
     assert STATED.scenario("paper-delay-low").latency_s == (0.0, 0.1, 0.3)
@@ -202,13 +204,11 @@ def test_reproduce_search__shows_the_nearest_and_says_that_it_is_a_hypothesis(mo
     monkeypatch.setattr(search, "GRID", SMALL)
     assert search.reproduce_search(SETTINGS).notes == ["The search needs `--full`."]
     made = search.reproduce_search(replace(SETTINGS, full=True))
-    nearest, fixed = made.sheets
+    (nearest,) = made.sheets
     assert nearest.rows[0][:2] == ("printed", 0.0) and nearest.rows[-1][0] == "as stated"
     distances = [row[1] for row in nearest.rows[1:-1]]
     assert len(distances) == search.SHOWN and distances == sorted(distances)
-    assert len(fixed.rows) == sum(map(len, SMALL.values())) and "is a hypothesis" in made.notes[1]
-    assert fixed.rows[1][0] == "Vehicle 2 acts at 0.2 s" and "Vehicle 2 acts at 0.2 s" in fixed.rows[1][2]
-    assert min(row[1] for row in fixed.rows) == distances[0]
+    assert "is a hypothesis" in made.notes[1] and f"among {len([*readings_of(SMALL)])} readings" in made.notes[1]
     asked = {row[0]: row for row in nearest.rows}
     assert asked["as stated"][4:] == pytest.approx(numbers_of(table_of(STATED, 20)).T.ravel())
 

@@ -76,7 +76,7 @@ def test_conclusions__by_planted_harm() -> None:
     judged = {text: judge_statement(parts) for text, parts in tables.conclusions(found, SHIPPED).items()}
     assert {text: each[:2] for text, each in judged.items()} == {
         "E-V2X-BM reduces the collisions of Non-E": ("does not hold", "differs"),
-        "the hybrids collide least": ("holds in 2 of 4", "differs"),
+        "the hybrids collide least": ("holds in 0 of 4", "undecided"),
         "Non-E does the most harm": ("holds in 6 of 6", "agrees"),
         "the hybrids do the least harm": ("holds in 8 of 8", "agrees"),
         "contribution 1: learning does less harm than the analytic baseline": ("holds in 4 of 4", "agrees"),
@@ -105,7 +105,8 @@ def test_numbers__by_hand() -> None:
     assert [each[1:] for each in claims] == [
         ("Non-E, collision rate 75 % (300 collisions)", three_quarters, f"{three_quarters}, agrees", "agrees", ""),
         ("Non-E, average harm 10.1", "10.00 [10.00, 10.00]", "12.00 [12.00, 12.00], differs", "agrees", ""),
-        ("E-V2X-BM, collision rate 30 % (120 collisions)", one_half, f"{three_quarters}, differs", "cannot be", why(one_half)),
+        ("E-V2X-BM, collision rate 30 % (120 collisions)", one_half, f"{three_quarters}, differs", "cannot be",
+         why(one_half)),
         ("E-V2X-BM, average harm 3", "6.00 [6.00, 6.00]", "3.00 [3.00, 3.00] (predicted), agrees", "cannot be",
          why("4.00 [3.61, 4.39]")),
         ("E-V2X-BM, harm decrease 70 %", "40.0 % [40.0, 40.0]", "75.0 % [75.0, 75.0] (predicted), differs", "differs",
@@ -135,8 +136,9 @@ def process_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_random_table__has_every_printed_number_and_the_papers_process() -> None:
     made = tables.reproduce_random_table(SETTINGS)
     found, (printed, stated, process) = by_text(made), made.sheets
-    assert len(found) == 11 + 5 + 2 and len(printed.rows) == 4
-    assert found["Non-E, collision rate 93.91 %"] == ("80.0 % [71.1, 86.7]", "96.0 % [90.2, 98.4], agrees", "differs")
+    assert len(found) == 11 + 7 + 2 and len(printed.rows) == 4
+    rate = found["Non-E, collision rate 93.91 % (9391 collisions)"]
+    assert rate == ("80.0 % [71.1, 86.7]", "96.0 % [90.2, 98.4], undecided", "differs")
     rows = {name: [each and each.value for each in cells] for name, *cells in stated.rows}
     assert rows[E_V2X_BM] == pytest.approx([0.6, *GOLDEN[STATED][E_V2X_BM][1:]])
     assert rows["least possible (proven)"][1] == pytest.approx(strategies.least_harm(STATED, 100).mean())
@@ -243,20 +245,21 @@ def test_trajectories_and_accelerations__have_these_numbers() -> None:
     assert len(ends) == len(commands) == 8
     assert ["as stated", "1", "PPO", "0", "0.00", "0.00", "0.16", "1.84"] in ends
     found = {each.paper: (each.outcome, each.nearest, each.why) for one in made for each in one.claims}
+    ours = "the policies are ours, not the paper's ({})".format
     assert found == {
         "positions under PPO and SAC are more alike in Scenario 1 than in 2":
-            ("differs", "does not hold", "root mean square 2.06 m against 0.88 m, +1.18 m"),
+            ("differs", "does not hold", ours("root mean square 2.06 m against 0.88 m")),
         "Scenario 2: PPO keeps the larger distance to Vehicle 3":
-            ("agrees", "holds", "mean gap 5.92 m under SAC, 6.70 m under PPO, -0.78 m"),
+            ("agrees", "holds", "mean gap 5.92 m under SAC, 6.70 m under PPO"),
         "Scenario 2: SAC keeps the larger distance to Vehicle 1":
-            ("agrees", "holds", "mean gap 3.28 m under PPO, 4.05 m under SAC, -0.78 m"),
+            ("agrees", "holds", "mean gap 3.28 m under PPO, 4.05 m under SAC"),
         "profiles of PPO and SAC are more alike in Scenario 1 than in 2":
-            ("differs", "does not hold", "root mean square difference 3.13 m/s² against 2.16 m/s², +0.97 m/s²"),
-        "Scenario 2: PPO accelerates before it brakes": ("agrees", "holds", "first command +7.00 m/s², -7.00 m/s²"),
+            ("differs", "does not hold", ours("root mean square difference 3.13 m/s² against 2.16 m/s²")),
+        "Scenario 2: PPO accelerates before it brakes": ("agrees", "holds", "first command +7.00 m/s²"),
         "Scenario 2: SAC decelerates throughout most of it":
-            ("agrees", "holds", "braking in 100 % of the time it moves, -0.50 m/s²"),
+            ("agrees", "holds", "braking in 100 % of the time it moves"),
         "Scenario 2: PPO's profile is the smoother one":
-            ("differs", "holds", "ups and downs 17.4 m/s² under PPO, 8.9 m/s² under SAC, +8.50 m/s²"),
+            ("differs", "holds", ours("ups and downs 17.4 m/s² under PPO, 8.9 m/s² under SAC")),
     }  # fmt: skip
 
 

@@ -55,11 +55,12 @@ TIE, ZERO = Less("z", Estimate(0.0, None), both_are_0=True), Less("e", around(0.
         ([A, OPEN], ("holds in 1 of 2", "undecided", "b, -0.50 [-1.50, +0.50]")),
         ([A, WRONG], ("holds in 1 of 2", "differs", "c, +2.00 [+1.00, +3.00]")),
         ([OPEN, WRONG], ("holds in 0 of 2", "differs", "b, -0.50 [-1.50, +0.50]; c, +2.00 [+1.00, +3.00]")),
-        ([OPEN], ("does not hold", "undecided", "b, -0.50 [-1.50, +0.50]")),
+        ([OPEN], ("not shown", "undecided", "b, -0.50 [-1.50, +0.50]")),
         ([Less("f", Estimate(0.5, None))], ("does not hold", "differs", "f, +0.50")),
         ([ZERO], ("does not hold", "differs", "e, +0.00 [+0.00, +0.00]")),
         ([A, TIE], ("holds in 1 of 1, both are 0 in 1 more", "agrees", "a, -3.00 [-4.00, -2.00]")),
-        ([TIE, TIE], ("holds in 0 of 0, both are 0 in 2 more", "agrees", "")),
+        ([TIE, TIE], ("nothing to compare", "undecided", "both are 0 in all worlds")),
+        ([], ("nothing to compare", "undecided", "too few worlds")),
     ],
 )
 def test_statement__by_hand(parts: list[Less], expected: tuple[str, str, str]) -> None:
@@ -77,6 +78,7 @@ def test_less__is_paired_in_the_same_worlds() -> None:
 def test_claims__in_the_one_table() -> None:
     claims = [
         judge("Fig. 4", "a is less", [A], [WRONG, D], why="so it is"),
+        judge("Fig. 4", "c is less", [WRONG], why="so it is"),
         judge("Fig. 5", "b is less", [Less("rates", around(0.25, 0.125))], show=PERCENT),
         judge("Fig. 6", "nothing", [TIE], why="all are 0"),
         Claim("Table II", "2,005", "", "", "cannot be", "a|b"),
@@ -85,9 +87,10 @@ def test_claims__in_the_one_table() -> None:
     assert claims_sheet(claims).markdown().splitlines() == [
         "| Where | The paper | Ours, as stated | Ours, nearest reading | Why |",
         "| --- | --- | --- | --- | --- |",
-        "| Fig. 4 | a is less | holds | holds in 1 of 2 | agrees: so it is (a, -3.00 [-4.00, -2.00]) |",
+        "| Fig. 4 | a is less | holds | holds in 1 of 2 | agrees: a, -3.00 [-4.00, -2.00] |",
+        "| Fig. 4 | c is less | does not hold |  | differs because so it is (c, +2.00 [+1.00, +3.00]) |",
         "| Fig. 5 | b is less | does not hold |  | differs because rates, 25.0 % [12.5, 37.5] |",
-        "| Fig. 6 | nothing | holds |  | agrees: all are 0 |",
+        "| Fig. 6 | nothing | nothing to compare |  | undecided: both are 0 in all worlds |",
         "| Table II | 2,005 |  |  | cannot be because a\\|b |",
         "| Fig. 2 | same |  |  | not run: needs --full |",
     ]
