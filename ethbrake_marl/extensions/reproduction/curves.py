@@ -17,6 +17,7 @@ from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
 from ethbrake_marl.extensions.reproduction.search import NEAREST
 from ethbrake_marl.extensions.reproduction.strategies import (
     COUPLED,
+    MAP_STEP_S,
     PAPERS,
     PREDICTED,
     SIMULATED,
@@ -37,15 +38,18 @@ ENDS_M = (10, 12, 14, 16, 18, 20)  # of the groups, for the sum of both gaps
 EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "PPO, not converged"
 
 
-def lines_of(reading: Reading, settings: Settings, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy under a reading, [n], and of the paper's process in its map."""
+def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
+    """Return the first-impact harm of each strategy under a reading, [n]."""
     found = strategies(reading, episodes, policies)
     lines = {name: each["first"] for name, each in found.items()} | {EXPECTED: found[E_V2X_BM][PREDICTED]}
-    if reading.step_s is None:
-        lines[PROVEN] = least_harm(reading, episodes)
-    for name, seeds in of_the_process(reading, episodes, settings).items():
-        lines[f"{name}, {PAPERS}"] = np.stack([seed[name]["first"] for seed in seeds])
-    return lines
+    return lines | ({PROVEN: least_harm(reading, episodes)} if reading.step_s is None else {})
+
+
+def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[str, Floats]:
+    """Return the same in the paper's map, with the policies of its process, [seeds, n]; nothing without trainings."""
+    found = of_the_process(reading, episodes, settings)
+    trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in found.items()}
+    return {**lines_of(reading._replace(step_s=MAP_STEP_S), episodes, {}), **trained} if found else {}
 
 
 def estimate(line: Floats, rows: Floats) -> Estimate:
@@ -77,7 +81,7 @@ def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequ
         for names in ([*next(iter(groups.values()))[0]],)
     }
     panels = {
-        reading: {name: curve for name, curve in curves.items() if name in shown or "process" in name}
+        reading: {name: curve for name, curve in curves.items() if name in shown}
         for reading, curves in estimates.items()
     }
     text = "Mean first-impact harm of each strategy under each reading; bands: 95 % intervals."
@@ -104,7 +108,7 @@ def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Grou
     episodes, found = min(DISTANCE_WORLDS, settings.episodes), {}
     for name, reading in (("as stated", STATED), ("nearest reading", NEAREST)):
         there = reading._replace(base=DISTANCE)
-        found[name] = by_distance(there, episodes, lines_of(there, settings, episodes, policies))
+        found[name] = by_distance(there, episodes, lines_of(there, episodes, policies))
     return found
 
 
@@ -112,6 +116,9 @@ def reproduce_distance(settings: Settings) -> Made:
     """Reproduce the figure of harm against the sum of both gaps."""
     readings = distances(settings, settings.policies)
     stated, nearest = (statements(groups, settings.policies) for groups in readings.values())
+    there, episodes = STATED._replace(base=DISTANCE), min(DISTANCE_WORLDS, settings.episodes)
+    if lines := process_lines(there, episodes, settings):
+        readings[PAPERS] = by_distance(there, episodes, lines)
     why = "where gaps are short, the deceleration that E-V2X-BM plans does far more harm than it predicts"
     whys = {"E-V2X-BM does less harm than non-ethical": why}
     claims = [judge("Fig. 4", text, parts, nearest[text], why=whys.get(text, "")) for text, parts in stated.items()]
@@ -147,21 +154,23 @@ ONE = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # the world 
 
 def reproduce_delays(settings: Settings) -> Made:
     """Reproduce the figure of harm at three delays, in its single world. The delays are our choice."""
-    groups: dict[str, tuple[Lines, Floats]] = {}
+    groups, trained, one = {}, {}, np.array([True])
     for delay in DELAYS:
         reading = STATED._replace(base=f"paper-delay-{delay}", others=ONE)
         _, middle, rear = opened(reading.only(*WORLDS), 1)[2].latency_s[0]
-        lines = lines_of(reading, settings, 1, settings.policies)
-        groups[f"{delay} ({middle:g}, {rear:g} s)"] = lines, np.array([True])
+        name = f"{delay} ({middle:g}, {rear:g} s)"
+        groups[name] = lines_of(reading, 1, settings.policies), one
+        trained[name] = process_lines(reading, 1, settings), one
     parts = [
         part
         for policy in settings.policies
         for other in (NON_E, E_V2X_BM, COUPLED)
         for part in less_in_each(groups, policy, other)
     ]
+    readings = {"as stated": groups} | ({PAPERS: trained} if all(lines for lines, _ in trained.values()) else {})
     claim = judge("Fig. 5", "SAC and PPO do the least harm at every delay (the delays are ours)", parts)
     shown = [NON_E, E_V2X_BM, COUPLED, *settings.policies, EXPECTED, PROVEN]
-    made = show_harm("harm-delays", "Gaps of 7 m, speeds of 20, 18 and 20 m/s", {"as stated": groups}, shown, "Delay")
+    made = show_harm("harm-delays", "Gaps of 7 m, speeds of 20, 18 and 20 m/s", readings, shown, "Delay")
     return made._replace(claims=[claim], notes=[f"One world: no intervals. {settings.who_drives}"])
 
 

@@ -127,11 +127,17 @@ class Course(NamedTuple):
 
     returns: Values  # mean return of training episodes
     harm: Values  # first-impact harm on the fixed list (m2/s2)
+    decisions: float = 100.0  # at the end
 
     @property
     def values(self) -> Floats:
         """Returns, [seeds, k]."""
         return np.array([[*each.values()] for each in self.returns])
+
+    @property
+    def late(self) -> Floats:
+        """Returns over the last quarter of the progress, [seeds, at least 2]."""
+        return self.values[:, -max(self.values.shape[1] // 4, 2) :]
 
     @property
     def last(self) -> Floats:
@@ -145,33 +151,40 @@ class Course(NamedTuple):
 
     @property
     def converged(self) -> Floats:
-        """Progress at which nine tenths of the rise are behind, [seeds] %; 100 without a rise."""
+        """Decisions after which nine tenths of the rise are behind, [seeds]; all of them without a rise."""
         risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
-        return np.where(self.rise > 0.0, np.array([*self.returns[0]])[risen.argmax(axis=1)], 100.0)
+        progress = np.where(self.rise > 0.0, np.array([*self.returns[0]])[risen.argmax(axis=1)], 100.0)
+        return 0.01 * self.decisions * progress
 
     @property
     def unrest(self) -> Floats:
-        """Standard deviation of the return over the second half of the progress, [seeds]."""
-        return np.asarray(self.values[:, self.values.shape[1] // 2 :].std(axis=1, ddof=1))
+        """Standard deviation of the return over the last quarter of the progress, [seeds]."""
+        return np.asarray(self.late.std(axis=1, ddof=1))
 
     @property
     def spread(self) -> Floats:
-        """Mean distance of the return from the mean of all seeds over the second half of the progress, [seeds]."""
-        half = self.values[:, self.values.shape[1] // 2 :]
-        return np.asarray(np.abs(half - half.mean(axis=0)).mean(axis=1))
+        """Mean distance of the return from the mean of all seeds over the last quarter of the progress, [seeds]."""
+        return np.asarray(np.abs(self.late - self.late.mean(axis=0)).mean(axis=1))
 
 
 def column(run: Path, name: str) -> dict[float, float]:
-    """Return a column of a run's table: progress (%) -> value, where there is one."""
-    rows = [*csv.DictReader((run / "progress.csv").read_text("utf-8").splitlines())]
-    last = float(rows[-1]["steps"])
-    return {100.0 * float(row["steps"]) / last: float(row[name]) for row in rows if row.get(name)}
+    """Return a column of a run's table: decisions -> value, where there is one."""
+    rows = csv.DictReader((run / "progress.csv").read_text("utf-8").splitlines())
+    return {float(row["steps"]): float(row[name]) for row in rows if row.get(name)}
+
+
+def course_of(runs: Sequence[Path]) -> Course:
+    """Return the course of the runs of one recipe at one delay."""
+    returns, harm = ([column(run, name) for run in runs] for name in (RETURN, HARM))
+    last = max(harm[0])
+    returns, harm = ([{100.0 * k / last: x for k, x in each.items()} for each in every] for every in (returns, harm))
+    return Course(returns, harm, last)
 
 
 def courses_of(settings: Settings, delay: str) -> dict[str, Course]:
     """Return the trainings at a delay that have finished: PPO or SAC -> course; none without ``full``."""
     return {
-        NAMES[recipe]: Course(*([column(run, name) for run in runs] for name in (RETURN, HARM)))
+        NAMES[recipe]: course_of(runs)
         for recipe, runs in (trained(settings.folder, delay) if settings.full else {}).items()
     }
 
@@ -207,7 +220,7 @@ STATEMENTS = {
     ),
     LOW: (
         "both algorithms reach higher returns than at high delay",
-        "SAC converges faster than PPO (in % of the training, as in the figure; the lengths are ours)",
+        "SAC converges faster than PPO (here: after fewer decisions)",
         "PPO converges more stably than SAC",
         "returns of different seeds vary more than at high delay",
     ),
@@ -227,8 +240,12 @@ def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Clai
     else:
         parts = [
             [Less.of_lists(name, high[name].last, low[name].last) for name in high],
-            [Less.of_lists("progress (%) at nine tenths of the rise", low["SAC"].converged, low["PPO"].converged)],
-            [Less.of_lists("deviation in the second half", low["PPO"].unrest, low["SAC"].unrest)],
+            [
+                Less.of_lists(
+                    "SAC minus PPO, decisions until nine tenths of the rise", low["SAC"].converged, low["PPO"].converged
+                )
+            ],
+            [Less.of_lists("PPO minus SAC, deviation in the last quarter", low["PPO"].unrest, low["SAC"].unrest)],
             [Less.of_lists(name, high[name].spread, low[name].spread) for name in high],
         ]
     return [judge(FIGURE[delay], text, each) for text, each in zip(STATEMENTS[delay], parts, strict=True)]
