@@ -192,12 +192,13 @@ def test_statements__of_the_distance_by_planted_harm() -> None:
 def test_distance__figure_and_tables_have_the_same_numbers() -> None:
     made = curves.reproduce_distance(SETTINGS)
     assert len(by_text(made)) == 4
-    stated, nearest = (axes.lines for axes in made.figures[0].figure.axes)
-    for lines, sheet in zip((stated, nearest), made.sheets, strict=True):
+    stated, *others = (axes.lines for axes in made.figures[0].figure.axes)
+    for lines, sheet in zip((stated, *others), made.sheets, strict=True):
         rows = {name: [each.value for each in cells] for name, *cells in sheet.rows}
         shown = {line.get_label(): line.get_ydata().tolist() for line in lines}
-        assert {name: rows[name] for name in shown} == shown and {NON_E, "PPO", "PPO, paper's process"} <= {*shown}
+        assert {name: rows[name] for name in shown} == shown and {NON_E, "PPO", "SAC"} <= {*shown}
         assert (PROVEN in rows) == (lines is stated) and EXPECTED in rows
+    assert len(others) == 2 and "paper's process" in made.sheets[2].title
 
 
 @pytest.mark.parametrize(("spec", "outcome"), [("ppo-obstacle", "differs"), ("e_v2x_bm:pairwise", "agrees")])
