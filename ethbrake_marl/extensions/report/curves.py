@@ -12,6 +12,7 @@ from matplotlib.ticker import EngFormatter
 from ethbrake_marl.extensions.report.style import band, finish, in_our_style, label_text, new_panels, series_style
 from ethbrake_marl.files.sheet import Estimate
 
+LONG = 30  # characters of a label that make a legend narrow
 Curve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
 
 
@@ -65,4 +66,5 @@ def curves_figure(
         if axes.dataLim.ymin >= 0.0:
             axes.set_ylim(bottom=0.0)
     every[0].set_ylabel(y_label)
-    return finish(figure, caption, every[0], columns=5 if len(panels) > 1 else 3)
+    narrow = len(panels) == 1 or max(map(len, labels), default=0) > LONG
+    return finish(figure, caption, every[0], columns=3 if narrow else 5)

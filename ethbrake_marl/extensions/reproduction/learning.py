@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.curves import curves_figure, over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
-from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
+from ethbrake_marl.extensions.reproduction.verdicts import APART, Claim, Less, judge
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
@@ -248,4 +248,8 @@ def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Clai
             [Less.of_lists("PPO minus SAC, deviation in the last quarter", low["PPO"].unrest, low["SAC"].unrest)],
             [Less.of_lists(name, high[name].spread, low[name].spread) for name in high],
         ]
-    return [judge(FIGURE[delay], text, each) for text, each in zip(STATEMENTS[delay], parts, strict=True)]
+    whole = Column("", digits=0, sign="+")
+    return [
+        judge(FIGURE[delay], text, each, show=whole if "decisions" in text else APART)
+        for text, each in zip(STATEMENTS[delay], parts, strict=True)
+    ]
