@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.curves import curves_figure, over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
-from ethbrake_marl.extensions.reproduction.verdicts import APART, Claim, Less, judge
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
@@ -220,7 +220,7 @@ STATEMENTS = {
     ),
     LOW: (
         "both algorithms reach higher returns than at high delay",
-        "SAC converges faster than PPO (here: after fewer decisions)",
+        "SAC converges faster than PPO",
         "PPO converges more stably than SAC",
         "returns of different seeds vary more than at high delay",
     ),
@@ -240,16 +240,17 @@ def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Clai
     else:
         parts = [
             [Less.of_lists(name, high[name].last, low[name].last) for name in high],
-            [
-                Less.of_lists(
-                    "SAC minus PPO, decisions until nine tenths of the rise", low["SAC"].converged, low["PPO"].converged
-                )
-            ],
+            [Less.of_lists("SAC minus PPO, decisions", low["SAC"].converged, low["PPO"].converged)],
             [Less.of_lists("PPO minus SAC, deviation in the last quarter", low["PPO"].unrest, low["SAC"].unrest)],
             [Less.of_lists(name, high[name].spread, low[name].spread) for name in high],
         ]
-    whole = Column("", digits=0, sign="+")
-    return [
-        judge(FIGURE[delay], text, each, show=whole if "decisions" in text else APART)
-        for text, each in zip(STATEMENTS[delay], parts, strict=True)
-    ]
+    claims = [judge(FIGURE[delay], text, each) for text, each in zip(STATEMENTS[delay], parts, strict=True)]
+    return claims if delay == HIGH else [claims[0], faster(low, claims[1]), *claims[2:]]
+
+
+def faster(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
+    """Return whether SAC converges faster. The paper's axis is the progress of trainings whose lengths it keeps."""
+    ends = {name: (course.converged.mean(), course.decisions) for name, course in courses.items()}
+    text = ", ".join(f"{name} after {at:,.0f} of {whole:,.0f} decisions" for name, (at, whole) in ends.items())
+    why = f"in decisions or in % of the training? The lengths are ours: {text} is at nine tenths of its rise"
+    return by_decisions._replace(ours=f"by decisions it {by_decisions.ours}", outcome="undecided", why=why)

@@ -187,8 +187,10 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
     for text in readings[0]:
         (words, stated), (_, nearest) = (each[text] for each in readings)
         ours, near = ("holds" if value < 0.0 else "does not hold" for value in (stated, nearest))
-        outcome: Outcome = "agrees" if stated < 0.0 else "differs"
-        why = words if stated < 0.0 else f"the policies are ours, not the paper's ({words})"
+        outcome: Outcome = "agrees" if stated < 0.0 else "undecided"
+        why = (
+            f"with our policies, {words}" if stated < 0.0 else f"our policies do not show it, the paper's may ({words})"
+        )
         claims.append(Claim(where, text, ours, near, outcome, why))
     return claims
 

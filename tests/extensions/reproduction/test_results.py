@@ -68,7 +68,7 @@ def outcomes(**harm: float) -> dict[str, dict[str, np.ndarray]]:
     }  # fmt: skip
 
 
-CONTRIBUTION_2 = "contribution 2: the hybrid is more reliable than learning alone (here: does less harm)"
+CONTRIBUTION_2 = "contribution 2: the hybrid is more reliable than learning alone (here: less harm, fewer collisions)"
 
 
 def test_conclusions__by_planted_harm() -> None:
@@ -81,14 +81,14 @@ def test_conclusions__by_planted_harm() -> None:
         "the hybrids do the least harm": ("holds in 8 of 8", "agrees"),
         "contribution 1: learning does less harm than the analytic baseline": ("holds in 4 of 4", "agrees"),
         "contribution 1: learning avoids collisions of the baseline": ("holds in 0 of 2", "differs"),
-        CONTRIBUTION_2: ("holds in 2 of 4", "differs"),
+        CONTRIBUTION_2: ("holds in 2 of 6", "differs"),
     }
     assert judged[CONTRIBUTION_2][2].startswith("Hybrid PPO minus PPO")
     worse = outcomes(NonE=4.0, EV2X=5.0, SAC=6.0, PPO=6.0, HSAC=5.5, HPPO=4.5)
     assert [judge_statement(parts)[:2] for parts in tables.conclusions(worse, SHIPPED).values()] == [
         ("does not hold", "differs"), ("holds in 0 of 4", "differs"), ("holds in 0 of 6", "differs"),
         ("holds in 2 of 8", "differs"), ("holds in 0 of 4", "differs"), ("holds in 0 of 2", "differs"),
-        ("holds in 4 of 4", "agrees"),
+        ("holds in 4 of 6", "differs"),
     ]  # fmt: skip
 
 
@@ -246,21 +246,21 @@ def test_trajectories_and_accelerations__have_these_numbers() -> None:
     assert len(ends) == len(commands) == 8
     assert ["as stated", "1", "PPO", "0", "0.00", "0.00", "0.16", "1.84"] in ends
     found = {each.paper: (each.outcome, each.nearest, each.why) for one in made for each in one.claims}
-    ours = "the policies are ours, not the paper's ({})".format
+    ours, with_ours = "our policies do not show it, the paper's may ({})".format, "with our policies, {}".format
     assert found == {
         "positions under PPO and SAC are more alike in Scenario 1 than in 2":
-            ("differs", "does not hold", ours("root mean square 2.06 m against 0.88 m")),
+            ("undecided", "does not hold", ours("root mean square 2.06 m against 0.88 m")),
         "Scenario 2: PPO keeps the larger distance to Vehicle 3":
-            ("agrees", "holds", "mean gap 5.92 m under SAC, 6.70 m under PPO"),
+            ("agrees", "holds", with_ours("mean gap 5.92 m under SAC, 6.70 m under PPO")),
         "Scenario 2: SAC keeps the larger distance to Vehicle 1":
-            ("agrees", "holds", "mean gap 3.28 m under PPO, 4.05 m under SAC"),
+            ("agrees", "holds", with_ours("mean gap 3.28 m under PPO, 4.05 m under SAC")),
         "profiles of PPO and SAC are more alike in Scenario 1 than in 2":
-            ("differs", "does not hold", ours("root mean square difference 3.13 m/s² against 2.16 m/s²")),
-        "Scenario 2: PPO accelerates before it brakes": ("agrees", "holds", "first command +7.00 m/s²"),
+            ("undecided", "does not hold", ours("root mean square difference 3.13 m/s² against 2.16 m/s²")),
+        "Scenario 2: PPO accelerates before it brakes": ("agrees", "holds", with_ours("first command +7.00 m/s²")),
         "Scenario 2: SAC decelerates throughout most of it":
-            ("agrees", "holds", "braking in 100 % of the time it moves"),
+            ("agrees", "holds", with_ours("braking in 100 % of the time it moves")),
         "Scenario 2: PPO's profile is the smoother one":
-            ("differs", "holds", ours("ups and downs 17.4 m/s² under PPO, 8.9 m/s² under SAC")),
+            ("undecided", "holds", ours("ups and downs 17.4 m/s² under PPO, 8.9 m/s² under SAC")),
     }  # fmt: skip
 
 
