@@ -100,7 +100,8 @@ LEAD = (
     "Each row is a number or a statement of the paper. *As stated*: with the parameters that the paper states, and our"
     " defaults for the others. *Nearest reading*: the values of what it leaves open that bring all numbers of Table III"
     " nearest together (found by a search, so a hypothesis). *Why* begins with the verdict on the row as stated:"
-    " agrees (within 2 %), differs because, cannot be because (with a proof), undecided (too few worlds)."
+    " agrees (within 2 %), differs because, cannot be because (with a proof), undecided (too few worlds, or our"
+    " choice decides)."
 )
 QUICK = "Figures 2 and 3, the paper's own process and the search over the readings need --full."
 
