@@ -110,6 +110,7 @@ _EXTRA_OF = {
     **dict.fromkeys(("pygame", "imageio_ffmpeg"), "render"),
     **dict.fromkeys(("ray", "joblib"), "cluster"),
     "optuna": "tune",
+    "numba_cuda": "cuda",
 }
 
 

@@ -1,0 +1,158 @@
+"""Where kernels run: on a GPU, through NVIDIA's driver, or on a processor, one world after the other."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.cuda.machine_code import ptx_of
+
+OLDEST = (7, 0)  # compute capability that torch supports, and with it this package
+BLOCK = 128  # threads that a GPU starts together
+
+
+class Kernel(NamedTuple):
+    """Something to do in n worlds, in two forms."""
+
+    name: str  # of all that decides its code beside the sources
+    thread: Callable[[], Callable[..., None]]  # returns the kernel of a GPU (``threads``)
+    each: Callable[..., None]  # does the work of all threads on a processor, with memory ``mine``
+    mine: Any  # of one thread, arrays
+
+    def launch(self, device: torch.device, n: int, *given: Any) -> None:
+        """Do the work of n threads. ``given`` are tensors on this device, numbers, and tuples of both."""
+        if device.type == "cuda":
+            _driver(device.index or 0).launch(self, n, given)
+        else:
+            self.each(self.mine, *_as_arrays(given), n)
+
+
+def device_named(name: str) -> torch.device:
+    """Return a device: ``cpu``, ``cuda`` or ``cuda:1``. Raises ``InvalidInput`` if it cannot run the kernels."""
+    try:
+        device = torch.device(name)
+    except (RuntimeError, TypeError):
+        device = torch.device("meta")
+    if device.type not in ("cpu", "cuda"):
+        raise InvalidInput(f"device = {name!r}: must be 'cuda', or 'cpu', where the same code runs slowly")
+    if device.type == "cuda":
+        _check_gpu(device.index or 0)
+        device = torch.device("cuda", device.index or 0)
+    return device
+
+
+def _check_gpu(index: int) -> None:
+    if torch.version.cuda is None:
+        raise InvalidInput(
+            f"device = 'cuda': the installed torch {torch.__version__} is not built for NVIDIA's GPUs; install a build"
+            " that is (pip install torch, on Linux), or use device 'cpu'"
+        )
+    if not torch.cuda.is_available():
+        raise InvalidInput(
+            "device = 'cuda': torch finds no NVIDIA GPU whose driver it can use (nvidia-smi lists GPUs and driver); use"
+            " device 'cpu'"
+        )
+    if not index < torch.cuda.device_count():
+        raise InvalidInput(f"device = 'cuda:{index}': there are only {torch.cuda.device_count()} GPUs, from cuda:0 on")
+    if torch.cuda.get_device_capability(index) < OLDEST:
+        name, has = torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index)
+        raise InvalidInput(
+            f"device = 'cuda:{index}': {name} has compute capability {has[0]}.{has[1]}; needs at least"
+            f" {OLDEST[0]}.{OLDEST[1]} (Volta, 2017); use device 'cpu'"
+        )
+
+
+def _as_arrays(given: Any) -> Any:
+    """Return arguments with arrays of numpy, in the same memory, in place of tensors."""
+    if isinstance(given, torch.Tensor):
+        return given.numpy()
+    if isinstance(given, tuple):
+        parts = [_as_arrays(each) for each in given]
+        return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)
+    return given
+
+
+def _like(given: Any) -> Any:
+    """Return arguments of the same types on the processor: with empty arrays in place of tensors."""
+    if isinstance(given, torch.Tensor):
+        return torch.empty((0,) * given.dim(), dtype=given.dtype).numpy()
+    if isinstance(given, tuple):
+        parts = [_like(each) for each in given]
+        return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)
+    return given
+
+
+def cells_of(given: Any) -> Iterator[Any]:
+    """Yield the parameters that a kernel compiled by numba takes for its arguments.
+
+    An array becomes two pointers that are not used, its number of entries, the size of one in bytes, its address, its
+    shape and its strides in bytes; a tuple becomes those of its parts.
+    """
+    if isinstance(given, tuple):
+        for each in given:
+            yield from cells_of(each)
+    elif isinstance(given, torch.Tensor):
+        assert given.is_contiguous()
+        size = given.element_size()
+        shape, strides = given.shape, [size * step for step in given.stride()]
+        for number in (0, 0, given.numel(), size, given.data_ptr(), *shape, *strides):
+            yield ctypes.c_int64(number)
+    elif isinstance(given, bool | np.bool_):
+        yield ctypes.c_int8(given)
+    elif isinstance(given, float):
+        yield ctypes.c_double(given)
+    else:
+        yield ctypes.c_int64(given)
+
+
+class _Driver:
+    """NVIDIA's driver of one GPU, in the context and on the stream of torch."""
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+        torch.zeros(1, device=f"cuda:{index}")  # torch makes the context
+        self.cuda = ctypes.CDLL("nvcuda.dll" if hasattr(ctypes, "windll") else "libcuda.so.1")
+        self.functions: dict[str, ctypes.c_void_p] = {}
+
+    def launch(self, kernel: Kernel, n: int, given: tuple[Any, ...]) -> None:
+        if not n:
+            return
+        with torch.cuda.device(self.index):
+            if kernel.name not in self.functions:
+                self.functions[kernel.name] = self.load(kernel, given)
+            cells = [*cells_of((*given, n))]
+            places = (ctypes.c_void_p * len(cells))(*(ctypes.addressof(cell) for cell in cells))
+            stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
+            function, blocks = self.functions[kernel.name], -(-n // BLOCK)
+            self.check("cuLaunchKernel", function, blocks, 1, 1, BLOCK, 1, 1, 0, stream, places, None)
+
+    def load(self, kernel: Kernel, given: tuple[Any, ...]) -> ctypes.c_void_p:
+        capability = torch.cuda.get_device_capability(self.index)
+        code = ptx_of(kernel.name, kernel.thread, (*_like(given), 0), capability)
+        module, function = ctypes.c_void_p(), ctypes.c_void_p()
+        self.check("cuModuleLoadData", ctypes.byref(module), code.encode() + b"\0")
+        self.check("cuModuleGetFunction", ctypes.byref(function), module, b"kernel")
+        return function
+
+    def check(self, call: str, *given: Any) -> None:
+        """Call a function of the driver. Raises ``InvalidInput`` with its reason if it fails."""
+        code = getattr(self.cuda, call)(*given)
+        if code:
+            text = ctypes.c_char_p()
+            self.cuda.cuGetErrorString(code, ctypes.byref(text))
+            reason = "unknown error" if text.value is None else text.value.decode()
+            raise InvalidInput(
+                f"device = 'cuda:{self.index}': the driver's {call} fails: {reason} (error {code}); with too little"
+                " memory use fewer worlds, with a driver older than 550 a newer one, or use device 'cpu'"
+            )
+
+
+@cache
+def _driver(index: int) -> _Driver:
+    return _Driver(index)

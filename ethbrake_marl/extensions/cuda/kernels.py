@@ -1,0 +1,181 @@
+"""What one thread does in one world: it copies the world into its own memory and calls the core's functions there.
+
+``step_worlds`` and ``observe_worlds`` are the core's, ``follow``, ``gather`` and ``improve`` those of the search; they
+are called as they are, with a batch of one world, so no rule is written a second time. The same text runs on a GPU
+(``device``), and on a processor, one world after the other.
+
+In arrays that all threads share the worlds come last, so that neighbouring threads read neighbouring numbers. n:
+worlds, B: bodies, L: learners, F: features.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.observe import N_NEIGHBOUR, N_OBSTACLE, N_OWN, N_ROLE, observe_worlds
+from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED
+from ethbrake_marl.episode.step import OUT_ROWS, step_worlds
+from ethbrake_marl.motion.compiling import large
+from ethbrake_marl.motion.layout import CAR_ROWS, LINE_ROWS, ROWS
+
+# what a launch of `play` does
+STEP = 0  # a step; an episode that has ended stays as it is
+RENEW = 1  # a step; an episode that ends is replaced by one in the next world of the pool
+BEGIN = 2  # replaces every episode
+LOOK = 3  # only observes
+
+# what may be wrong in a world
+FINE, NO_ACTION, PHYSICS_FAILED = 0, 1, 2
+
+
+class Stored(NamedTuple):
+    """Episodes, as in ``State``, with the worlds last."""
+
+    line: Any  # [LINE_ROWS, B, n]
+    car: Any  # [CAR_ROWS, B, n]
+    clock: Any  # [CLOCK_COLUMNS, n]
+    know: Any  # [B, B, n]
+    wanted: Any  # [B, n]
+
+
+class Results(NamedTuple):
+    """What a step did."""
+
+    out: Any  # [OUT_ROWS, n] rows as in `Step.out`
+    reward: Any  # [n] of every learner
+    observations: Any  # [n, L, F] float32
+    status: Any  # [n] FINE, NO_ACTION or PHYSICS_FAILED
+
+
+class Ruling(NamedTuple):
+    """The numbers that a step needs: the fields of ``Rules``."""
+
+    learners: Any  # [L]
+    time_step_s: Any
+    horizon_s: Any
+    harm: Any
+    terminal: Any
+    counting: Any  # [6]
+
+
+class Looking(NamedTuple):
+    """How a view is computed: the fields of ``Plan`` that need no function of Python."""
+
+    offsets: Any
+    role: Any
+    obstacle: Any
+    places: Any
+    scaling: Any  # [3, F]
+
+
+class Mine(NamedTuple):
+    """A thread's own memory: one world, and what it works with."""
+
+    line: Any
+    car: Any
+    clock: Any
+    know: Any
+    wanted: Any
+    actions: Any
+    scratch: Any
+    out: Any
+    reward: Any
+    value: Any
+    seen: Any  # float32, all others float64
+
+
+def shapes_of(bodies: int, learners: int, features: int, neighbours: int) -> Mine:
+    """Return the shapes of a thread's own memory for ``play``."""
+    return Mine(
+        line=(1, LINE_ROWS, bodies),
+        car=(1, CAR_ROWS, bodies),
+        clock=(1, CLOCK_COLUMNS),
+        know=(1, bodies, bodies),
+        wanted=(1, bodies),
+        actions=(1, learners),
+        scratch=(ROWS, bodies),
+        out=(OUT_ROWS, 1),
+        reward=(1, bodies - 1),
+        value=(N_OWN + N_NEIGHBOUR * neighbours + N_ROLE + N_OBSTACLE,),
+        seen=(1, learners, features),
+    )
+
+
+@large
+def load(t, stored, mine):
+    """Copy world t into a thread's own memory."""
+    for i in range(mine.wanted.shape[1]):
+        for row in range(mine.line.shape[1]):
+            mine.line[0, row, i] = stored.line[row, i, t]
+        for row in range(mine.car.shape[1]):
+            mine.car[0, row, i] = stored.car[row, i, t]
+        for j in range(mine.wanted.shape[1]):
+            mine.know[0, i, j] = stored.know[i, j, t]
+        mine.wanted[0, i] = stored.wanted[i, t]
+    for row in range(mine.clock.shape[1]):
+        mine.clock[0, row] = stored.clock[row, t]
+
+
+@large
+def save(t, stored, mine, is_new):
+    """Copy a thread's world back: what a step changes, and all of it if the world is new."""
+    for i in range(mine.wanted.shape[1]):
+        for row in range(mine.line.shape[1]):
+            stored.line[row, i, t] = mine.line[0, row, i]
+        stored.wanted[i, t] = mine.wanted[0, i]
+        if is_new:
+            for row in range(mine.car.shape[1]):
+                stored.car[row, i, t] = mine.car[0, row, i]
+            for j in range(mine.wanted.shape[1]):
+                stored.know[i, j, t] = mine.know[0, i, j]
+    for row in range(mine.clock.shape[1]):
+        stored.clock[row, t] = mine.clock[0, row]
+
+
+@large
+def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
+    """Let world t take a step, as ``mode`` says, and observe it.
+
+    ``actions`` [n, L] float32 are clipped to [-1, 1]. If one of them is no number, nothing moves and ``status`` says
+    so. ``following`` [n] is the world of the pool in which the next episode begins.
+    """
+    load(t, stored, mine)
+    is_new = mode == BEGIN
+    if mode == STEP or mode == RENEW:
+        runs = mine.clock[0, ENDED] == 0.0
+        for j in range(mine.actions.shape[1]):
+            action = float(actions[t, j])
+            mine.actions[0, j] = 1.0 if action > 1.0 else (-1.0 if action < -1.0 else action)
+        refused, failed = step_worlds(
+            mine.line, mine.car, mine.clock, mine.wanted, mine.actions, mine.scratch, mine.out, mine.reward,
+            rules.learners, rules.time_step_s, rules.horizon_s, rules.harm, rules.terminal, rules.counting,
+        )  # fmt: skip
+        for row in range(mine.out.shape[0]):
+            results.out[row, t] = mine.out[row, 0] if refused < 0 else 0.0
+        results.reward[t] = mine.reward[0, 0] if refused < 0 else 0.0
+        if failed >= 0:
+            results.status[t] = PHYSICS_FAILED
+        elif refused >= 0 and runs:
+            results.status[t] = NO_ACTION
+        is_new = mode == RENEW and mine.clock[0, ENDED] == 1.0
+    if is_new:
+        load(following[t], pool, mine)
+        following[t] = (following[t] + following.shape[0]) % pool.wanted.shape[1]
+    if mode != LOOK:
+        save(t, stored, mine, is_new)
+    observe_worlds(
+        mine.line, mine.car, mine.clock, mine.know, rules.learners, view.offsets, view.role, view.obstacle, view.places,
+        view.scaling, mine.value, mine.seen,
+    )  # fmt: skip
+    for j in range(mine.seen.shape[1]):
+        for f in range(mine.seen.shape[2]):
+            results.observations[t, j, f] = mine.seen[0, j, f]
+
+
+@large
+def play_each(mine, stored, pool, following, actions, results, rules, view, mode, n):
+    """Do the work of n threads of ``play`` on a processor."""
+    for t in range(n):
+        play(t, mine, stored, pool, following, actions, results, rules, view, mode)

@@ -1,0 +1,70 @@
+"""PTX, the machine code that NVIDIA's driver takes, of a kernel: made without a GPU, and kept beside the kernels' own.
+
+Multiplications and additions stay apart (``fma=0``), so every operation rounds as on a processor, and a world has the
+same bits there and here. The driver compiles PTX for its GPU when it is loaded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ethbrake_marl.errors import MissingExtra, naming_extras
+from ethbrake_marl.files.store import write_file
+from ethbrake_marl.motion.compiling import folder_of
+
+NEWEST = (9, 0)  # GPUs that are newer run the code of this one
+PTX_VERSION = "8.4"  # every driver from 550 on reads it, and nothing here needs a newer one
+
+
+def ptx_of(
+    name: str, kernel: Callable[[], Callable[..., None]], given: tuple[Any, ...], capability: tuple[int, int]
+) -> str:
+    """Return the PTX of a kernel, whose entry is called ``kernel``, for arguments of the types of ``given``.
+
+    ``name`` says all that decides the code beside the sources. ``capability`` is the GPU's. Raises ``MissingExtra``
+    if the code has not been made before, and numba-cuda is not installed.
+    """
+    capability = min(capability, NEWEST)
+    file = folder_of(str(Path(__file__).with_name("kernels.py"))) / f"{name}-{capability[0]}{capability[1]}.ptx"
+    if not file.exists():
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_file(file, made(kernel(), given, capability).encode())
+    return file.read_text()
+
+
+def made(kernel: Callable[..., None], given: tuple[Any, ...], capability: tuple[int, int]) -> str:
+    """Compile a kernel."""
+    with naming_extras():
+        import numba_cuda  # noqa: F401  # replaces numba.cuda
+    import numba
+    from numba import cuda
+
+    with without_fma(capability):
+        types = numba.void(*(numba.typeof(each) for each in given))
+        text, _ = cuda.compile_ptx(kernel, types, cc=capability)
+    text = re.sub(r"\.version \d+\.\d+", f".version {PTX_VERSION}", text, count=1)
+    entry = re.search(r"\.entry (\w+)\(", text)
+    assert entry is not None
+    return text.replace(entry[1], "kernel")
+
+
+@contextmanager
+def without_fma(capability: tuple[int, int]) -> Iterator[None]:
+    """Context manager: numba-cuda keeps * and + apart, which it has no option for, and asks no GPU what it can."""
+    from numba.cuda import dispatcher
+    from numba.cuda.cudadrv import nvvm
+
+    class Gpu:
+        compute_capability = capability
+
+    before = nvvm.compile_ir, dispatcher.get_current_device
+    nvvm.compile_ir = lambda code, **options: before[0](code, **options | {"fma": 0})
+    dispatcher.get_current_device = lambda: Gpu
+    try:
+        yield
+    finally:
+        nvvm.compile_ir, dispatcher.get_current_device = before

@@ -1,0 +1,41 @@
+"""Kernels for a GPU: a thread takes memory of its own, and does the work of one world (``kernels``).
+
+numba's simulator runs them without a GPU. Only what is launched imports this module, because numba.cuda is slow to
+import.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from numba import cuda, float32, float64
+
+from ethbrake_marl.extensions.cuda.kernels import Mine, play
+
+
+def play_thread(shapes: Mine) -> Callable[..., None]:
+    """Return the kernel that does ``play`` in n worlds, with one thread for each; ``shapes`` are constants of it."""
+    line, car, clock, know, wanted, proposed, scratch, out, rewards, value, seen = shapes
+
+    def play_worlds(
+        stored: Any, pool: Any, following: Any, actions: Any, results: Any, rules: Any, view: Any, mode: Any, n: Any
+    ) -> None:
+        t = cuda.grid(1)
+        if t < n:
+            mine = Mine(
+                cuda.local.array(line, float64),
+                cuda.local.array(car, float64),
+                cuda.local.array(clock, float64),
+                cuda.local.array(know, float64),
+                cuda.local.array(wanted, float64),
+                cuda.local.array(proposed, float64),
+                cuda.local.array(scratch, float64),
+                cuda.local.array(out, float64),
+                cuda.local.array(rewards, float64),
+                cuda.local.array(value, float64),
+                cuda.local.array(seen, float32),
+            )
+            play(t, mine, stored, pool, following, actions, results, rules, view, mode)
+
+    return play_worlds

@@ -1,0 +1,239 @@
+"""``Worlds``: many episodes on a GPU, as torch tensors: step, observe, begin again, without a copy to the processor."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import LAST, State, check_exact
+from ethbrake_marl.episode.step import HARM, OUT_ROWS, TERMINATED, TOTAL_HARM, TRUNCATED, failure
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.extensions.cuda.device import Kernel, device_named
+from ethbrake_marl.extensions.cuda.kernels import (
+    BEGIN,
+    LOOK,
+    NO_ACTION,
+    PHYSICS_FAILED,
+    RENEW,
+    STEP,
+    Looking,
+    Mine,
+    Results,
+    Ruling,
+    Stored,
+    play_each,
+    shapes_of,
+)
+from ethbrake_marl.names import open_game
+from ethbrake_marl.worlds.game import AnyScenario
+
+POOL = 100_000  # worlds that are drawn by default
+
+
+class Stepped(NamedTuple):
+    """What a step did in n worlds: tensors that the next step overwrites."""
+
+    observations: Tensor  # [n, L, F] float32 of the learners, front to rear; of the new episode where one has begun
+    reward: Tensor  # [n] float64 of every learner
+    terminated: Tensor  # [n] bool, whether all vehicles have come to rest
+    truncated: Tensor  # [n] bool, whether the horizon came first
+    first_impact_harm: Tensor  # [n] float64 of the line in this step (m2/s2)
+    total_harm: Tensor  # [n] float64 of all impacts of the line in this step (m2/s2)
+
+
+class Worlds:
+    """n episodes on one device, with the bits of ``Game.step``.
+
+    An episode that ends is replaced, in the same step, by one in the next world of a pool, which is drawn in advance.
+
+    >>> import torch
+    >>> from ethbrake_marl.extensions.cuda import Worlds
+    >>> worlds = Worlds("paper-random", 64, pool=256, device="cpu")
+    >>> observations = worlds.reset()
+    >>> step = worlds.step(torch.full((64, 1), -1.0))
+    >>> step.observations.shape, step.reward.dtype
+    (torch.Size([64, 1, 27]), torch.float64)
+
+    """
+
+    def __init__(
+        self,
+        scenario: AnyScenario,
+        n: int,
+        pool: int | State = POOL,
+        device: str = "cuda",
+        *,
+        seed: int = 0,
+        learners: Any = None,
+        reward: Any = "harm",
+        observation: Any = None,
+    ) -> None:
+        """Draw the pool, and bring it to the device.
+
+        Args:
+            scenario: as for ``open_game``; so are ``learners``, ``reward`` and ``observation``.
+            n: number of episodes.
+            pool: number of training worlds that are drawn, or worlds at the alert (``Scenario.sample``).
+            device: ``cuda``, ``cuda:1``, or ``cpu``, where the same code runs slowly.
+            seed: of the training worlds.
+
+        Raises ``InvalidInput`` for what no kernel computes: scripts that look at the state, messages, another physics,
+        features and terms of the reward with functions of Python, learners with different views; and for a device
+        that cannot run kernels. Raises ``MissingExtra`` if the kernels must be compiled and numba-cuda is missing.
+
+        """
+        check_whole_number("n", n, 1)
+        self.n, self.device = n, device_named(device)
+        self.scenario, self.game = open_game(scenario, learners, reward, observation)
+        check_runs(self.game)
+        if isinstance(pool, State):
+            worlds = pool
+        else:
+            check_whole_number("pool", pool, 1)
+            worlds = self.game.draw(pool, seed, 0)
+        first = self.game.reset(worlds)
+        self.longest = int(first.clock[:, LAST].max())  # decisions of the longest episode
+        self.pool = self.stored(first)
+        self.view = self.game.views[int(self.game.rules.learners[0])]
+        self.rules, self.looking, self.kernel = kernel_of(self.game, first.vehicles + 1, self.device)
+        self.now = Stored(*(self._zeros(*each.shape[:-1], n) for each in self.pool))
+        self.following = torch.arange(n, device=self.device) % first.n
+        L, F = len(self.game.rules.learners), len(self.view.names)
+        self.results = Results(
+            self._zeros(OUT_ROWS, n),
+            self._zeros(n),
+            self._zeros(n, L, F, kind=torch.float32),
+            self._zeros(n, kind=torch.int64),
+        )
+        self._no_actions = self._zeros(n, L, kind=torch.float32)
+
+    def _zeros(self, *shape: int, kind: torch.dtype = torch.float64) -> Tensor:
+        return torch.zeros(*shape, dtype=kind, device=self.device)
+
+    def stored(self, state: State) -> Stored:
+        """Return episodes as tensors on this device."""
+        arrays = (state.line, state.car, state.clock, state.know, state.wanted)
+        return Stored(*(torch.from_numpy(np.moveaxis(each, 0, -1).copy()).to(self.device) for each in arrays))
+
+    def reset(self) -> Tensor:
+        """Begin all episodes, in the first n worlds of the pool; return what the learners observe, [n, L, F]."""
+        torch.arange(self.n, out=self.following)
+        self.following.remainder_(self.pool.wanted.shape[1])
+        self.results.status.zero_()
+        self._launch(self._no_actions, BEGIN)
+        return self.results.observations
+
+    def step(self, actions: Tensor, *, renew: bool = True) -> Stepped:
+        """Take one step in all episodes.
+
+        ``actions`` [n, L] float32 are clipped to [-1, 1]. With ``renew`` False an episode that has ended stays as it
+        is, and its reward and harm are 0. What goes wrong in a world is kept for ``check``, so that no step waits for
+        the device. Raises ``InvalidInput`` for a tensor of another shape, type or device.
+        """
+        shape = self._no_actions.shape
+        if not (isinstance(actions, Tensor) and actions.shape == shape and actions.dtype == torch.float32):
+            what = f"{actions.dtype} of shape {tuple(actions.shape)}" if isinstance(actions, Tensor) else repr(actions)
+            raise InvalidInput(f"actions = {what:.80}: must be a torch tensor, float32, of shape {tuple(shape)}")
+        if actions.device != self.device:
+            raise InvalidInput(f"actions: are on the device {actions.device}, the worlds on {self.device}")
+        self._launch(actions.detach().contiguous(), RENEW if renew else STEP)
+        out, reward, observations, _ = self.results
+        ends = out[TERMINATED] == 1.0, out[TRUNCATED] == 1.0
+        return Stepped(observations, reward, *ends, out[HARM], out[TOTAL_HARM])
+
+    def put(self, stored: Stored, rows: Tensor) -> Tensor:
+        """Continue the episodes ``rows`` [n] of another ``Stored``; return what the learners observe, [n, L, F]."""
+        for mine, other in zip(self.now, stored, strict=True):
+            torch.index_select(other, -1, rows, out=mine)
+        self._launch(self._no_actions, LOOK)
+        return self.results.observations
+
+    def _launch(self, actions: Tensor, mode: int) -> None:
+        given = (self.now, self.pool, self.following, actions, self.results, self.rules, self.looking, mode)
+        self.kernel.launch(self.device, self.n, *given)
+
+    def state(self) -> State:
+        """Return the episodes as the core's ``State``, copied to the processor."""
+        arrays = (np.ascontiguousarray(np.moveaxis(each.cpu().numpy(), -1, 0)) for each in self.now)
+        return State(*arrays, {})
+
+    def check(self) -> None:
+        """Raise an error for the first world in which something went wrong in a step since the last ``reset``.
+
+        ``InvalidInput`` for an action that is no number, ``PhysicsError`` if a check of the physics failed.
+        """
+        if not bool(self.results.status.any()):
+            return
+        status = self.results.status.cpu().numpy()
+        row = int(status.nonzero()[0][0])
+        if status[row] == NO_ACTION:
+            raise InvalidInput(f"actions: an action of row {row} is no number; nothing has moved in this world")
+        assert status[row] == PHYSICS_FAILED
+        state = self.state()
+        raise failure(state, row, state.time_s[row], self.game.rules.horizon_s)
+
+
+def check_runs(game: Game) -> None:
+    """Raise ``InvalidInput`` for what kernels of a GPU do not compute; the message says what they do."""
+    what = f"scenario {game.name!r} on a GPU"
+    for body, script in game.scripts.items():
+        name = getattr(script, "name", type(script).__name__)
+        raise InvalidInput(
+            f"{what}: vehicle_{body} is driven by {name!r}, which looks at the state; scripts that hold one command run"
+            " there, such as full_brake and coast (--set roles.NAME=full_brake)"
+        )
+    if type(game) is not Game:
+        raise InvalidInput(
+            f"{what}: its worlds are those of {type(game).__module__}.{type(game).__name__}; messages with content and"
+            " another physics run on a processor only"
+        )
+    if game.shield is not None:
+        raise InvalidInput(f"{what}: has a shield, which runs on a processor only; train without it, then shield")
+    if not len(game.rules.learners):
+        raise InvalidInput(f"{what}: has no learner; make a vehicle one: learners=['vehicle_2']")
+    if not game.rewarding.is_compiled:
+        parts = [name for name, *_ in game.rewarding.terms] + ["shaping"] * (game.rewarding.shaping is not None)
+        raise InvalidInput(
+            f"{what}: the reward has {', '.join(parts) or 'components'}; the terms harm (of the whole line, in any"
+            " count) and terminal run there"
+        )
+    views = {game.views[i] for i in game.rules.learners.tolist()}
+    if len(views) > 1:
+        raise InvalidInput(f"{what}: its learners observe different features; give all of them the same observation")
+    plan = next(iter(views)).plan
+    beside = [group.name for group, *_ in plan.groups] + [own.feature.name for _, own, _ in plan.own]
+    if beside:
+        raise InvalidInput(
+            f"{what}: the observation has {', '.join(beside)}, which functions of Python compute; the groups own,"
+            " front_K, rear_K, role and obstacle run there"
+        )
+
+
+def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Looking, Kernel]:
+    """Return what ``play`` needs beside the worlds, and its kernel."""
+    on = partial(torch.tensor, device=device)
+    rules, plan = game.rules, game.views[int(game.rules.learners[0])].plan
+    ruling = Ruling(
+        on(rules.learners),
+        float(rules.time_step_s),
+        float(rules.horizon_s),
+        float(rules.harm),
+        float(rules.terminal),
+        on(rules.counting),
+    )
+    looking = Looking(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
+    size = bodies, len(rules.learners), plan.scaling.shape[1], len(plan.offsets)
+    shapes = shapes_of(*size)
+    memory = Mine(*(np.zeros(shape, np.float32 if shape is shapes.seen else np.float64) for shape in shapes))
+    return ruling, looking, Kernel("play-" + "-".join(map(str, size)), partial(_thread, shapes), play_each, memory)
+
+
+def _thread(shapes: Mine) -> Any:
+    from ethbrake_marl.extensions.cuda.threads import play_thread  # numba.cuda is slow to import
+
+    return play_thread(shapes)
