@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from ethbrake_marl.episode.observe import N_NEIGHBOUR, N_OBSTACLE, N_OWN, N_ROLE, observe_worlds
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED
 from ethbrake_marl.episode.step import OUT_ROWS, step_worlds

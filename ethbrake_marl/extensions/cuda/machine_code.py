@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.errors import MissingExtra, naming_extras
+from ethbrake_marl.errors import naming_extras
 from ethbrake_marl.files.store import write_file
 from ethbrake_marl.motion.compiling import folder_of
 

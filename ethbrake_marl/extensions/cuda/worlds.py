@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import LAST, State, check_exact
+from ethbrake_marl.episode.state import LAST, State
 from ethbrake_marl.episode.step import HARM, OUT_ROWS, TERMINATED, TOTAL_HARM, TRUNCATED, failure
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.extensions.cuda.device import Kernel, device_named
@@ -76,7 +76,10 @@ class Worlds:
         """Draw the pool, and bring it to the device.
 
         Args:
-            scenario: as for ``open_game``; so are ``learners``, ``reward`` and ``observation``.
+            scenario: as for ``open_game``, and so are
+            learners: which vehicles learn,
+            reward: of terms that the compiled step knows, and
+            observation: the features of the groups own, front_K, rear_K, role and obstacle.
             n: number of episodes.
             pool: number of training worlds that are drawn, or worlds at the alert (``Scenario.sample``).
             device: ``cuda``, ``cuda:1``, or ``cpu``, where the same code runs slowly.
