@@ -208,11 +208,11 @@ def check_runs(game: Game) -> None:
     views = {game.views[i] for i in game.rules.learners.tolist()}
     if len(views) > 1:
         raise InvalidInput(f"{what}: its learners observe different features; give all of them the same observation")
-    plan = next(iter(views)).plan
-    beside = [group.name for group, *_ in plan.groups] + [own.feature.name for _, own, _ in plan.own]
+    (view,) = views
+    beside = [name for name, place in zip(view.names, view.plan.places, strict=False) if place < 0]
     if beside:
         raise InvalidInput(
-            f"{what}: the observation has {', '.join(beside)}, which functions of Python compute; the groups own,"
+            f"{what}: the observation has {', '.join(beside[:5])}, which functions of Python compute; the groups own,"
             " front_K, rear_K, role and obstacle run there"
         )
 
