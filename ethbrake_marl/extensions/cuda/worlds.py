@@ -156,9 +156,12 @@ class Worlds:
         self._launch(self._no_actions, LOOK)
         return self.results.observations
 
+    def arguments(self, actions: Tensor, mode: int) -> tuple[Any, ...]:
+        """Return the arguments of the kernel ``play``, but for the thread."""
+        return self.now, self.pool, self.following, actions, self.results, self.rules, self.looking, mode
+
     def _launch(self, actions: Tensor, mode: int) -> None:
-        given = (self.now, self.pool, self.following, actions, self.results, self.rules, self.looking, mode)
-        self.kernel.launch(self.device, self.n, *given)
+        self.kernel.launch(self.device, self.n, *self.arguments(actions, mode))
 
     def state(self) -> State:
         """Return the episodes as the core's ``State``, copied to the processor."""

@@ -10,7 +10,6 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.cuda.worlds import Worlds
 from tests.refused import refused
 
