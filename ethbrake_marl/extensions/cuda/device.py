@@ -106,7 +106,7 @@ def cells_of(given: Any) -> Iterator[Any]:
         shape, strides = given.shape, [size * step for step in given.stride()]
         for number in (0, 0, given.numel(), size, given.data_ptr(), *shape, *strides):
             yield ctypes.c_int64(number)
-    elif isinstance(given, bool | np.bool_):
+    elif isinstance(given, bool):
         yield ctypes.c_int8(given)
     elif isinstance(given, float):
         yield ctypes.c_double(given)
