@@ -14,12 +14,13 @@ from ethbrake_marl.episode.counts import other_count, weights_of
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.cuda.device import Kernel, device_named
 from ethbrake_marl.extensions.cuda.search_kernels import Own, Plans, Searched, search_each, shapes_of
+from ethbrake_marl.extensions.proofs.line import rows_of
 from ethbrake_marl.extensions.search.kernels import STEPWISE
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
 from ethbrake_marl.extensions.search.search import PROFILES, seeded
 from ethbrake_marl.motion.layout import Floats
 
-WHOLE_NUMBERS = ("ends", "best_ends", "best_phases", "given_ends", "given_phases")  # in a thread's own memory
+WHOLE_NUMBERS = ("ends", "best_ends", "kind")  # in a thread's own memory
 
 
 def search(
@@ -29,7 +30,7 @@ def search(
     seconds: float | None = None,
     rounds: int = 6,
     restarts: int = 16,
-    drawn: int = 200,
+    drawn: int = 50,
     changes: int = 400,
     seed: int = 0,
     device: str = "cuda",
@@ -46,7 +47,7 @@ def search(
         seconds: begin no further round later; the result then depends on the speed. None: ``rounds`` of them.
         rounds: of random changes.
         restarts: threads in each world, a power of two.
-        drawn: random profiles that each thread draws in the first round.
+        drawn: random profiles that each thread tries in the first round, beside some of full driving and braking.
         changes: random changes that each thread tries in a round.
         seed: of the random numbers.
         device: as for ``Worlds``.
@@ -62,7 +63,7 @@ def search(
     on, n, begun = device_named(device), problem.n, time.monotonic()
     searched, kernel = _searched(problem, on)
     plans = _started(problem, given, restarts, seed, on)
-    drawing = torch.from_numpy(PROFILES[np.newaxis]).to(on)
+    drawing = torch.from_numpy(PROFILES.copy()).to(on)
     for number in range(rounds if seconds is None else 1 << 20):
         asked = (searched, plans, drawing, drawn if number == 0 else 0, changes)
         kernel.launch(on, n * restarts, *asked)
@@ -92,8 +93,11 @@ def _searched(problem: Problem, on: torch.device) -> tuple[Searched, Kernel]:
     count, state = problem.harm_count, problem.state
     numbers = np.array([problem.time_step_s, problem.horizon_s, problem.aim, 0.0])
     weights = np.stack([weights_of(count), weights_of(other_count(count))])
+    at = rows_of(state, int(problem.bodies[0]))
+    forward = (state.speeds_mps >= 0.0).all(axis=1) & (len(problem.bodies) == 1)
+    by_world = (state.line, state.car, state.clock, state.wanted, problem.bounds, problem.shares, at, forward)
     searched = Searched(
-        *(moved(each) for each in (state.line, state.car, state.clock, state.wanted, problem.bounds, problem.shares)),
+        *(moved(each) for each in by_world),
         *(torch.from_numpy(each.copy()).to(on) for each in (problem.bodies, numbers, weights)),
     )
     size = state.vehicles + 1, len(problem.bodies)

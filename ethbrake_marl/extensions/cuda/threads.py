@@ -44,8 +44,8 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
 
 def search_thread(shapes: Own) -> Callable[..., None]:
     """Return the kernel that does ``search`` in n threads; ``shapes`` are constants of it."""
-    car, clock, wanted, bounds, shares, scratch, lines, tried, commands, best_commands, given_commands = shapes[:11]
-    change, best_value, ends, best_ends, best_phases, given_ends, given_phases, random = shapes[11:]
+    car, clock, wanted, bounds, shares, at, scratch, lines, tried = shapes[:9]
+    commands, best_commands, change, ends, best_ends, kind, random = shapes[9:]
 
     def search_worlds(searched: Any, plans: Any, drawing: Any, drawn: Any, budget: Any, n: Any) -> None:
         t = cuda.grid(1)
@@ -56,19 +56,16 @@ def search_thread(shapes: Own) -> Callable[..., None]:
                 cuda.local.array(wanted, float64),
                 cuda.local.array(bounds, float64),
                 cuda.local.array(shares, float64),
+                cuda.local.array(at, float64),
                 cuda.local.array(scratch, float64),
                 cuda.local.array(lines, float64),
                 cuda.local.array(tried, float64),
                 cuda.local.array(commands, float64),
                 cuda.local.array(best_commands, float64),
-                cuda.local.array(given_commands, float64),
                 cuda.local.array(change, float64),
-                cuda.local.array(best_value, float64),
                 cuda.local.array(ends, int64),
                 cuda.local.array(best_ends, int64),
-                cuda.local.array(best_phases, int64),
-                cuda.local.array(given_ends, int64),
-                cuda.local.array(given_phases, int64),
+                cuda.local.array(kind, int64),
                 cuda.local.array(random, uint64),
             )
             search(t, own, searched, plans, drawing, drawn, budget)

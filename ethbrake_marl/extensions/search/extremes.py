@@ -11,15 +11,17 @@ import numpy as np
 
 from ethbrake_marl.extensions.proofs.line import rows_of
 from ethbrake_marl.extensions.proofs.meetings import meet_front, meet_rear
-from ethbrake_marl.extensions.search.kernels import RESOLUTION, try_all
+from ethbrake_marl.extensions.search.kernels import allowed, try_all
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
 from ethbrake_marl.extensions.search.search import prepared, seeded
+from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import Floats
 
 KEPT = 12  # profiles of each world
 LATEST_S = 2.0  # latest first change of command, in the first round
 TIMES = 24  # first changes that are tried in each round
 ROUNDS = 3  # each closer to the best time so far
+EXTREME_PHASES = 5
 WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # steps by which the second change comes early, and the share in it
 
 
@@ -38,11 +40,11 @@ def extreme_profiles(problem: Problem) -> Profiles:
         world, room = prepared(problem, int(k), random, MOST_PHASES, False)
         tried, values = [], []
         for kind in kinds:
-            meet, low, high = (meet_front, meet_rear)[kind], 0.0, LATEST_S
+            low, high = 0.0, LATEST_S
             for _ in range(ROUNDS):
                 changes = low + (high - low) * np.arange(TIMES) / (TIMES - 1)
-                meetings, value = np.array([meet(at[k], change) for change in changes]), np.empty(TIMES * len(WAYS))
-                tried.append(extremes(problem, int(k), kind, changes, meetings))
+                value = np.empty(TIMES * len(WAYS))
+                tried.append(extremes(problem, int(k), at[k], kind, changes))
                 try_all(world, room, *tried[-1], value)
                 values.append(value)
                 best = changes[value.argmin() // len(WAYS)]
@@ -55,23 +57,45 @@ def extreme_profiles(problem: Problem) -> Profiles:
     return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, 1))
 
 
-def extremes(problem: Problem, k: int, kind: int, changes: Floats, meetings: Floats) -> Profiles:
-    """Return the extreme profiles of world k that change at these times (s) and at these meetings, [TIMES * WAYS].
+@large
+def meeting_of(at, kind, change):
+    """Return when (s) a vehicle that changes its command at ``change`` (s) meets its neighbour; infinite: never."""
+    return meet_front(at, change) if kind == 0 else meet_rear(at, change)
+
+
+@large
+def write_extreme(kind, change, meeting, early, share, step, last, low, high, ends, commands):
+    """Write the extreme profile that changes at ``change`` (s) and at ``meeting`` (s).
 
     ``kind`` 0 drives, brakes and drives; 1 brakes, drives and brakes. Commands change between steps only: within the
     step of a change the command is the mean of both, so that the speed after it is exact.
     """
-    low, high = problem.bounds[k, 0]
-    first, second = (low, high) if kind else (high, low)
+    first, second = (high, low) if kind == 0 else (low, high)
+    turn = int(min(change / step, float(last)))
+    back = max(int(min(meeting / step, float(last))) - early, turn + 1)
+    ends[0], ends[1], ends[2] = turn, min(turn + 1, last), min(back, last)
+    ends[3], ends[4] = min(back + 1, last), last
+    commands[0, 0] = commands[4, 0] = allowed(first, low, high)
+    commands[1, 0] = allowed(second + (change / step - turn) * (first - second), low, high)
+    commands[2, 0] = allowed(second, low, high)
+    commands[3, 0] = allowed(second + share * (first - second), low, high)
+
+
+@large
+def write_extremes(at, kind, changes, step, last, low, high, ends, commands):
+    """Write the extreme profiles that change at these times (s), in all ways, [TIMES * WAYS]."""
+    row = 0
+    for change in changes:
+        meeting = meeting_of(at, kind, change)
+        for early, share in WAYS:
+            write_extreme(kind, change, meeting, early, share, step, last, low, high, ends[row], commands[row])
+            row += 1
+
+
+def extremes(problem: Problem, k: int, at: Floats, kind: int, changes: Floats) -> Profiles:
+    """Return the extreme profiles of world k that change at these times (s), [TIMES * WAYS]."""
+    size = len(changes) * len(WAYS)
+    ends, commands = np.empty((size, EXTREME_PHASES), np.int64), np.empty((size, EXTREME_PHASES, 1))
     step, last = problem.time_step_s, int(problem.last_step[k])
-    early, share = np.array(WAYS).T
-    turn = np.repeat(np.minimum(changes / step, last).astype(np.int64), len(WAYS))
-    within = np.repeat(changes / step, len(WAYS)) - turn
-    back = np.minimum(np.repeat(meetings / step, len(WAYS)), last).astype(np.int64)
-    back = np.maximum(back - np.tile(early, TIMES).astype(np.int64), turn + 1)
-    ends = np.minimum(np.stack([turn, turn + 1, back, back + 1, np.full(len(turn), last)], axis=1), last)
-    commands = np.empty((len(turn), 5, 1))
-    commands[:, [0, 4]], commands[:, 2] = first, second
-    commands[:, 1, 0] = second + within * (first - second)
-    commands[:, 3, 0] = second + np.tile(share, TIMES) * (first - second)
-    return Profiles(ends, np.trunc(np.clip(commands, low, high) * RESOLUTION) / RESOLUTION)
+    write_extremes(at, kind, changes, step, last, *problem.bounds[k, 0].tolist(), ends, commands)
+    return Profiles(ends, commands)
