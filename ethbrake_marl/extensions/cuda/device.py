@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 
 from ethbrake_marl.errors import InvalidInput

@@ -61,8 +61,8 @@ def search(
     if restarts not in (1 << k for k in range(11)):
         raise InvalidInput(f"restarts = {restarts!r}: must be a power of two, from 1 to 1024")
     on, n, begun = device_named(device), problem.n, time.monotonic()
-    searched, kernel = _searched(problem, on)
-    plans = _started(problem, given, restarts, seed, on)
+    searched, kernel = searched_worlds(problem, on)
+    plans = started(problem, given, restarts, seed, on)
     drawing = torch.from_numpy(PROFILES.copy()).to(on)
     for number in range(rounds if seconds is None else 1 << 20):
         asked = (searched, plans, drawing, drawn if number == 0 else 0, changes)
@@ -84,7 +84,7 @@ def search(
     return found, problem.values(found)
 
 
-def _searched(problem: Problem, on: torch.device) -> tuple[Searched, Kernel]:
+def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kernel]:
     """Return worlds as tensors, and the kernel that searches them."""
 
     def moved(array: Any) -> Tensor:
@@ -115,7 +115,7 @@ def _thread(shapes: Own) -> Any:
     return search_thread(shapes)
 
 
-def _started(problem: Problem, given: Profiles | None, restarts: int, seed: int, on: torch.device) -> Plans:
+def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, on: torch.device) -> Plans:
     """Return the plans of all threads before the first round: the given profiles, one after the other, or none."""
     n, C = problem.n, len(problem.bodies)
     ends = np.repeat(problem.last_step[:, np.newaxis], MOST_PHASES, axis=1)[np.newaxis].repeat(restarts, axis=0)
@@ -125,7 +125,7 @@ def _started(problem: Problem, given: Profiles | None, restarts: int, seed: int,
         Q = len(short.ends) // n
         if len(short.ends) != n * Q or not Q:
             raise InvalidInput(f"given: has {len(short.ends)} profiles; must have some for each of the {n} worlds")
-        if not Q <= restarts:
+        if not restarts >= Q:
             raise InvalidInput(f"given: has {Q} profiles for each world, but {restarts} threads search it (restarts)")
         problem.take(np.repeat(np.arange(n), Q)).check(short)
         ends[:Q] = np.moveaxis(short.ends.reshape(n, Q, -1), 1, 0)

@@ -96,6 +96,6 @@ def extremes(problem: Problem, k: int, at: Floats, kind: int, changes: Floats) -
     """Return the extreme profiles of world k that change at these times (s), [TIMES * WAYS]."""
     size = len(changes) * len(WAYS)
     ends, commands = np.empty((size, EXTREME_PHASES), np.int64), np.empty((size, EXTREME_PHASES, 1))
-    step, last = problem.time_step_s, int(problem.last_step[k])
-    write_extremes(at, kind, changes, step, last, *problem.bounds[k, 0].tolist(), ends, commands)
+    (low, high), last = problem.bounds[k, 0].tolist(), int(problem.last_step[k])
+    write_extremes(at, kind, changes, problem.time_step_s, last, low, high, ends, commands)
     return Profiles(ends, commands)
