@@ -4,12 +4,14 @@ A kernel is a function on arrays of numbers, compiled by numba. Kernels use + - 
 without fast-math: a world has the same bits in every batch and on every processor.
 
 Numba keeps the machine code of a function, and does not notice when a function that it calls changes. The folder of the
-machine code is therefore named by the digest of the core's kernels and of all kernels beside it.
+machine code is therefore named by the digest of the core's kernels, of all kernels beside it, and of those in the
+folders of extensions from which these import something.
 """
 
 from __future__ import annotations
 
 import hashlib
+import re
 import shutil
 import warnings
 from collections.abc import Callable
@@ -27,6 +29,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 PACKAGE = Path(__file__).parents[1]
 SOURCES = ("motion", "episode")  # folders with the core's kernels
 _MARK = b"motion.compiling import"  # in every other file with kernels
+_EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE)
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
@@ -65,13 +68,19 @@ def large(function: Function) -> Function:
 
 @cache
 def folder_of(file: str) -> Path:
-    """Return the folder with the machine code of the kernels in ``file``, which may call those of the files beside it.
+    """Return the folder with the machine code of the kernels in ``file``, which may call those that it imports.
 
     If the cache folder is temporary, machine code that may only be read (a container's image) is copied into it. Warns
     if there is none to copy.
     """
-    digest = hashlib.sha256()
-    beside = {path for path in Path(file).parent.glob("*.py") if _MARK in path.read_bytes()}
+    digest, folders, beside = hashlib.sha256(), [Path(file).parent], set()
+    for folder in folders:  # which grow
+        for path in folder.glob("*.py"):
+            content = path.read_bytes()
+            if _MARK in content:
+                beside.add(path)
+                imported = [PACKAGE / "extensions" / name.decode() for name in _EXTENSION.findall(content)]
+                folders += [other for other in dict.fromkeys(imported) if other not in folders]
     core = {path for name in SOURCES for path in (PACKAGE / name).glob("*.py")}
     for path in sorted({Path(file)} | beside | core):
         digest.update(path.name.encode() + path.read_bytes())

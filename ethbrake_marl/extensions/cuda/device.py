@@ -30,7 +30,7 @@ class Kernel(NamedTuple):
         if device.type == "cuda":
             _driver(device.index or 0).launch(self, n, given)
         else:
-            self.each(self.mine, *_as_arrays(given), n)
+            self.each(self.mine, *as_arrays(given), n)
 
 
 def device_named(name: str) -> torch.device:
@@ -58,8 +58,11 @@ def _check_gpu(index: int) -> None:
             "device = 'cuda': torch finds no NVIDIA GPU whose driver it can use (nvidia-smi lists GPUs and driver); use"
             " device 'cpu'"
         )
-    if not index < torch.cuda.device_count():
-        raise InvalidInput(f"device = 'cuda:{index}': there are only {torch.cuda.device_count()} GPUs, from cuda:0 on")
+    count = torch.cuda.device_count()
+    if not index < count:
+        raise InvalidInput(
+            f"device = 'cuda:{index}': the only devices are {', '.join(f'cuda:{k}' for k in range(count))}"
+        )
     if torch.cuda.get_device_capability(index) < OLDEST:
         name, has = torch.cuda.get_device_name(index), torch.cuda.get_device_capability(index)
         raise InvalidInput(
@@ -68,22 +71,22 @@ def _check_gpu(index: int) -> None:
         )
 
 
-def _as_arrays(given: Any) -> Any:
+def as_arrays(given: Any) -> Any:
     """Return arguments with arrays of numpy, in the same memory, in place of tensors."""
     if isinstance(given, torch.Tensor):
         return given.numpy()
     if isinstance(given, tuple):
-        parts = [_as_arrays(each) for each in given]
+        parts = [as_arrays(each) for each in given]
         return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)
     return given
 
 
-def _like(given: Any) -> Any:
+def like(given: Any) -> Any:
     """Return arguments of the same types on the processor: with empty arrays in place of tensors."""
     if isinstance(given, torch.Tensor):
         return torch.empty((0,) * given.dim(), dtype=given.dtype).numpy()
     if isinstance(given, tuple):
-        parts = [_like(each) for each in given]
+        parts = [like(each) for each in given]
         return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)
     return given
 
@@ -103,7 +106,7 @@ def cells_of(given: Any) -> Iterator[Any]:
         shape, strides = given.shape, [size * step for step in given.stride()]
         for number in (0, 0, given.numel(), size, given.data_ptr(), *shape, *strides):
             yield ctypes.c_int64(number)
-    elif isinstance(given, bool | np.bool_):
+    elif isinstance(given, bool):
         yield ctypes.c_int8(given)
     elif isinstance(given, float):
         yield ctypes.c_double(given)
@@ -134,7 +137,7 @@ class _Driver:
 
     def load(self, kernel: Kernel, given: tuple[Any, ...]) -> ctypes.c_void_p:
         capability = torch.cuda.get_device_capability(self.index)
-        code = ptx_of(kernel.name, kernel.thread, (*_like(given), 0), capability)
+        code = ptx_of(kernel.name, kernel.thread, (*like(given), 0), capability)
         module, function = ctypes.c_void_p(), ctypes.c_void_p()
         self.check("cuModuleLoadData", ctypes.byref(module), code.encode() + b"\0")
         self.check("cuModuleGetFunction", ctypes.byref(function), module, b"kernel")

@@ -141,7 +141,7 @@ def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
     """
     load(t, stored, mine)
     is_new = mode == BEGIN
-    if mode == STEP or mode == RENEW:
+    if mode in (STEP, RENEW):
         runs = mine.clock[0, ENDED] == 0.0
         for j in range(mine.actions.shape[1]):
             action = float(actions[t, j])

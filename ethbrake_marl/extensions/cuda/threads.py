@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from numba import cuda, float32, float64
+from numba import cuda, float32, float64, int64, uint64
 
 from ethbrake_marl.extensions.cuda.kernels import Mine, play
+from ethbrake_marl.extensions.cuda.search_kernels import Own, search
 
 
 def play_thread(shapes: Mine) -> Callable[..., None]:
@@ -39,3 +40,37 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
             play(t, mine, stored, pool, following, actions, results, rules, view, mode)
 
     return play_worlds
+
+
+def search_thread(shapes: Own) -> Callable[..., None]:
+    """Return the kernel that does ``search`` in n threads; ``shapes`` are constants of it."""
+    car, clock, wanted, bounds, shares, scratch, lines, tried, commands, best_commands, given_commands = shapes[:11]
+    change, best_value, ends, best_ends, best_phases, given_ends, given_phases, random = shapes[11:]
+
+    def search_worlds(searched: Any, plans: Any, drawing: Any, drawn: Any, budget: Any, n: Any) -> None:
+        t = cuda.grid(1)
+        if t < n:
+            own = Own(
+                cuda.local.array(car, float64),
+                cuda.local.array(clock, float64),
+                cuda.local.array(wanted, float64),
+                cuda.local.array(bounds, float64),
+                cuda.local.array(shares, float64),
+                cuda.local.array(scratch, float64),
+                cuda.local.array(lines, float64),
+                cuda.local.array(tried, float64),
+                cuda.local.array(commands, float64),
+                cuda.local.array(best_commands, float64),
+                cuda.local.array(given_commands, float64),
+                cuda.local.array(change, float64),
+                cuda.local.array(best_value, float64),
+                cuda.local.array(ends, int64),
+                cuda.local.array(best_ends, int64),
+                cuda.local.array(best_phases, int64),
+                cuda.local.array(given_ends, int64),
+                cuda.local.array(given_phases, int64),
+                cuda.local.array(random, uint64),
+            )
+            search(t, own, searched, plans, drawing, drawn, budget)
+
+    return search_worlds

@@ -123,13 +123,19 @@ class Worlds:
         arrays = (state.line, state.car, state.clock, state.know, state.wanted)
         return Stored(*(torch.from_numpy(np.moveaxis(each, 0, -1).copy()).to(self.device) for each in arrays))
 
+    @property
+    def observations(self) -> Tensor:
+        """What the learners observe now, [n, L, F] float32; the next step overwrites it."""
+        seen: Tensor = self.results.observations
+        return seen
+
     def reset(self) -> Tensor:
         """Begin all episodes, in the first n worlds of the pool; return what the learners observe, [n, L, F]."""
         torch.arange(self.n, out=self.following)
         self.following.remainder_(self.pool.wanted.shape[1])
         self.results.status.zero_()
         self._launch(self._no_actions, BEGIN)
-        return self.results.observations
+        return self.observations
 
     def step(self, actions: Tensor, *, renew: bool = True) -> Stepped:
         """Take one step in all episodes.
@@ -154,16 +160,19 @@ class Worlds:
         for mine, other in zip(self.now, stored, strict=True):
             torch.index_select(other, -1, rows, out=mine)
         self._launch(self._no_actions, LOOK)
-        return self.results.observations
+        return self.observations
+
+    def arguments(self, actions: Tensor, mode: int) -> tuple[Any, ...]:
+        """Return the arguments of the kernel ``play``, but for the thread."""
+        return self.now, self.pool, self.following, actions, self.results, self.rules, self.looking, mode
 
     def _launch(self, actions: Tensor, mode: int) -> None:
-        given = (self.now, self.pool, self.following, actions, self.results, self.rules, self.looking, mode)
-        self.kernel.launch(self.device, self.n, *given)
+        self.kernel.launch(self.device, self.n, *self.arguments(actions, mode))
 
     def state(self) -> State:
         """Return the episodes as the core's ``State``, copied to the processor."""
-        arrays = (np.ascontiguousarray(np.moveaxis(each.cpu().numpy(), -1, 0)) for each in self.now)
-        return State(*arrays, {})
+        line, car, clock, know, wanted = (np.moveaxis(each.cpu().numpy(), -1, 0).copy() for each in self.now)
+        return State(line, car, clock, know, wanted, {})
 
     def check(self) -> None:
         """Raise an error for the first world in which something went wrong in a step since the last ``reset``.
@@ -208,11 +217,11 @@ def check_runs(game: Game) -> None:
     views = {game.views[i] for i in game.rules.learners.tolist()}
     if len(views) > 1:
         raise InvalidInput(f"{what}: its learners observe different features; give all of them the same observation")
-    plan = next(iter(views)).plan
-    beside = [group.name for group, *_ in plan.groups] + [own.feature.name for _, own, _ in plan.own]
+    (view,) = views
+    beside = [name for name, place in zip(view.names, view.plan.places, strict=False) if place < 0]
     if beside:
         raise InvalidInput(
-            f"{what}: the observation has {', '.join(beside)}, which functions of Python compute; the groups own,"
+            f"{what}: the observation has {', '.join(beside[:5])}, which functions of Python compute; the groups own,"
             " front_K, rear_K, role and obstacle run there"
         )
 

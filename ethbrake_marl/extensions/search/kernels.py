@@ -2,7 +2,7 @@
 
 A profile has ``ends`` [K], the decisions at which its phases end, and ``commands`` [K, B] (m/s2). Every world has a
 random stream of its own, so its result does not depend on other worlds. The same functions search profiles of a few
-phases, and plans with one phase for each decision.
+phases, and plans with one phase for each decision. They use no functions of NumPy, so they also compile for a GPU.
 """
 
 from __future__ import annotations
@@ -259,6 +259,16 @@ def copy_profile(ends, commands, to_ends, to_commands):
             to_commands[p, b] = commands[p, b]
 
 
+@kernel
+def largest(values):
+    """Return the place of the largest value, the first of equal ones."""
+    place = 0
+    for m in range(1, values.shape[0]):
+        if values[m] > values[place]:
+            place = m
+    return place
+
+
 @large
 def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
     """Fill ``field`` with the best of the given profiles [Q, K] and of ``drawn`` random ones, in any order.
@@ -286,7 +296,7 @@ def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
         field.phases[worst], field.values[worst] = used, value
         if value <= 0.0:
             break
-        worst = int(np.argmax(field.values))
+        worst = largest(field.values)
 
 
 @large

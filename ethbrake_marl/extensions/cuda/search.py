@@ -1,0 +1,153 @@
+"""``search``: the best profiles of many worlds at once, on a GPU, by many threads in each world."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ethbrake_marl.episode.counts import other_count, weights_of
+from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
+from ethbrake_marl.extensions.cuda.device import Kernel, device_named
+from ethbrake_marl.extensions.cuda.search_kernels import Own, Plans, Searched, search_each, shapes_of
+from ethbrake_marl.extensions.search.kernels import STEPWISE
+from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
+from ethbrake_marl.extensions.search.search import PROFILES, seeded
+from ethbrake_marl.motion.layout import Floats
+
+WHOLE_NUMBERS = ("ends", "best_ends", "best_phases", "given_ends", "given_phases")  # in a thread's own memory
+
+
+def search(
+    problem: Problem,
+    given: Profiles | None = None,
+    *,
+    seconds: float | None = None,
+    rounds: int = 6,
+    restarts: int = 16,
+    drawn: int = 200,
+    changes: int = 400,
+    seed: int = 0,
+    device: str = "cuda",
+) -> tuple[Profiles, dict[str, Floats]]:
+    """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
+
+    Of ``restarts`` threads in each world every one draws random profiles and improves the best. After each round the
+    threads meet in pairs, and both go on from the better profile. The last round goes decision by decision.
+
+    Args:
+        problem: n worlds, and what is minimised in them (``problem_of``). For a front repeat its worlds, each time with
+            other weights: ``problem.take(rows).minimising(weights)``.
+        given: profiles with which threads begin, [n * Q]: first the Q profiles of world 0, and so on.
+        seconds: begin no further round later; the result then depends on the speed. None: ``rounds`` of them.
+        rounds: of random changes.
+        restarts: threads in each world, a power of two.
+        drawn: random profiles that each thread draws in the first round.
+        changes: random changes that each thread tries in a round.
+        seed: of the random numbers.
+        device: as for ``Worlds``.
+
+    Raises ``InvalidInput`` for a bad number or device, and ``PhysicsError`` for worlds in which no profile can be
+    simulated.
+
+    """
+    for name, value, least in (("rounds", rounds, 1), ("drawn", drawn, 1), ("changes", changes, 1), ("seed", seed, 0)):
+        check_whole_number(name, value, least)
+    if restarts not in (1 << k for k in range(11)):
+        raise InvalidInput(f"restarts = {restarts!r}: must be a power of two, from 1 to 1024")
+    on, n, begun = device_named(device), problem.n, time.monotonic()
+    searched, kernel = _searched(problem, on)
+    plans = _started(problem, given, restarts, seed, on)
+    drawing = torch.from_numpy(PROFILES[np.newaxis]).to(on)
+    for number in range(rounds if seconds is None else 1 << 20):
+        asked = (searched, plans, drawing, drawn if number == 0 else 0, changes)
+        kernel.launch(on, n * restarts, *asked)
+        plans = met(plans, n, restarts, number)
+        if seconds is not None:
+            plans.values[0].item()  # waits for the device
+            if time.monotonic() - begun >= seconds:
+                break
+    searched.numbers[STEPWISE] = 1.0
+    kernel.launch(on, n * restarts, searched, plans, drawing, 0, changes)
+    values, best = plans.values.reshape(restarts, n).min(dim=0)
+    failed = torch.isinf(values).nonzero()[:, 0].tolist()
+    if failed:
+        raise PhysicsError(dict.fromkeys(failed, "no profile could be simulated"))
+    rows = best * n + torch.arange(n, device=on)
+    ends, commands = plans.ends[:, rows].cpu().numpy(), plans.commands[..., rows].cpu().numpy()
+    found = Profiles(ends.T.copy(), np.moveaxis(commands, -1, 0).copy())
+    return found, problem.values(found)
+
+
+def _searched(problem: Problem, on: torch.device) -> tuple[Searched, Kernel]:
+    """Return worlds as tensors, and the kernel that searches them."""
+
+    def moved(array: Any) -> Tensor:
+        return torch.from_numpy(np.moveaxis(array, 0, -1).copy()).to(on)
+
+    count, state = problem.harm_count, problem.state
+    numbers = np.array([problem.time_step_s, problem.horizon_s, problem.aim, 0.0])
+    weights = np.stack([weights_of(count), weights_of(other_count(count))])
+    searched = Searched(
+        *(moved(each) for each in (state.line, state.car, state.clock, state.wanted, problem.bounds, problem.shares)),
+        *(torch.from_numpy(each.copy()).to(on) for each in (problem.bodies, numbers, weights)),
+    )
+    size = state.vehicles + 1, len(problem.bodies)
+    shapes = shapes_of(*size)
+    kinds = [
+        np.uint64 if name == "random" else np.int64 if name in WHOLE_NUMBERS else np.float64 for name in Own._fields
+    ]
+    memory = Own(*(np.zeros(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)))
+    return searched, Kernel("search-" + "-".join(map(str, size)), partial(_thread, shapes), search_each, memory)
+
+
+def _thread(shapes: Own) -> Any:
+    from ethbrake_marl.extensions.cuda.threads import search_thread  # numba.cuda is slow to import
+
+    return search_thread(shapes)
+
+
+def _started(problem: Problem, given: Profiles | None, restarts: int, seed: int, on: torch.device) -> Plans:
+    """Return the plans of all threads before the first round: the given profiles, one after the other, or none."""
+    n, C = problem.n, len(problem.bodies)
+    ends = np.repeat(problem.last_step[:, np.newaxis], MOST_PHASES, axis=1)[np.newaxis].repeat(restarts, axis=0)
+    commands, phases = np.zeros((restarts, n, MOST_PHASES, C)), np.zeros((restarts, n), np.int64)
+    if given is not None:
+        short = given.shortened()
+        Q = len(short.ends) // n
+        if len(short.ends) != n * Q or not Q:
+            raise InvalidInput(f"given: has {len(short.ends)} profiles; must have some for each of the {n} worlds")
+        if not Q <= restarts:
+            raise InvalidInput(f"given: has {Q} profiles for each world, but {restarts} threads search it (restarts)")
+        problem.take(np.repeat(np.arange(n), Q)).check(short)
+        ends[:Q] = np.moveaxis(short.ends.reshape(n, Q, -1), 1, 0)
+        commands[:Q] = np.moveaxis(short.commands_mps2.reshape(n, Q, MOST_PHASES, C), 1, 0)
+        phases[:Q] = (ends[:Q] == problem.last_step[:, np.newaxis]).argmax(axis=2) + 1
+    random = np.concatenate([seeded(problem.identity, seed * restarts + r) for r in range(restarts)])
+    arrays = (
+        np.moveaxis(ends.reshape(-1, MOST_PHASES), 0, -1),
+        np.moveaxis(commands.reshape(-1, MOST_PHASES, C), 0, -1),
+        phases.reshape(-1),
+        np.full(restarts * n, np.inf),
+        random.view(np.int64),
+    )
+    return Plans(*(torch.from_numpy(each.copy()).to(on) for each in arrays))
+
+
+def met(plans: Plans, n: int, restarts: int, number: int) -> Plans:
+    """Return the plans after a round, in which the threads of a world met in pairs: both have the better profile.
+
+    From round to round a thread meets a nearer one, so that after log2 of ``restarts`` rounds it can have met all.
+    """
+    if restarts == 1:
+        return plans
+    apart = restarts >> (1 + number % (restarts.bit_length() - 1))
+    values = plans.values.reshape(-1, 2, apart, n)
+    rows = torch.arange(restarts * n, device=values.device).reshape(values.shape)
+    better = torch.where(values[:, :1] <= values[:, 1:], rows[:, :1], rows[:, 1:]).expand_as(rows).reshape(-1)
+    ends, commands = plans.ends[:, better].contiguous(), plans.commands[..., better].contiguous()
+    return Plans(ends, commands, plans.phases[better], plans.values[better], plans.random)
