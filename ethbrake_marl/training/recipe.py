@@ -118,7 +118,6 @@ class TrainingRecipe(FileModel):
     seed: int = Field(0, ge=0, lt=2**32, description="seed of worlds, networks and exploration")
     device: str = Field(
         "cpu",
-        pattern=r"^[a-z]+(:[0-9]{1,3})?$",
         exclude_if=lambda device: device == "cpu",
         description="device that trains: cpu, or another one for which the algorithm has a variant, such as cuda or"
         " cuda:1",
