@@ -48,6 +48,10 @@ def train_command(
     settings: SettingsOption = None,
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
+    device: Annotated[
+        str | None,
+        typer.Option(metavar="cpu|cuda|cuda:N", help="Device that trains the policy.", show_default="as in the recipe"),
+    ] = None,
     output: OutputOption = None,
     resume: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Continue the training run in this folder.")
@@ -81,7 +85,7 @@ def train_command(
         if resume is not None:
             asked = {
                 "--scenario": scenario, "--recipe": recipe, "--set": settings, "--steps": steps, "--seed": seed,
-                "--output": output, "--force": force or None,
+                "--device": device, "--output": output, "--force": force or None,
             }  # fmt: skip
             for option in (name for name, value in asked.items() if value is not None):
                 raise InvalidInput(
@@ -105,8 +109,9 @@ def train_command(
 
         folder = output or run_folder(chosen.name, plan.name, plan.scheme, plan.seed if seed is None else seed)
         result = train(
-            plan, chosen, folder, steps=steps, seed=seed, force=force, on_progress=tell, settings=changes.texts
-        )
+            plan, chosen, folder, steps=steps, seed=seed, device=device, force=force, on_progress=tell,
+            settings=changes.texts,
+        )  # fmt: skip
         show_trained(out, result, scenario)
 
 

@@ -87,6 +87,7 @@ def train(
     scheme: Scheme | None = None,
     seed: int | None = None,
     steps: int | None = None,
+    device: str | None = None,
     force: bool = False,
     settings: Sequence[str] = (),
     measure: Measure | None = measure_on_list,
@@ -105,6 +106,7 @@ def train(
         scheme: how several learners train together; None: as the recipe says. Likewise:
         seed: of worlds, networks and exploration.
         steps: decisions of all learners together. A training ends with a whole update, so there may be a few more.
+        device: that trains: ``cpu``, or another one for which the algorithm has a variant, such as ``cuda``.
         force: replace an earlier run in ``directory``.
         settings: by which recipe and scenario differ from their files, ``KEY=VALUE``; ``config.json`` records them.
         measure: takes a ``Training``, and returns a function of policies, learner -> policy, that returns metrics. It
@@ -112,11 +114,11 @@ def train(
             the recipe's fixed list of worlds; None: not at all.
         on_progress: is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
 
-    Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe and scenario do not fit each other
-    or another thread is training, ``TrainingDiverged`` if a loss or a weight is not finite.
+    Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe, scenario and device do not fit
+    each other or another thread is training, ``TrainingDiverged`` if a loss or a weight is not finite.
 
     """
-    changes = {"scheme": scheme, "seed": seed, "total_steps": steps}
+    changes = {"scheme": scheme, "seed": seed, "total_steps": steps, "device": device}
     training = Training.of(recipe, scenario, **{key: value for key, value in changes.items() if value is not None})
     folder = RunFolder(directory)
     with _prepared(training, folder, measure, on_progress) as updates:

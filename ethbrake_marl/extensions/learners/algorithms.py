@@ -26,7 +26,7 @@ class Vine(Algorithm):
         """Return a new model, with the weights of the policy that the recipe's key ``start`` names."""
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
-        model = (VineModel if recipe.experts is None else MixtureModel)(training, environment)
+        model = self.new_model(training, environment)
         if recipe.start is not None:
             first = model.policy.actors[0] if isinstance(model, MixtureModel) else model.policy
             policy, wanted = named_policy(recipe.start, recipe.name, "start"), recipe.network_spec(len(model.features))
@@ -35,6 +35,11 @@ class Vine(Algorithm):
                 weight.copy_(torch.from_numpy(tensors[name]))
             first.learning.load_state_dict(first.average.state_dict())
         return model
+
+    def new_model(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
+        """Return a new model with random weights."""
+        recipe: Any = training.recipe
+        return (VineModel if recipe.experts is None else MixtureModel)(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
         """Return the averaged weights."""

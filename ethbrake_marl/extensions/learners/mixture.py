@@ -289,7 +289,7 @@ class MixtureModel(VineModel):
             scores = gate.learning(memory.get_buffer("seen")[some])
             best = scores.gather(1, costlier.argmin(dim=1, keepdim=True))
             loss = (costlier * softplus(scores - best)).sum(dim=1).mean()
-            losses.append(gate.descend(loss, self.recipe.averaging))
+            losses.append(gate.descend(loss, self.recipe.averaging).item())
         if losses:
             self.logger.record("gating/loss", float(np.mean(losses)))
 

@@ -54,8 +54,8 @@ class BranchingModel(BaseAlgorithm):
         """Return the networks, whose weights depend on torch's generator."""
 
     @abstractmethod
-    def improve(self, seen: Float32s, states: State) -> None:
-        """Learn from visited decisions: observations [decisions L, F], and the states there."""
+    def improve(self, seen: Any, states: Any) -> None:
+        """Learn from what ``collect`` returns."""
 
     def learn(
         self,
@@ -78,8 +78,8 @@ class BranchingModel(BaseAlgorithm):
         callback.on_training_end()
         return self
 
-    def collect(self, callback: BaseCallback) -> tuple[Float32s, State]:
-        """Return the decisions of this update."""
+    def collect(self, callback: BaseCallback) -> tuple[Any, Any]:
+        """Return the visited decisions of this update: observations [decisions L, F], and the states there."""
         return self.visit(callback, self.policy.act)
 
     def visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:

@@ -55,16 +55,19 @@ class Averaged(nn.Module):
         self.new_optimizer(rate)
 
     def new_optimizer(self, rate: float) -> None:
-        """Begin with a new optimiser."""
-        self.optimizer = Adam(self.learning.parameters(), lr=rate, eps=1e-5)
+        """Begin with a new optimiser. On a GPU its rate and counters are there, so that a CUDA graph can contain it."""
+        weights = [*self.learning.parameters()]
+        on_gpu, device = weights[0].is_cuda, weights[0].device
+        begin = torch.tensor(rate, device=device) if on_gpu else rate
+        self.optimizer = Adam(weights, lr=begin, eps=1e-5, capturable=on_gpu)
 
-    def descend(self, loss: Tensor, keep: float) -> float:
+    def descend(self, loss: Tensor, keep: float) -> Tensor:
         """Make one step of the optimiser on a loss, let the average follow, and return the loss."""
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
         self.follow(keep)
-        return loss.item()
+        return loss.detach()
 
     @torch.no_grad()
     def follow(self, keep: float) -> None:
@@ -87,7 +90,7 @@ class Averaged(nn.Module):
 
     def tensors(self, name: str) -> dict[str, Float32s]:
         """Return copies of ``weights``."""
-        return {place: weight.numpy().copy() for place, weight in self.weights(name).items()}
+        return {place: weight.cpu().numpy().copy() for place, weight in self.weights(name).items()}
 
 
 class Memory(nn.Module):

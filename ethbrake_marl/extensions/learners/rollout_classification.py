@@ -147,7 +147,7 @@ class RolloutClassificationModel(BranchingModel):
         if not len(chooser.memory):
             return
         for some, importance in chooser.draw(recipe.gradient_steps, recipe.batch_size, recipe.focus):
-            losses.append(chooser.descend(chooser.loss(some, importance, recipe.guide), recipe.averaging))
+            losses.append(chooser.descend(chooser.loss(some, importance, recipe.guide), recipe.averaging).item())
         self._n_updates += len(losses)
         self.logger.record("train/loss", float(np.mean(losses)))
 

@@ -6,18 +6,18 @@ The name is from Schulman et al. 2015 (TRPO), who sample branches from visited s
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
 from ethbrake_marl.extensions.learners.networks import Averaged, drawn, linear_layers, perceptron
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
 
 
@@ -47,12 +47,25 @@ class Actor(Averaged):
         return np.clip(self.means(observations), -1.0, 1.0)
 
 
+class Branches(NamedTuple):
+    """Two branches of each of B visited decisions: first B with a higher action, then B with a lower one."""
+
+    world: Ints  # [2B] number of the visited state
+    learner: Ints  # [2B] whose action is moved, from 0
+    size: Floats  # [2B] by how much
+    steps: Ints  # [2B] for how many steps
+
+    def decisions(self, learners: int) -> Ints:
+        """Return the numbers of the decisions, [B]."""
+        return (self.world * learners + self.learner)[: len(self.world) // 2]
+
+
 class Tried(NamedTuple):
     """B decisions at which a higher and a lower action were tried."""
 
-    seen: Float32s  # [B, F] observations
-    mean: Float32s  # [B] output of the actor, not clipped
-    gradient: Float32s  # [B] of the return with respect to the action
+    seen: Tensor  # [B, F] observations
+    mean: Tensor  # [B] output of the actor, not clipped
+    gradient: Tensor  # [B] of the return with respect to the action
 
 
 class VineModel(BranchingModel):
@@ -68,20 +81,33 @@ class VineModel(BranchingModel):
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
-    def improve(self, seen: Float32s, states: State) -> None:
+    def improve(self, seen: Any, states: Any) -> None:
         """Measure gradients, and follow them."""
         self.train_actor(self.policy, self.try_out(seen, states, self.policy))
 
     def try_out(self, seen: Float32s, states: State, policy: Actor) -> Tried:
         """Draw visited decisions; play a branch with a higher and one with a lower action than the policy's."""
-        recipe, learners = self.recipe, self.learners
-        alive = np.flatnonzero(moving(states).repeat(learners))
-        rows = drawn(alive, recipe.tried)
-        least, most = recipe.offset.smallest, recipe.offset.largest
-        sizes: Floats = least * (most / least) ** torch.rand(len(rows), dtype=torch.float64).numpy()
-        world, learner = np.divmod(np.tile(rows, 2), learners)
-        size, steps = np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2)
-        moved = np.zeros(len(size))  # by how much the actions were moved, after clipping, summed over the steps
+        branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
+        gained, moved = self.play(states, branches, policy)
+        own = seen[branches.decisions(self.learners)]
+        gradient = self.measured_gradient(torch.from_numpy(gained), torch.from_numpy(moved))
+        return Tried(torch.from_numpy(own), torch.from_numpy(policy.means(own)), gradient)
+
+    def draw_branches(self, decisions: Ints) -> Branches:
+        """Draw at which of the ``decisions`` actions are moved, by how much, and for how long."""
+        rows, offset = drawn(decisions, self.recipe.tried), self.recipe.offset
+        ratio = offset.largest / offset.smallest
+        sizes: Floats = offset.smallest * ratio ** torch.rand(len(rows), dtype=torch.float64).numpy()
+        world, learner = np.divmod(np.tile(rows, 2), self.learners)
+        return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
+
+    def play(self, states: State, branches: Branches, policy: Actor) -> tuple[Floats, Floats]:
+        """Play branches to the end; return what their learners gained, and by how much their actions were moved, [2B].
+
+        An action stays in [-1, 1], so it may move by less than was asked for. The steps are summed.
+        """
+        world, learner, size, steps = branches
+        moved, longest = np.zeros(len(size)), int(steps.max(initial=0))
 
         def decide(now: Moment) -> Floats:
             actions = now.ask(policy.act)
@@ -93,33 +119,38 @@ class VineModel(BranchingModel):
             moved[row] += after - before
             return actions
 
-        longest = int(steps.max(initial=0))
-        gained, _ = play_on(self.game, states.take(world), decide, recipe.gamma, at_least=longest)
-        (up, down), (higher, lower) = np.split(gained[np.arange(len(size)), learner], 2), np.split(moved, 2)
+        gained, _ = play_on(self.game, states.take(world), decide, self.recipe.gamma, at_least=longest)
+        return gained[np.arange(len(size)), learner], moved
+
+    def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
+        """Return the gradient at each decision, [B] float32, of the returns and moves of two branches each, [2B]."""
+        (up, down), (higher, lower) = gained.chunk(2), moved.chunk(2)
         measured = (up - down) / (higher - lower)
-        gradient = np.clip(measured, -recipe.gradient_limit, recipe.gradient_limit)
-        whole = float(np.abs(measured).sum())
-        self.logger.record("train/gradient_cut", 1.0 - float(np.abs(gradient).sum()) / whole if whole else 0.0)
-        return Tried(seen[rows], policy.means(seen[rows]), gradient.astype(np.float32))
+        gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)
+        whole = float(measured.abs().sum())
+        self.logger.record("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / whole if whole else 0.0)
+        return gradient.float()
 
     def train_actor(self, actor: Actor, tried: Tried) -> None:
         """Move an actor's outputs towards their targets."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
-        target, weight = trusted_targets(tried, recipe.trust_radius, recipe.anchor)
-        seen, wanted, weights = (torch.from_numpy(array) for array in (tried.seen, target, weight))
-        losses = []
+        lesson, losses = (tried.seen, *trusted_targets(tried, recipe.trust_radius, recipe.anchor)), []
         for _ in range(recipe.n_epochs):
-            for batch in torch.split(torch.randperm(len(wanted)), recipe.batch_size):
-                loss = (weights[batch] * (actor.learning(seen[batch])[:, 0] - wanted[batch]) ** 2).mean()
-                losses.append(actor.descend(loss, recipe.averaging))
+            for batch in torch.split(torch.randperm(len(tried.seen)).to(tried.seen.device), recipe.batch_size):
+                losses.append(self.descend(actor, *(part[batch] for part in lesson)))
         self._n_updates += recipe.n_epochs
-        self.logger.record("train/loss", float(np.mean(losses)) if losses else 0.0)
-        self.logger.record("train/gradient", float(np.abs(tried.gradient).mean()) if len(wanted) else 0.0)
-        self.logger.record("train/tried", len(wanted))
+        self.logger.record("train/loss", float(np.mean([loss.item() for loss in losses])) if losses else 0.0)
+        self.logger.record("train/gradient", float(tried.gradient.abs().mean()) if losses else 0.0)
+        self.logger.record("train/tried", len(tried.seen))
+
+    def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        """Make one step of the optimiser with some decisions; return the loss."""
+        loss = (weight * (actor.learning(seen)[:, 0] - target) ** 2).mean()
+        return actor.descend(loss, self.recipe.averaging)
 
 
-def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32s, Float32s]:
+def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
     """Return targets of the actor's outputs, and the weights of the squared errors in the loss, [B] each.
 
     Let m be the present output and g the gradient. Then ``weight = |g| / radius + anchor`` and ``target = m + g /
@@ -127,8 +158,6 @@ def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Float32
     m. An output at or beyond 1 is not moved farther out, because actions are clipped to [-1, 1].
     """
     outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))
-    gradient = tried.gradient.copy()
-    gradient[outward] = 0.0
-    weight = (np.abs(gradient) / radius + anchor).astype(np.float32)
-    target: Float32s = tried.mean + gradient / weight
-    return target, weight
+    gradient = tried.gradient.masked_fill(outward, 0.0)
+    weight = gradient.abs() / radius + anchor
+    return tried.mean + gradient / weight, weight

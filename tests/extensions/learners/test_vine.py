@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.learners.start import members_of, widened
@@ -21,9 +22,9 @@ STILL = load_recipe("vine").replace(**SMALL, learning_rate={"start": 1e-12, "end
 
 def test_targets__keep_the_slope_and_stay_within_the_radius_and_the_bounds() -> None:
     # r = 0.05 and k = 3: g = 0.15 moves by 0.15 / (3 + 3), g = 1e6 by almost 0.05, g = 0 not at all
-    gradient = np.array([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15, -1e6], np.float32)
-    mean = np.array([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0, -1.0], np.float32)
-    target, weight = trusted_targets(Tried(np.zeros((9, 1), np.float32), mean, gradient), 0.05, 3.0)
+    gradient = torch.tensor([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15, -1e6])
+    mean = torch.tensor([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0, -1.0])
+    target, weight = trusted_targets(Tried(torch.zeros(9, 1), mean, gradient), 0.05, 3.0)
     assert [round(float(each), 6) for each in target] == [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975, -1.0]
     assert [round(float(each), 5) for each in weight[[0, 1, 2, 4]]] == [3.0, 6.0, 6.0, 3.0]
     assert [round(float(each), 5) for each in (weight * (target - mean))[:3]] == [0.0, 0.15, -0.15]
@@ -36,10 +37,11 @@ def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: fl
     model = new_model(recipe, PAIR)
     states, seen = model.rows.episode.take(np.arange(8)), model._last_obs
     tried = model.try_out(seen, states, model.policy)
-    assert len(tried.seen) == 16 and np.abs(tried.gradient).max() > (0.1 if limit > 1.0 else 0.0)
-    assert np.abs(tried.gradient).max() <= np.float32(limit)
-    row = next(k for k in range(16) if abs(tried.gradient[k]) == np.abs(tried.gradient).max())
-    (place,) = np.flatnonzero((seen == tried.seen[row]).all(axis=1))
+    gradients = tried.gradient.numpy()
+    assert len(tried.seen) == 16 and np.abs(gradients).max() > (0.1 if limit > 1.0 else 0.0)
+    assert np.abs(gradients).max() <= np.float32(limit)
+    row = int(np.abs(gradients).argmax())
+    (place,) = np.flatnonzero((seen == tried.seen[row].numpy()).all(axis=1))
     game, gained = model.game, []
     for offset in (1e-4, -1e-4):
         now, total = states.take([place // 2]), 0.0
@@ -53,7 +55,7 @@ def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: fl
                 break
         gained.append(total)
     slope = (gained[0] - gained[1]) / 4e-4
-    assert tried.gradient[row] == pytest.approx(np.clip(slope, -limit, limit), rel=0.1)
+    assert gradients[row] == pytest.approx(np.clip(slope, -limit, limit), rel=0.1)
     cut = model.logger.name_to_value["train/gradient_cut"]
     assert cut == 0.0 if limit > 1.0 else cut > 0.5
 

@@ -1,0 +1,147 @@
+"""Vine on a GPU: episodes, branches and the network's training stay there; the random numbers are the processor's."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3.common.callbacks import BaseCallback
+from torch import Tensor, nn
+
+from ethbrake_marl.episode.state import ENDED
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.cuda.graphs import Graphed
+from ethbrake_marl.extensions.cuda.kernels import Stored
+from ethbrake_marl.extensions.cuda.worlds import POOL, Worlds
+from ethbrake_marl.extensions.learners.algorithms import Vine
+from ethbrake_marl.extensions.learners.recipes import VineRecipe
+from ethbrake_marl.extensions.learners.vine import Actor, Tried, VineModel
+from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
+from ethbrake_marl.training.training import Training
+
+
+class CudaVine(Vine):
+    """Vine for the recipe's device. A mixture of experts trains on a processor only."""
+
+    def new_model(self, training: Training, environment: EthBrakeVecEnv) -> CudaVineModel:
+        """Return a new model with random weights, the same as on a processor.
+
+        Raises ``InvalidInput`` for a mixture of experts, for minibatches of different sizes, for what ``Worlds``
+        refuses, and for more worlds than the device has memory for.
+        """
+        recipe = training.recipe
+        assert isinstance(recipe, VineRecipe)
+        where = f"recipe {recipe.name!r} on device {recipe.device!r}"
+        if recipe.experts is not None:
+            raise InvalidInput(
+                f"{where}: experts: a mixture of experts trains on a processor only; leave out experts, or train on the"
+                " device 'cpu'"
+            )
+        if recipe.tried % recipe.batch_size:
+            raise InvalidInput(f"{where}: batch_size = {recipe.batch_size}: must divide tried = {recipe.tried} there")
+        try:
+            return CudaVineModel(training, environment, self.device_of(recipe))
+        except torch.OutOfMemoryError:
+            raise InvalidInput(
+                f"{where}: n_envs = {recipe.n_envs}, tried = {recipe.tried}: need more memory than the device has;"
+                " choose smaller ones"
+            ) from None
+
+    def device_of(self, recipe: VineRecipe) -> str:
+        """Return the name of the device that trains."""
+        return recipe.device
+
+
+class CudaVineModel(VineModel):
+    """Visits decisions in ``worlds``, and plays their branches in other ones.
+
+    The environment that the training has built, for the interface of Stable-Baselines3, stays at its first episodes.
+    n: worlds; L: learners; B: tried decisions; D: visited decisions of one learner, n_steps n.
+    """
+
+    def __init__(self, training: Training, environment: EthBrakeVecEnv, device: str) -> None:
+        recipe: Any = training.recipe
+        new = partial(Worlds, training.scenario, device=device, reward=recipe.reward, seed=recipe.seed)
+        seen = list(training.row.names)
+        self.worlds = new(recipe.n_envs, POOL, observation=seen)
+        self.branches = new(2 * recipe.tried, self.worlds.game.draw(1, recipe.seed, 0), observation=seen)
+        super().__init__(training, environment)
+        count, place, zeros = recipe.n_envs * recipe.n_steps, self.worlds.device, torch.zeros
+        kind = self.worlds.pool.line.dtype
+        self.visited = Stored(*(zeros(*each.shape[:-1], count, dtype=kind, device=place) for each in self.worlds.pool))
+        self.seen = self.worlds.reset().repeat(recipe.n_steps, 1, 1)  # [D, L, F]
+        self.each_learner = torch.arange(self.learners, device=place)
+        self.played = Graphed(self.play_here, place)
+        self.descended = Graphed(partial(super().descend, self.policy), place)
+
+    def new_policy(self) -> nn.Module:
+        """Return the actor, on the device."""
+        actor = super().new_policy().to(self.worlds.device)
+        assert isinstance(actor, Actor)
+        actor.new_optimizer(self.recipe.learning_rate.at(1.0))
+        return actor
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        episodes = [f"worlds.now.{name}" for name in Stored._fields]
+        return super()._get_torch_save_params()[0], [*episodes, "worlds.following", "worlds.results.observations"]
+
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        """Set the learning rate. A CUDA graph reads it where it has been from the beginning."""
+        (group,) = optimizers.param_groups
+        rate = group["lr"]
+        super()._update_learning_rate(optimizers)
+        if isinstance(rate, Tensor):
+            group["lr"] = rate.fill_(group["lr"])
+
+    def act(self, seen: Tensor) -> Tensor:
+        """Return the learners' actions, [n, L], where they observe ``seen`` [n, L, F]."""
+        outputs: Tensor = self.policy.learning(seen.flatten(0, 1))
+        return outputs.clamp(-1.0, 1.0).view(seen.shape[:2])
+
+    @torch.no_grad()
+    def collect(self, callback: BaseCallback) -> tuple[Tensor, Stored]:
+        """Drive all worlds for ``n_steps`` decisions; return observations [D L, F], and the states there."""
+        worlds = self.worlds
+        for step in range(self.recipe.n_steps):
+            rows = slice(step * worlds.n, (step + 1) * worlds.n)
+            for visited, now in zip(self.visited, worlds.now, strict=True):
+                visited[..., rows] = now
+            self.seen[rows] = worlds.results.observations
+            worlds.step(self.act(self.seen[rows]))
+        worlds.check()
+        self.num_timesteps += self.n_envs * self.recipe.n_steps
+        return self.seen.flatten(0, 1), self.visited
+
+    def improve(self, seen: Any, states: Any) -> None:
+        """Measure gradients at some of the visited decisions, and follow them."""
+        self.train_actor(self.policy, self.measure(seen))
+
+    @torch.no_grad()
+    def measure(self, seen: Tensor) -> Tried:
+        """Draw visited decisions; play a branch with a higher and one with a lower action than the policy's."""
+        place = self.worlds.device
+        branches = self.draw_branches(np.arange(len(seen)))
+        own = seen[torch.from_numpy(branches.decisions(self.learners)).to(place)]
+        gained, moved = self.played(*(torch.from_numpy(column).to(place) for column in branches))
+        self.branches.check()
+        return Tried(own, self.policy.learning(own)[:, 0], self.measured_gradient(gained, moved))
+
+    def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
+        """Do the work of ``play`` on the device; return what learners gained and how far actions moved, [2, 2B]."""
+        worlds, result = self.branches, torch.zeros(2, len(world), dtype=size.dtype, device=size.device)
+        seen, its = worlds.put(self.visited, world), learner[:, None] == self.each_learner
+        for number in range(self.worlds.longest):
+            actions = self.act(seen)
+            if number < max(self.recipe.holds):
+                held = (number < steps) & (worlds.now.clock[ENDED] == 0.0)
+                other = torch.where(its & held[:, None], (actions + size[:, None]).clamp(-1.0, 1.0).float(), actions)
+                result[1] += (other.double() - actions.double()).sum(dim=1)
+                actions = other
+            result[0] += self.recipe.gamma**number * worlds.step(actions, renew=False).reward
+        return result
+
+    def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        """Make one step of the optimiser with some decisions; return the loss."""
+        return self.descended(seen, target, weight).clone()
