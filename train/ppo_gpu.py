@@ -105,8 +105,7 @@ class Ppo:
 
     def __init__(self, worlds: eb.cuda.Worlds, settings: Settings) -> None:
         self.worlds, self.settings = worlds, settings
-        n, learners, features = worlds.reset().shape
-        steps, device = settings.rollout, worlds.device
+        steps, device, (n, learners, features) = settings.rollout, worlds.device, worlds.reset().shape
         self.actor = Actor(features, settings).to(device)
         self.critic = perceptron(features, settings.hidden, last_gain=1.0).to(device)
         self.networks = nn.ModuleList([self.actor, self.critic])
@@ -162,8 +161,11 @@ class Ppo:
 
     def recorded(self) -> tuple[Callable[[], None], Callable[[], None]]:
         """Return `collect` and `update` as CUDA graphs. What recording them has learned is forgotten again."""
+        torch.cuda.set_device(self.rate.device)
         before = deepcopy(self.networks.state_dict())
+        torch.set_float32_matmul_precision("high")  # of what is recorded (TF32); evaluations are exact to float32
         collect, update = graph_of(self.collect), graph_of(self.update)
+        torch.set_float32_matmul_precision("highest")
         self.networks.load_state_dict(before)
         for moments in self.optimiser.state.values():
             for moment in moments.values():
@@ -213,8 +215,6 @@ def train(settings: Settings, folder: Path) -> dict[str, float]:
     listed = eb.cuda.Worlds(scenario, settings.worlds, scenario.sample(settings.worlds, seed=1007), **where)
     env = eb.parallel_env(scenario, agents="learners", reward=reward)  # not driven: says what `save_team` records
     ppo = Ppo(copies, settings)
-    if copies.device.type == "cuda":
-        torch.cuda.set_device(copies.device)  # whose graphs are recorded
     collect, update = ppo.recorded() if ppo.rate.is_cuda else (ppo.collect, ppo.update)
     ppo.seen[-1].copy_(copies.reset())
     updates = -(-settings.steps // ppo.actions.numel())

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import HARM
@@ -99,6 +100,7 @@ def test_recording__leaves_networks_and_optimiser_as_they_were(
 ) -> None:
     """Before a CUDA graph is recorded its calls run a few times; here they run without a GPU."""
     monkeypatch.setattr(program, "graph_of", lambda call: (call(), call)[1])
+    monkeypatch.setattr("torch.cuda.set_device", lambda device: None)
     learned = []
     for records in (False, True):
         torch.manual_seed(0)
@@ -110,6 +112,35 @@ def test_recording__leaves_networks_and_optimiser_as_they_were(
         ppo.learn(*calls)
         learned.append(ppo.networks.state_dict())
     assert all(torch.equal(one, other) for one, other in zip(*(each.values() for each in learned), strict=True))
+
+
+class NoReading(TorchDispatchMode):
+    """While it holds, nothing may read a tensor as a number, for which a GPU would have to be waited for."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        assert func not in (torch.ops.aten._local_scalar_dense.default, torch.ops.aten.nonzero.default)
+        return func(*args, **(kwargs or {}))
+
+
+def test_rollout_and_update__can_be_recorded(program: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CUDA graphs demand that no number is read and that no tensor moves."""
+    ppo = program.Ppo(eb.cuda.Worlds("paper-random", 8, 16, "cpu"), program.Settings(n=8, rollout=8, minibatches=4))
+    ppo.collect(), ppo.update()
+
+    def addresses() -> list[int]:
+        results = (ppo.seen, ppo.stored, ppo.rewards, ppo.ended, ppo.rows, ppo.rate, *ppo.worlds.results)
+        learned = [tensor for each in ppo.networks.parameters() for tensor in (each, each.grad)]
+        moments = [tensor for state in ppo.optimiser.state.values() for tensor in state.values()]
+        return [each.data_ptr() for each in (*results, *ppo.worlds.now, ppo.worlds.following, *learned, *moments)]
+
+    before = addresses()
+    ppo.collect(), ppo.update()
+    assert addresses() == before
+    monkeypatch.setattr(ppo.optimiser, "step", lambda: None)  # on a processor it reads the learning rate
+    with NoReading():
+        ppo.collect(), ppo.update()
+    with pytest.raises(AssertionError), NoReading():
+        ppo.rate.item()
 
 
 def test_the_learning_rate__is_the_tensor_that_the_optimiser_reads(program: ModuleType) -> None:
