@@ -2,6 +2,7 @@
 
 import runpy
 import sys
+from copy import deepcopy
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -75,11 +76,12 @@ def test_advantages__by_hand(program: ModuleType) -> None:
 
 
 def test_a_rollout__goes_on_where_the_last_one_ended(program: ModuleType) -> None:
-    worlds = eb.cuda.Worlds("paper-random", 6, 12, "cpu")
-    ppo = program.Ppo(worlds, program.Settings(rollout=40, minibatches=4))
+    short = eb.load_scenario("paper-random").replace(horizon_s=3.0)  # some episodes end there, others before
+    worlds, twin = (eb.cuda.Worlds(short, 6, 12, "cpu") for _ in range(2))
+    settings = program.Settings(rollout=40, minibatches=4)
+    ppo, truncated = program.Ppo(worlds, settings), False
     ppo.seen[-1].copy_(worlds.reset())
-    twin, seen = eb.cuda.Worlds("paper-random", 6, 12, "cpu"), []
-    seen.append(twin.reset().clone())
+    seen = [twin.reset().clone()]
     for _ in range(2):
         ppo.collect()
         for t, actions in enumerate(ppo.actions):
@@ -88,11 +90,33 @@ def test_a_rollout__goes_on_where_the_last_one_ended(program: ModuleType) -> Non
             seen.append(step.observations.clone())
             assert torch.equal(ppo.rewards[t, :, 0], step.reward.float())
             assert torch.equal(ppo.ended[t, :, 0] == 1.0, step.terminated | step.truncated)
-    assert ppo.ended.any() and not ppo.ended.all()
-    assert torch.allclose(ppo.gains.mean(), torch.zeros(()), atol=1e-6)
+            truncated |= bool(step.truncated.any())
+    assert truncated and not ppo.ended.all()
+    values = ppo.critic(ppo.seen)[..., 0]
+    gains = program.advantages(ppo.rewards, ppo.ended, values, settings.gamma, settings.gae_lambda)
+    assert torch.allclose(ppo.targets, gains + values[:-1], atol=1e-5)
+    assert torch.allclose(ppo.gains, (gains - gains.mean()) / gains.std(), atol=1e-5)
     mean, std = ppo.actor.mean(ppo.seen[:-1])[..., 0], ppo.actor.log_std.exp()
     exact = torch.distributions.Normal(mean, std).log_prob(ppo.actions) + 0.5 * np.log(2.0 * np.pi)
     assert torch.allclose(ppo.before, exact, atol=1e-5)
+
+
+@pytest.mark.parametrize(("ratio", "gain", "learns"), [(1.5, 1.0, False), (1.5, -1.0, True), (0.5, -1.0, False)])
+def test_the_actor__does_not_learn_beyond_the_clip(
+    ratio: float, gain: float, learns: bool, program: ModuleType
+) -> None:
+    """If an action is already more (less) likely than 1.2 (0.8) times before, it is not made yet more (less) so."""
+    ppo = program.Ppo(eb.cuda.Worlds("paper-random", 8, 16, "cpu"), program.Settings(n=8, rollout=8, minibatches=4))
+    ppo.collect()
+    ppo.before -= np.log(ratio)
+    ppo.gains.fill_(gain)
+    before = deepcopy(ppo.networks)
+    ppo.update()
+    changed = [
+        any((one != other).any() for one, other in zip(mine.parameters(), old.parameters(), strict=True))
+        for mine, old in zip(ppo.networks, before, strict=True)
+    ]
+    assert changed == [learns, True]
 
 
 def test_recording__leaves_networks_and_optimiser_as_they_were(
