@@ -76,7 +76,7 @@ def test_train__leaves_a_folder_whose_policy_is_the_best_on_the_list(tmp_path: P
     status, config = status_of(run), json.loads((run / "config.json").read_text())
     assert (status["status"], status["steps"], status["updates"]) == ("finished", 6 * UPDATE, 6)
     assert status["evaluations"] == list(result.evaluations)
-    assert TrainingRecipe.model_fields.keys() - config["recipe"].keys() == {"observation"}
+    assert TrainingRecipe.model_fields.keys() - config["recipe"].keys() == {"observation", "device"}
     assert config["settings"] == ["x=1"]
     rows = kept(run)["rows"]
     assert [int(row["steps"]) for row in rows] == [UPDATE * k for k in range(7)]

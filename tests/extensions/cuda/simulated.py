@@ -1,7 +1,8 @@
 """Whole episodes in numba's simulator of a GPU, which runs the threads in Python and does not clear their memory.
 
 ``NUMBA_ENABLE_CUDASIM=1 NUMBA_DISABLE_JIT=1 python -m tests.extensions.cuda.simulated 2`` drives two worlds of each
-scenario, compares all bits, and prints the decisions.
+scenario, compares all bits, and prints the decisions. Then it searches one world, and compares with the same search
+without threads.
 """
 
 from __future__ import annotations
@@ -9,10 +10,13 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+import numpy as np
 import torch
 from numba import cuda
 
 from ethbrake_marl.extensions.cuda.device import Kernel, as_arrays
+from ethbrake_marl.extensions.cuda.search import search
+from tests.extensions.cuda.test_search import problem
 from tests.extensions.cuda.test_worlds import SIX, whole_episodes
 
 
@@ -21,6 +25,11 @@ def launch(kernel: Kernel, on: torch.device, n: int, *given: Any) -> None:
 
 
 if __name__ == "__main__":
+    asked = {"rounds": 1, "restarts": 1, "drawn": 2, "changes": 3, "device": "cpu"}
+    (ends, commands), values = search(problem(1), **asked)
     Kernel.launch = launch  # type: ignore[method-assign]
     for name in SIX.values():
         print(name, whole_episodes(name, int(sys.argv[1])))
+    again, the_same = search(problem(1), **asked)
+    assert np.array_equal(again.ends, ends) and np.array_equal(again.commands_mps2, commands) and values == the_same
+    print("search", values["first"].item())

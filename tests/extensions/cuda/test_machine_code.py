@@ -31,7 +31,7 @@ def test_threads_of_the_simulator__have_the_same_bits() -> None:
     command = [sys.executable, "-W", "ignore", "-m", "tests.extensions.cuda.simulated", "1"]
     done = subprocess.run(command, env=os.environ | on, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert [line.split()[0] for line in done.stdout.splitlines()] == [*SIX.values()]
+    assert [line.split()[0] for line in done.stdout.splitlines()] == [*SIX.values(), "search"]
 
 
 def test_parameters__of_an_array_a_tuple_and_numbers() -> None:
