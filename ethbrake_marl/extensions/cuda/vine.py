@@ -131,7 +131,7 @@ class CudaVineModel(VineModel):
     def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
         """Do the work of ``play`` on the device; return what learners gained and how far actions moved, [2, 2B]."""
         worlds, result = self.branches, torch.zeros(2, len(world), dtype=size.dtype, device=size.device)
-        seen, its = worlds.put(self.visited, world), learner[:, None] == self.each_learner
+        seen, its, discount = worlds.put(self.visited, world), learner[:, None] == self.each_learner, 1.0
         for number in range(self.worlds.longest):
             actions = self.act(seen)
             if number < max(self.recipe.holds):
@@ -139,7 +139,8 @@ class CudaVineModel(VineModel):
                 other = torch.where(its & held[:, None], (actions + size[:, None]).clamp(-1.0, 1.0).float(), actions)
                 result[1] += (other.double() - actions.double()).sum(dim=1)
                 actions = other
-            result[0] += self.recipe.gamma**number * worlds.step(actions, renew=False).reward
+            result[0] += discount * worlds.step(actions, renew=False).reward
+            discount *= self.recipe.gamma
         return result
 
     def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
