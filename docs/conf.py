@@ -63,7 +63,6 @@ nb_execution_timeout = 1200  # s for one cell, on a busy machine that compiles e
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
-nb_ipywidgets_js: dict[str, dict[str, str]] = {}  # the site loads nothing; sliders move in Jupyter alone
 
 html_theme = "furo"
 html_title = f"ethbrake_marl {__version__}"

@@ -170,7 +170,7 @@ def test_naming_extras__leaves_other_missing_modules_alone() -> None:
 
 
 def test_extras__are_those_of_the_table_and_all_is_their_sum_without_that_of_gpus() -> None:
-    assert {"dev", "docs", "all", "notebook", *_EXTRA_OF.values()} == set(EXTRAS)
+    assert {"dev", "docs", "all", *_EXTRA_OF.values()} == set(EXTRAS)
     distribution = {
         "stable_baselines3": "stable-baselines3",
         "pygame": "pygame-ce",
@@ -182,4 +182,4 @@ def test_extras__are_those_of_the_table_and_all_is_their_sum_without_that_of_gpu
         names = [re.split(r"[<>=\[]", line)[0] for line in EXTRAS[extra]]
         assert distribution.get(package, package) in map(str.lower, names)
     whole = [extra for extra in dict.fromkeys(_EXTRA_OF.values()) if extra != "cuda"]
-    assert EXTRAS["all"] == [f"ethbrake-marl[{','.join([*whole, 'notebook'])}]"]
+    assert EXTRAS["all"] == [f"ethbrake-marl[{','.join(whole)}]"]

@@ -21,7 +21,7 @@ from ethbrake_marl import __version__
 from ethbrake_marl.cli.command import JsonOption, Out
 from ethbrake_marl.kernel_store import cache_folder, is_temporary
 
-EXTRAS = ("train", "marl", "export", "data", "render", "cluster", "notebook")
+EXTRAS = ("train", "marl", "export", "data", "render", "cluster")
 
 _TINY = ("--set=n_envs=16", "--set=n_steps=8", "--set=tried=16", "--set=evaluation.worlds=10")
 

@@ -10,16 +10,16 @@ PACKAGE = ROOT / "ethbrake_marl"
 PAGE = ROOT / "docs" / "internals" / "layout.md"
 BEGINNING = """# How the code is laid out
 
-Which file does what? The package has a core and extensions. The core contains everything that the
-paper's environment, training, scenarios and levels of cooperation need. An extension is a folder
-that you can delete: it registers itself by entry points (`pyproject.toml`), and no module of the
-core names it. To delete an extension, delete its folder, its folder in `tests/extensions/`, its
-lines in `pyproject.toml` and every extension that uses it; then run `make venv`. `make core`
-deletes all extensions in a copy of the repository, and runs the core's tests there.
+Which file does what? [Another page](reading.md) says in which order to read the core.
 
-A module imports only from its own folder or from folders that this page lists below that folder;
-`make lint` checks this. The following command makes this page from the code:
-`python -m tests.docs.layout`.
+The core has everything that the paper's environment, training, scenarios and levels of cooperation
+need. An extension is a folder that registers itself by entry points (`pyproject.toml`); [no module
+of the core names it](../decisions/README.md#the-core-never-names-an-extension). To delete one,
+delete its folder, its folder in `tests/extensions/`, its lines in `pyproject.toml` and every
+extension that uses it; then run `make venv`.
+
+A module imports only from its own folder or from what this page lists below it; `make lint` checks
+this. `python -m tests.docs.layout` makes this page from the code.
 
 ## Where to look
 
@@ -58,10 +58,8 @@ files/sheet.py          Sheet: columns become text
 ```
 """
 END = """
-The folder `scenarios/` contains one YAML file for each scenario, and the folder `train/` one YAML
-file for each training recipe. The scenarios and recipes of an extension are in a subfolder with the
-extension's name. The wheel (the installable package) contains `scenarios/` and `train/`. Another
-page explains [how the code is tested](tests.md).
+`scenarios/` has one YAML file for each scenario, `train/` one for each recipe; those of an extension
+are in a subfolder of its name. The wheel contains both folders.
 """
 
 
@@ -69,10 +67,6 @@ def first_sentence(path: Path) -> str:
     """What a folder or a file says it is, in its first sentence."""
     text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
     return " ".join(text.partition("\n\n")[0].split()).rstrip(".").replace("``", "`")
-
-
-def files(place: Path) -> list[Path]:
-    return sorted(place.rglob("*.py")) if place.is_dir() else [place]
 
 
 def room_of(module: str) -> str | None:
@@ -104,23 +98,18 @@ def layers(folder: str) -> list[list[str]]:
     return [layer.split(" | ") for layer in contract["layers"]]
 
 
-def table(rooms: list[list[str]], inside: str, uses: dict[str, set[str]]) -> list[str]:
-    """A table of rooms: their files, what they are, and which others they use."""
-    folder = PACKAGE / inside.rstrip(".").replace(".", "/") if inside else PACKAGE
-    lines = [f"| in `{folder.relative_to(ROOT).as_posix()}/` | what it holds | uses |", "|---|---|---|"]
-    order = [room for layer in rooms for room in layer]
-    for room in order:
+def table(rooms: list[list[str]], inside: str = "") -> list[str]:
+    """A table of rooms: their files, and what they are."""
+    folder = PACKAGE / inside
+    lines = [f"| in `{folder.relative_to(ROOT).as_posix()}/` | what it holds |", "|---|---|"]
+    for room in (room for layer in rooms for room in layer):
         place = folder / room
         path = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
-        name = f"{room}/" if place.is_dir() else f"{room}.py"
-        others = sorted(each.removeprefix(inside) for each in uses[inside + room] if each.startswith(inside))
-        others = [each for each in order if each in others]
-        lines.append(f"| `{name}` | {first_sentence(path)} | {', '.join(others) or '–'} |")
+        lines.append(f"| `{room}{'/' if place.is_dir() else '.py'}` | {first_sentence(path)} |")
     return lines
 
 
 def page() -> str:
-    uses = arrows()
     core = [[room for room in layer if not room.startswith("__")] for layer in layers("ethbrake_marl")]
     core = [[room for room in layer if room != "extensions"] for layer in core]
     drawing = [" · ".join(layer) for layer in core if layer]
@@ -135,14 +124,14 @@ def page() -> str:
             *drawing,
             "```",
             "",
-            *table([layer for layer in core if layer], "", uses),
+            *table([layer for layer in core if layer]),
             "\n## Extensions\n",
             "An extension may use the core and the extensions in the lines below it:\n",
             "```text",
             *beside,
             "```",
             "",
-            *table(extensions, "extensions.", uses),
+            *table(extensions, "extensions"),
             END,
         ]
     )

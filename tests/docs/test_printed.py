@@ -71,7 +71,7 @@ def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: 
 
 
 PROGRAM_PAGES = (
-    *("cooperation", "environments", "evaluate", "shield", "reference/README"),
+    *("cooperation", "environments", "evaluate", "internals/reading", "shield", "reference/README"),
     pytest.param("../README", marks=pytest.mark.slow),
 )
 

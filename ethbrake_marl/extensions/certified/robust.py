@@ -3,7 +3,7 @@
 It is the step shield with one change: the price of a plan is the largest harm over all members of a world
 (``uncertainty``). The members are played beside the episode, with the actions that are applied, by the episode's own
 step; so the proof of the step shield holds in each of them. It does not hold between the corners
-(docs/internals/proofs/shield-corners.md).
+(docs/internals/proofs/shield.md).
 """
 
 from __future__ import annotations

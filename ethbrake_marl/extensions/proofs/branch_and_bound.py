@@ -3,7 +3,7 @@
 A first contact has a time and a closing speed. Its harm is its squared closing speed plus the harm that must follow
 (``followers.after``). A *cell* is a set of first contacts: a range of times and a range of closing speeds. The search
 halves the cell with the smallest bound until this bound is close to the smallest harm that it has reached.
-docs/internals/proofs/lower-bound-search.md has the proof; ``proofs/__init__.py`` explains the arguments.
+docs/internals/proofs/lower-bound.md has the proof; ``proofs/__init__.py`` explains the arguments.
 """
 
 from __future__ import annotations
