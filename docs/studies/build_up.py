@@ -1,4 +1,4 @@
-"""Harm of agents if brakes build up, by rate and by vehicle: the table ``build-up`` of docs/results/evaluation.md.
+"""Harm of agents if brakes build up, by rate and by vehicle, for docs/results/evaluation.md.
 
 .venv/bin/python docs/studies/build_up.py        # prints first-impact / total harm in m2/s2; five minutes on one core
 """

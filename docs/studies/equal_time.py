@@ -1,4 +1,4 @@
-"""Harm and processor time of agents on the same worlds: the table `equal-time` of docs/results/baselines.md.
+"""Harm and processor time of agents on the same worlds, for docs/results/baselines.md.
 
     .venv/bin/python docs/studies/equal_time.py [AGENT ...]
 

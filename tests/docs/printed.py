@@ -32,24 +32,8 @@ _HONEST = tuple(
     " --json"
     for test in ("", "-brake-only", "-obstacle")
 )
-_PAPER = tuple(
-    f"ethbrake evaluate --scenario paper-random{test} --agents full_brake,e_v2x_bm,{agents},best_harm --episodes 2000"
-    " --set measures=injury --json"
-    for test, agents in (
-        ("", "e_v2x_bm:pairwise,ppo,universal-paper"),
-        ("-brake-only", "e_v2x_bm:pairwise,ppo,universal-paper"),
-        ("-obstacle --set harm_count=total", "e_v2x_bm:pairwise,ppo,rollout-obstacle"),
-        ("-buildup", "ppo,universal-paper"),
-    )
-)
-
 TABLES: dict[str, tuple[str, ...]] = {
     "| who drives Vehicle 2 | knows | collisions | first-impact harm | total harm | push": _HONEST,
-    "| who drives Vehicle 2 | knows | collisions | first-impact harm | total harm | severe": _PAPER,
-    "| who drives Vehicle 2 | collisions | first-impact harm | total harm | share": (
-        "ethbrake evaluate --scenario recorded-openacc --agents full_brake,e_v2x_bm,e_v2x_bm:pairwise,idm,"
-        "universal-paper,best_harm --json",
-    ),
     "| agent | what it does | knows": (
         "ethbrake evaluate --agents ladder --scenario paper-random --episodes 10000 --seed 7 --json",
     ),

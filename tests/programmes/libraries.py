@@ -4,8 +4,8 @@ The programs of docs/train.md and docs/extensions/benchmarl.md run, too, in the 
 
 Each library has its own environment in ``.venvs/``, with this project in its present state. A library that cannot be
 installed is skipped with the reason. A policy is evaluated on a fixed list of worlds, together with full braking. If
-the library can evaluate policies itself, its harm is compared with ours, world by world. docs/results/libraries.md has
-the rows that are printed. ``--ci`` runs only the libraries that are cheap to install.
+the library can evaluate policies itself, its harm is compared with ours, world by world. docs/results/learning.md has
+the printed rows that beat full braking. ``--ci`` runs only the libraries that are cheap to install.
 """
 
 import json
