@@ -3,8 +3,8 @@
     python train/ppo_gpu.py --scenario paper-random --output runs/ppo-gpu
     ethbrake evaluate --scenario paper-random --agents full_brake,ppo,team@runs/ppo-gpu
 
-All learners share one actor and one critic. On a GPU a rollout and an update are recorded as CUDA graphs and replayed;
-`--device cpu` runs the same code slowly. Letters: T time steps, n copies, L learners, F features.
+All learners share one actor and one critic. On a GPU a rollout and an update are recorded as CUDA graphs and replayed.
+A processor runs the same code (`--device cpu --n 256`). Letters: T time steps, n copies, L learners, F features.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Settings:
 
     scenario: str = "paper-random"  # a shipped name, or the path of a YAML file
     device: str = "cuda"  # or "cuda:1", or "cpu"
-    steps: int = 20_000_000  # decisions of all learners together
+    steps: int = 5_000_000  # decisions of all learners together
     seed: int = 0
     output: Path = Path("runs/ppo-gpu")  # a new folder
     harm_count: str = "honest"  # what the reward counts: "honest" cost, "first" impacts (the paper) or "total" harm

@@ -16,6 +16,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.policies.bundle import load_drivers
 from tests.docs.site import load
+from tests.refused import refused
 
 PROGRAM = Path(__file__).resolve().parents[3] / "train" / "ppo_gpu.py"
 SMALL = {"device": "cpu", "n": 64, "rollout": 16, "minibatches": 8, "hidden": 16, "pool": 500, "worlds": 200}
@@ -119,6 +120,44 @@ def test_the_actor__does_not_learn_beyond_the_clip(
     assert changed == [learns, True]
 
 
+def test_the_actor__learns_the_same_beside_a_critic_with_large_errors(program: ModuleType) -> None:
+    actors = []
+    for scale in (1.0, 1e6):
+        torch.manual_seed(0)
+        ppo = program.Ppo(eb.cuda.Worlds("paper-random", 8, 16, "cpu"), program.Settings(n=8, rollout=8, minibatches=4))
+        ppo.collect()
+        ppo.targets *= scale
+        ppo.update()
+        actors.append(ppo.actor)
+    assert all(torch.equal(*each) for each in zip(*(each.parameters() for each in actors), strict=True))
+
+
+def test_training__begins_in_the_worlds_of_its_seed_near_full_braking_and_the_rate_falls_as_a_cosine(
+    program: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen, rates = [], []
+
+    def learn(ppo: Any, *_: Any) -> None:
+        seen.append(ppo.seen[-1].clone())
+        rates.append(ppo.rate.item())
+        assert torch.allclose(ppo.actor.mean(seen[0]), torch.tensor(-0.9), atol=0.1)
+
+    monkeypatch.setattr(program.Ppo, "learn", learn)
+    program.train(program.Settings(seed=5, steps=4 * 64 * 16, learning_rate=1.0, **SMALL), tmp_path)
+    assert torch.equal(seen[0], eb.cuda.Worlds("paper-random", 64, 500, "cpu", seed=5).reset())
+    np.testing.assert_allclose(rates, [1.0, 0.5 + 0.5**1.5, 0.5, 0.5 - 0.5**1.5], rtol=1e-6)
+
+
+def test_actions_that_are_no_numbers__are_refused(program: ModuleType) -> None:
+    worlds = eb.cuda.Worlds("paper-random", 8, 16, "cpu")
+    ppo = program.Ppo(worlds, program.Settings(n=8, rollout=8, minibatches=4))
+    torch.nn.init.constant_(ppo.actor.mean[-1].bias, float("nan"))
+    with refused("an action of row 0 is no number"):
+        ppo.learn(ppo.collect, ppo.update)
+    with refused("an action of row 0 is no number"):
+        program.evaluate(ppo.actor, worlds)
+
+
 def test_recording__leaves_networks_and_optimiser_as_they_were(
     program: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,6 +175,7 @@ def test_recording__leaves_networks_and_optimiser_as_they_were(
         ppo.learn(*calls)
         learned.append(ppo.networks.state_dict())
     assert all(torch.equal(one, other) for one, other in zip(*(each.values() for each in learned), strict=True))
+    assert torch.get_float32_matmul_precision() == "highest"
 
 
 class NoReading(TorchDispatchMode):
