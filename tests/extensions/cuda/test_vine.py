@@ -96,14 +96,14 @@ def test_branches__that_have_ended_gain_and_move_nothing() -> None:
 
 def begin(run: Path, **settings: Any) -> Any:
     return train(
-        SMALL.replace(total_steps=8 * 6 * 32), PAPER, run, **{"device": "twin", "on_progress": None, **settings}
+        SMALL.replace(total_steps=20 * 6 * 32), PAPER, run, **{"device": "twin", "on_progress": None, **settings}
     )
 
 
 def test_resume__after_a_kill_everything_is_the_same(tmp_path: Path) -> None:
     result = begin(tmp_path / "whole")
-    assert result.policy.manifest.algorithm == "vine" and result.updates == 8
-    killed(begin, tmp_path / "run", on_progress=dying_after(5))
+    assert result.policy.manifest.algorithm == "vine" and result.updates == 20
+    killed(begin, tmp_path / "run", on_progress=dying_after(14))
     assert resume(tmp_path / "run", on_progress=None).status == "finished"
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
     drives = eb.evaluate(PAPER, result.agent, episodes=10, seed=7)[result.agent]["first_impact_harm"].mean()
@@ -219,7 +219,7 @@ def test_gpu__that_is_missing_is_one_line(empty_folder: Path) -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_gpu__trains_and_goes_on_with_the_same_bits(tmp_path: Path) -> None:
     recipe = SMALL.replace(device="cuda")
-    train(recipe, PAPER, tmp_path / "whole", steps=8 * 6 * 32, on_progress=None)
+    train(recipe, PAPER, tmp_path / "whole", steps=20 * 6 * 32, on_progress=None)
     told: list[int] = []
 
     def stop(progress: Any) -> None:
@@ -228,6 +228,6 @@ def test_gpu__trains_and_goes_on_with_the_same_bits(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(recipe, PAPER, tmp_path / "run", steps=8 * 6 * 32, on_progress=stop)
+        train(recipe, PAPER, tmp_path / "run", steps=20 * 6 * 32, on_progress=stop)
     assert resume(tmp_path / "run", on_progress=None).status == "finished"
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
