@@ -112,9 +112,9 @@ def _import_public(name: str) -> Any:
     if name == "__all__":
         return ["__version__", *_usable()]
     if name not in _HOMES:
-        extension = f"{__name__}.extensions.{name}"
-        if not name.startswith("_") and find_spec(extension) is not None:
-            return import_module(extension)
+        folder = f"{__name__}.extensions"
+        if find_spec(folder) is not None and find_spec(f"{folder}.{name}") is not None:
+            return import_module(f"{folder}.{name}")
         close = get_close_matches(name, _HOMES, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
