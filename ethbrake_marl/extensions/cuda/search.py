@@ -60,6 +60,8 @@ def search(
         check_whole_number(name, value, least)
     if restarts not in (1 << k for k in range(11)):
         raise InvalidInput(f"restarts = {restarts!r}: must be a power of two, from 1 to 1024")
+    if not (seconds is None or seconds >= 0.0):
+        raise InvalidInput(f"seconds = {seconds!r}: must be None, or 0 or more")
     on, n, begun = device_named(device), problem.n, time.monotonic()
     searched, kernel = searched_worlds(problem, on)
     plans = started(problem, given, restarts, seed, on)

@@ -73,7 +73,7 @@ class Worlds:
         reward: Any = "harm",
         observation: Any = None,
     ) -> None:
-        """Draw the pool, and bring it to the device.
+        """Draw the pool, bring it to the device, and begin all episodes.
 
         Args:
             scenario: as for ``open_game``, and so are
@@ -95,9 +95,15 @@ class Worlds:
         self.scenario, self.game = open_game(scenario, learners, reward, observation)
         check_runs(self.game)
         if isinstance(pool, State):
-            worlds = pool
+            worlds, vehicles = pool, self.scenario.vehicles
+            if not (pool.n and pool.vehicles == vehicles):
+                raise InvalidInput(
+                    f"pool: has {pool.n} worlds of {pool.vehicles} vehicles; must have one or more of {vehicles}"
+                    f" vehicles, as in scenario {self.scenario.name!r}"
+                )
         else:
             check_whole_number("pool", pool, 1)
+            check_whole_number("seed", seed, 0)
             worlds = self.game.draw(pool, seed, 0)
         first = self.game.reset(worlds)
         self.longest = int(first.clock[:, LAST].max())  # decisions of the longest episode
@@ -114,6 +120,7 @@ class Worlds:
             self._zeros(n, kind=torch.int64),
         )
         self._no_actions = self._zeros(n, L, kind=torch.float32)
+        self.reset()
 
     def _zeros(self, *shape: int, kind: torch.dtype = torch.float64) -> Tensor:
         return torch.zeros(*shape, dtype=kind, device=self.device)
@@ -156,7 +163,12 @@ class Worlds:
         return Stepped(observations, reward, *ends, out[HARM], out[TOTAL_HARM])
 
     def put(self, stored: Stored, rows: Tensor) -> Tensor:
-        """Continue the episodes ``rows`` [n] of another ``Stored``; return what the learners observe, [n, L, F]."""
+        """Continue the episodes ``rows`` [n] of another ``Stored``; return what the learners observe, [n, L, F].
+
+        Raises ``InvalidInput`` for another number of rows.
+        """
+        if rows.shape != (self.n,):
+            raise InvalidInput(f"rows: have the shape {tuple(rows.shape)}; must be ({self.n},), one for each episode")
         for mine, other in zip(self.now, stored, strict=True):
             torch.index_select(other, -1, rows, out=mine)
         self._launch(self._no_actions, LOOK)

@@ -100,6 +100,7 @@ def test_threads__meet_in_pairs_and_go_on_from_the_better_profile() -> None:
         ({"drawn": 0}, "drawn = 0"),
         ({"changes": 0}, "changes = 0"),
         ({"seed": -1}, "seed = -1"),
+        ({"seconds": float("nan")}, "seconds = nan: must be None, or 0 or more"),
         ({"device": "gpu"}, "device = 'gpu'"),
         ({"given": 3}, "given: has 3 profiles; must have some for each of the 2 worlds"),
         ({"given": 8}, "given: has 4 profiles for each world, but 2 threads search it"),

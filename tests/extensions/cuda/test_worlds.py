@@ -110,6 +110,19 @@ def test_put__goes_on_with_any_episodes() -> None:
     assert same(other.step(actions[[3, 3, 0, 0, 1, 2]]).reward.numpy(), after.reward[[3, 3, 0, 0, 1, 2]].numpy())
 
 
+def test_put__of_another_number_of_rows_is_refused() -> None:
+    worlds = Worlds("paper-random", 4, 8, "cpu")
+    with refused("rows: have the shape (2,); must be (4,)"):
+        worlds.put(worlds.now, torch.tensor([0, 1]))
+
+
+def test_new_worlds__have_begun() -> None:
+    worlds = Worlds("paper-random", 4, 8, "cpu")
+    begun, seen = worlds.state(), worlds.observations.clone()
+    assert same(worlds.reset().numpy(), seen.numpy()) and same_state(worlds.state(), begun)
+    assert eb.cuda.Worlds is Worlds
+
+
 def test_actions__are_clipped_and_nothing_moves_without_a_number() -> None:
     worlds, clipped = (Worlds("paper-random", 3, 8, "cpu") for _ in range(2))
     worlds.reset(), clipped.reset()
@@ -149,6 +162,9 @@ def test_reward__has_the_weights_of_the_game() -> None:
         ({"device": "tpu"}, "device = 'tpu': must be 'cuda', or 'cpu'"),
         ({"n": 0}, "n = 0"),
         ({"pool": 0}, "pool = 0"),
+        ({"seed": -1}, "seed = -1"),
+        ({"pool": eb.load_scenario("realistic-pair").sample(3, seed=7)}, "pool: has 3 worlds of 2 vehicles; must have"),
+        ({"pool": eb.load_scenario("paper-random").sample(3, seed=7).take([])}, "pool: has 0 worlds of 3 vehicles"),
         ({"reward": "paper"}, "the reward has collision, risk, jerk"),
         ({"reward": {"harm": 1.0, "shaping": 1.0}}, "the reward has shaping"),
         ({"reward": {"harm": 1.0, "objective": "own"}}, "the reward has harm"),
