@@ -63,22 +63,6 @@ def test_folder__depends_on_the_kernels_beside(tmp_path: Path) -> None:
     assert folder_of(str(file)) != folder
 
 
-def test_folder__depends_on_the_kernels_of_another_extension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compiling, "PACKAGE", tmp_path)
-    one, other, folder_of = tmp_path / "extensions/one", tmp_path / "extensions/other", compiling.folder_of.__wrapped__
-    for folder in (one, other):
-        folder.mkdir(parents=True)
-        (folder / "kernels.py").write_text(KERNELS.format(factor=2.0))
-    file, text = one / "kernels.py", KERNELS.format(factor=5.0)
-    alone = folder_of(str(file))
-    (other / "kernels.py").write_text(text)
-    assert folder_of(str(file)) == alone
-    file.write_text(f"{file.read_text()}\nfrom ethbrake_marl.extensions.other.kernels import answer\n")
-    with_other = folder_of(str(file))
-    (other / "kernels.py").write_text(KERNELS.format(factor=2.0))
-    assert folder_of(str(file)) != with_other != alone
-
-
 @pytest.fixture
 def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[Path, list[str]]]:
     """Ask for the folder of a file's machine code, as in a new process; also return what was warned."""
