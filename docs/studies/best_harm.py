@@ -25,7 +25,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
-from ethbrake_marl.extensions.search.best_harm import search_list
+from ethbrake_marl.extensions.search.best_harm import BUDGET, search_list
 from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import SHIPPED, BestHarmTable, outdated_tables, shipped_tables
 from ethbrake_marl.files.sheet import Column, Sheet
@@ -51,10 +51,10 @@ def main(words: list[str]) -> None:
     add(
         "--harm-count",
         choices=[*COUNTS],
-        help="count to minimise; default: both harms. Other counts of --start stay as they are",
+        help="count to minimise; default: those of --start, or both harms. Other counts of --start stay as they are",
     )
     add("--vehicles", metavar="A,B,...", help="vehicles to control together; default: the learners")
-    add("--budget", type=int, default=100_000, help="candidate profiles per world and count")
+    add("--budget", type=int, default=BUDGET, help="candidate profiles per world and count")
     add("--search-seed", type=int, default=0)
     add("--threads", type=int, help="worlds searched at the same time; changes no result")
     add("--start", type=Path, metavar="FILE.npz", help="a table to start from; no world gets more harm")
@@ -68,8 +68,9 @@ def main(words: list[str]) -> None:
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
         print(shipped_bounds(shipped_tables()).markdown())
         return
-    table = search(given, " ".join(["docs/studies/best_harm.py", shlex.join(words)]))
-    for key, value in ((key, value) for key, value in table.header.items() if key != "after"):
+    names = [Path(word).name if word.endswith(".npz") else word for word in words]  # whose folders they were, nobody asks
+    table = search(given, shlex.join(["docs/studies/best_harm.py", *names]))
+    for key, value in table.header.items():
         print(f"{key:28} {value}")
     for count, harm in table.harm.items():
         print(f"{f'best known harm, {count}':28} {harm.mean():.4f} m2/s2, {(harm == 0.0).mean():.1%} of worlds without")
@@ -92,8 +93,8 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
     if not scenario.learners:
         raise InvalidInput(f"scenario {scenario.name!r} has no learner; give vehicles to control: --vehicles vehicle_2")
     alert = scenario.sample(given.episodes, seed=given.seed)
-    counts = tuple(HARM) if given.harm_count is None else (given.harm_count,)
     known = None if given.start is None else BestHarmTable.load(given.start)
+    counts = (given.harm_count,) if given.harm_count else tuple(HARM if known is None else known.harm)
     teams = [make_teams(given.agents, scenario, harm_count=count) if given.agents else {} for count in counts]
     table = search_list(
         game, alert, chunks=None if given.output is None else parts_beside(given.output), counts=counts,
@@ -101,7 +102,7 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
         teams=[team for each in teams for team in each.values()],
     )  # fmt: skip
     header = {**table.header, "episodes": given.episodes, "list_seed": given.seed, "command": command}
-    header |= {} if known is None else {"after": known.header}
+    header |= {} if known is None else {"after": known.header["command"]}
     harm, profiles = dict(table.harm), dict(table.profiles)
     for count in known.harm if known is not None else ():
         if count not in harm:  # stays as it was

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.drive import MODEL, Agent, Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
-from ethbrake_marl.extensions.search.best_harm import commands_of, e_v2x_bm_profiles
+from ethbrake_marl.extensions.search.best_harm import BUDGET, commands_of, e_v2x_bm_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of
 from ethbrake_marl.extensions.search.search import refine, search_profiles
 from ethbrake_marl.extensions.search.tables import best_known, outdated_tables
@@ -23,7 +23,6 @@ from ethbrake_marl.worlds.game import game_of
 from ethbrake_marl.worlds.roles import HELD, LEARNER
 from ethbrake_marl.worlds.scenario import Scenario
 
-BUDGET = 20_000  # profiles that best_harm simulates in a world that is in no table
 CANDIDATES = 500  # plans that +search simulates
 MOST_CANDIDATES = 1_000_000
 START = {"honest": "universal"}  # count -> policy whose episode a search also starts from,

@@ -24,7 +24,7 @@ from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
 
-BUDGET = 100_000  # profiles that are simulated in each world, in each count
+BUDGET = 20_000  # profiles that are simulated in each world, in each count
 CHUNK = 200  # worlds that are searched together
 CONSTANTS = 29  # constant commands with which every search begins
 
