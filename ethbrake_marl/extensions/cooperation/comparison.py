@@ -25,7 +25,7 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
     - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
     - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking, or none.
 
-    The joint optimum was searched in the first ``searched`` worlds; comparisons with it use only these.
+    The joint optimum is known in the first ``searched`` worlds; comparisons with it use only these.
     """
     steps = []
     for algorithm in dict.fromkeys(each.algorithm for each in measured if each.algorithm is not None):
@@ -48,13 +48,11 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
 
 
 def place_of(one: Measured) -> Json:
-    """Return the level's name and, in a sweep, the swept number."""
     swept = one.level.swept
     return {"level": one.level.name} | ({} if swept is None else {"swept_number": swept.number})
 
 
 def _level(one: Measured, searched: int) -> Json:
-    """Return the results of one level with one algorithm, as means over seeds and worlds."""
     scenario = one.level.scenario
     mean = partial(mean_over_seeds, clusters=one.clusters)
     entry: Json = {
@@ -81,7 +79,7 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
-    """Return the results in the first worlds, in which the joint optimum was searched."""
+    """Return the results in the first worlds, in which the joint optimum is known."""
     first = None if one.clusters is None else one.clusters[:searched]
     reached, braking = one.reached[COLUMN[count]][:, :searched], one.braking[COLUMN[count]][:, :searched]
     best = None if one.best is None else one.best[count]

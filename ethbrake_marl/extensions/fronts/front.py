@@ -1,8 +1,8 @@
 """The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
 A point of the front is the mean harm of each vehicle over the worlds, for one choice of weights. The points approximate
-the convex part of the Pareto front; a search finds them, and there is no proof that no better ones exist. N is the
-number of vehicles, W that of choices of weights.
+the convex part of the Pareto front; a search finds them, and there is no proof that no better ones exist. N vehicles, W
+choices of weights.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def search_front(
     True
 
     Args:
-        scenario: of the worlds; its learners are controlled.
+        scenario: its learners are controlled.
         worlds: n worlds at the alert.
         weights: weights of the vehicles' harm, [W, N].
         count: what is weighted: ``first``, ``total`` or ``honest`` (``episode.counts``).
@@ -165,7 +165,7 @@ def _tried(
 
 
 def observes_weights(team: Team) -> bool:
-    """Return whether what a team does may depend on the weights of harm: not for policies that do not observe them."""
+    """May a team's commands depend on the weights of harm? Not for policies that do not observe them."""
     policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
     seen = [() if policy is None else policy.observation.names for policy in policies]
     return team.shield is not None or any(not names or any("harm_weight" in name for name in names) for names in seen)

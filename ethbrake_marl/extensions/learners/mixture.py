@@ -40,7 +40,7 @@ LIKELY_ACTIONS, THEIR_SHARES = np.array([-1.0, 1.0, 0.0]), np.array([0.35, 0.5, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """No template has a higher return than the earlier experts, so a further expert has nothing to learn."""
+    """No template has a higher return than the earlier experts, so a new expert has nothing to learn."""
 
 
 class Stage(NamedTuple):
@@ -52,7 +52,7 @@ class Stage(NamedTuple):
 
 
 def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
-    """Return the stages of a training of so many updates. One with a small share may have none."""
+    """Return the stages of a training of so many updates; a small share may get none."""
     shares, others = plan.shares, plan.networks - 1
     parts: list[tuple[int | None, float]] = [(0, shares.pretraining_first)]
     parts += [(k + 1, shares.pretraining_others / others) for k in range(others)]
@@ -86,7 +86,6 @@ class Mixture(nn.Module):
         return means
 
     def act(self, observations: Float32s) -> Float32s:
-        """Return the actions."""
         return np.clip(self.means(observations), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
@@ -113,12 +112,9 @@ class Shown(NamedTuple):
 
 
 class MixtureModel(VineModel):
-    """Trains a mixture of experts for one learner."""
-
     policy: Mixture  # type: ignore[assignment]
 
     def new_policy(self) -> nn.Module:
-        """Return experts and gating network."""
         assert self.recipe.experts is not None
         self.plan = self.recipe.experts
         self.stage: Stage | None = None
@@ -151,7 +147,6 @@ class MixtureModel(VineModel):
         return np.concatenate(seen), State.join(states)
 
     def improve(self, seen: Float32s, states: State) -> None:
-        """Train what this stage trains."""
         stage, policy = self.stage, self.policy
         assert stage is not None
         self._update_current_progress_remaining(self.number - stage.first, stage.end - stage.first)
@@ -164,9 +159,9 @@ class MixtureModel(VineModel):
     def enter(self, stage: Stage) -> None:
         """Prepare a stage that begins, or is resumed.
 
-        A second or later expert first imitates templates; then the worlds of its training are selected. All this
-        depends on the earlier experts only, so a resumed training repeats it exactly. Raises ``NoBetterTemplate`` if
-        there is no better template, or no world to select.
+        A second or later expert first imitates templates; then the worlds of its training are selected. This depends
+        only on the earlier experts, so a resumed training repeats it exactly. Raises ``NoBetterTemplate`` if there is
+        no better template, or no world to select.
         """
         self.stage, self.own = stage, None
         if not stage.expert:
@@ -203,8 +198,8 @@ class MixtureModel(VineModel):
     def best_templates(self, explored: Explored) -> tuple[Ints, Floats]:
         """Draw templates in each world; return the worlds in which one does less harm than all experts, and it, [m, T].
 
-        A random template with little harm tolerates small errors of its actions, so a policy can imitate it. Therefore
-        no search improves it.
+        No search improves a template: a random one with little harm tolerates small errors of its actions, so a policy
+        can imitate it.
         """
         count, start = self.recipe.reward.harm_count, explored.start
         generator = np.random.default_rng(self.recipe.seed)
@@ -248,7 +243,7 @@ class MixtureModel(VineModel):
     def worlds_of(self, act: Act, explored: Explored) -> State:
         """Return the worlds in which a new expert is to be trained: it is better there, or not much worse.
 
-        Left out are worlds in which it is as good as the best earlier expert, or in which that one does no harm.
+        Left out are worlds in which it is as good as the best earlier expert, or that expert does no harm.
         """
         gained, _ = self.drive_from(explored.start, act, self.recipe.reward.harm_count)
         more = gained - explored.gained

@@ -83,7 +83,7 @@ class BranchingModel(BaseAlgorithm):
         return self.visit(callback, self.policy.act)
 
     def visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions; return observations [decisions L, F], and the states there."""
+        """Drive all worlds for ``n_steps`` decisions; return as ``collect``."""
         seen, states, every = [], [], np.arange(self.rows.n)
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
@@ -99,7 +99,6 @@ class BranchingModel(BaseAlgorithm):
         return np.concatenate(seen), State.join(states)
 
     def dump_logs(self) -> None:
-        """Write a row of the logs."""
         self.logger.dump(step=self.num_timesteps)
 
     def harm(self, state: State, count: str) -> Floats:

@@ -28,12 +28,11 @@ for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_
 
 
 def perceptron(inputs: int, outputs: int, hidden: Sequence[int], activation: Activation) -> nn.Sequential:
-    """Return a new network."""
     return nn.Sequential(*create_mlp(inputs, outputs, list(hidden), ACTIVATIONS[activation]))
 
 
 def silent(network: nn.Sequential) -> nn.Sequential:
-    """Let all outputs of a new network be 0, and return it."""
+    """Set all outputs of a new network to 0, and return it."""
     last = linear_layers(network)[-1]
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
@@ -41,7 +40,6 @@ def silent(network: nn.Sequential) -> nn.Sequential:
 
 
 def linear_layers(network: nn.Sequential) -> list[nn.Linear]:
-    """Return the layers that have weights."""
     return [layer for layer in network if isinstance(layer, nn.Linear)]
 
 
@@ -89,7 +87,6 @@ class Averaged(nn.Module):
         return {f"{place}.{part}": getattr(layer, part).detach() for place, layer in layers for part in PARTS}
 
     def tensors(self, name: str) -> dict[str, Float32s]:
-        """Return copies of ``weights``."""
         return {place: weight.cpu().numpy().copy() for place, weight in self.weights(name).items()}
 
 
@@ -114,7 +111,6 @@ class Memory(nn.Module):
         self.known += m
 
     def __len__(self) -> int:
-        """Return the number of decisions that can be recalled."""
         return min(int(self.known), self.size)
 
 

@@ -52,7 +52,7 @@ class Messages:
     }
 
     def read(self, key: str, value: Any) -> Any:
-        """Return the value of a key; lists of pieces in the order of ``PIECES``."""
+        """Return the value of a key, with lists of pieces in the order of ``PIECES``."""
         if key == "persistence":
             require(value in ("first", "periodic"), (key,), value, "must be first or periodic")
             return value
@@ -81,7 +81,7 @@ class Messages:
         return ("message_period_s", "loss_begins", "loss_ends") if _is_periodic(v2x) else ()
 
     def is_random(self, v2x: V2X) -> bool:
-        """Return whether messages after the first may be lost."""
+        """May messages after the first be lost?"""
         return _is_periodic(v2x) and v2x.loss_begins > 0.0
 
     def check(self, scenario: Scenario) -> None:
@@ -109,7 +109,6 @@ class Messages:
         return silent(_contents(scenario), heard, seen, channel, _kept(scenario))
 
     def game(self, game: Game) -> Game:
-        """Return the game with messages."""
         return GameWithMessages.of(game)
 
 

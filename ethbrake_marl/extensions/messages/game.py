@@ -52,12 +52,10 @@ class GameWithMessages(Game):
 
     @classmethod
     def of(cls, game: Game) -> GameWithMessages:
-        """Return the game with vehicles and scripts that believe what messages and sensors tell them."""
         views = tuple(believed_view(view) for view in game.views)
         return cls(*game._replace(views=views, scripts={i: Believer(script) for i, script in game.scripts.items()}))
 
     def first_decision(self, alert: State) -> State:
-        """Return the episodes at their first decision, with what has been received by then."""
         state = super().first_decision(alert)
         if not state.memories[NAME].is_periodic:
             return state
@@ -114,7 +112,6 @@ def believing(agent: Any) -> Any:
 
 @cache
 def believed_view(view: View) -> BelievedView:
-    """Return the view of what the observer believes."""
     return BelievedView(view)
 
 
@@ -141,7 +138,6 @@ class BelievedView(View):
         ]
 
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
-        """Return the observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
         seen = np.empty((state.n, len(observers), len(self.names)), np.float32)
         for o, body in enumerate(observers.tolist()):
             known = known_pieces(state, body)
@@ -158,7 +154,6 @@ class PieceView(View):
 
     @cached_property
     def plan(self) -> Plan:
-        """How this view is computed."""
         plan = View(self.names).plan
         return plan._replace(own=tuple((column, _or_unknown(own), offset) for column, own, offset in plan.own))
 
@@ -177,18 +172,15 @@ def _is_partly_known(state: State, other: int) -> Bools:
 
 
 class Believer:
-    """A script that acts on what its vehicle believes."""
-
     def __init__(self, script: Script) -> None:
         self.script = script
 
     @property
     def name(self) -> str:
-        """Name of the script."""
         return str(getattr(self.script, "name", type(self.script).__name__))
 
     def begin(self, alert: State, body: int) -> Any:
-        """Return the script's memory for new episodes. Raises ``InvalidInput`` if it will not know what it needs.
+        """Begin the script. Raises ``InvalidInput`` if it will not know what it needs.
 
         A script may have ``needs_ahead``: pieces of a message that it needs of the vehicle ahead, until it sees it.
         """
@@ -198,7 +190,7 @@ class Believer:
         return self.script.begin(believed(alert, body), body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Return the commands [n] m/s2 and the new memory. Raises ``InvalidInput`` for a script that needs more."""
+        """Let the script act. Raises ``InvalidInput`` for a script that needs more than its vehicle knows."""
         commands, memory = self.script.act(believed(state, body), memory, body)
         if not np.isfinite(commands).all():
             require_pieces(state, [body], f"script of vehicle_{body}", PIECES[:-1])

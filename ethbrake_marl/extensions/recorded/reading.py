@@ -25,7 +25,7 @@ OTHER_NAMES = {"preceeding": "preceding"}  # misspelt column in some files of NG
 
 
 class NotARecording(InvalidInput):
-    """Raised for a file that is not a recording, because it lacks more than half of the format's columns."""
+    """The file lacks more than half of the format's columns."""
 
 
 class Cells(NamedTuple):
@@ -37,17 +37,16 @@ class Cells(NamedTuple):
     frame: Any  # quantity -> finite numbers, or texts; in a format with gaps an empty cell is NaN
 
     def place(self, row: int, quantity: str = "") -> str:
-        """Return the place of a row for error messages: file, line and column."""
+        """Return file, line and column of a row, for messages."""
         with reading(self.file) as stream:
             lines = (number for number, line in enumerate(stream, 1) if number > self.heading and line.strip())
             line = next(islice(lines, row, None))
         return f"{self.file}, line {line}{f', column {self.names[quantity]}' if quantity else ''}"
 
     def refuse(self, bad: Any, quantity: str, values: Any, right: str) -> None:
-        """Raise ``InvalidInput``, which names file, line and column, if at least one value is wrong.
+        """Raise ``InvalidInput``, with file, line and column, at the first value that is ``bad``.
 
-        ``bad`` and ``values`` are series with the number of the row as index. The message shows the first wrong value;
-        ``right`` is its end, which says what a valid value is.
+        ``bad`` and ``values`` are series with the number of the row as index; ``right`` says what a valid value is.
         """
         if bad.any():
             row = bad.idxmax()
@@ -56,7 +55,7 @@ class Cells(NamedTuple):
 
 @contextmanager
 def reading(file: Path) -> Iterator[BufferedReader]:
-    """Open a file; bytes that are no text, and what goes wrong inside pyarrow, are one ``InvalidInput``."""
+    """Open a file. Bytes that are no text, and errors inside pyarrow, become ``InvalidInput``."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             yield stream

@@ -1,6 +1,6 @@
 """Create a scenario (a YAML file, and a CSV file with gaps and speeds) from a folder of recorded traffic.
 
-Only one file's states are in memory at a time, besides the rows: gaps and speeds of a chain of vehicles at one moment.
+Besides the rows, only one file's states are in memory at a time.
 """
 
 from __future__ import annotations
@@ -67,8 +67,6 @@ class Rows(NamedTuple):
 
 
 class FromData(NamedTuple):
-    """A scenario that was created from a folder of recordings, and information on the files."""
-
     text: str  # content of the scenario file (YAML)
     csv: str  # content of the file of its rows (CSV): gaps (m), speeds (m/s), and the column ``recording``
     found: list[str]  # sentences that say what the recordings contain, and what was left out
@@ -144,8 +142,8 @@ def read_rows(
 ) -> Rows:
     """Read the chains of vehicles in all recordings of a folder and its subfolders, or in one file.
 
-    If a file has an error, none of its chains are used, and the result contains the error message. A file with the
-    content of another one is skipped. Raises ``InvalidInput`` if there is no recording of this format, and no row.
+    A file with an error is left out, and the result has the message. A file with the content of another one is skipped.
+    Raises ``InvalidInput`` if there is no recording of this format, or no row.
     """
     longest, left_out, refused, skipped = 0, Counter[str](), list[str](), list[str]()
     numbers, of, seen, others = [np.empty((0, 2 * vehicles - 1))], list[tuple[str, str]](), set[bytes](), list[str]()

@@ -44,7 +44,6 @@ class Recording(NamedTuple):
     names: dict[float, str]  # number of a vehicle or lane -> its name, if files have names instead of numbers
 
     def name(self, number: float) -> str:
-        """Return the name of a vehicle or lane."""
         return self.names.get(number) or f"{number:.0f}"
 
 
@@ -186,9 +185,8 @@ def _check_positions(recording: Recording, every_s: float) -> None:
 def _openacc(raw: Any, cells: Cells, entry: Format) -> Any:
     """Return the states of cars of which speeds and gaps were recorded, in numbered columns.
 
-    Car k + 1 follows car k if the speeds of both cars and the gap between these cars (column ``IVS`` with the number k)
-    are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of the
-    gaps between it and the first car of its queue.
+    Car k + 1 follows car k if the speeds of both cars and the gap between them (column ``IVS`` with the number k) are
+    recorded. The first car of a queue has position 0, every other car minus the sum of the gaps up to the first.
     """
     cars = sorted(int(name.removeprefix("speed")) for name in raw if name.startswith("speed"))
     gap_of = {k: f"gap{k - 1}" for k in cars if k - 1 in cars and f"gap{k - 1}" in raw}

@@ -58,7 +58,6 @@ Films = Mapping[str, Sequence[Scene]]  # title -> scenes, of one world
 
 
 def stacked(films: Films) -> Iterator[Frame]:
-    """Yield the pictures of a film in order: all films at one time, one below the other."""
     for k in range(max(map(len, films.values()))):
         each = (scenes[min(k, len(scenes) - 1)]._replace(title=title) for title, scenes in films.items())
         yield np.concatenate([picture(scene) for scene in each])

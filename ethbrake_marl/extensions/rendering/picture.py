@@ -40,7 +40,7 @@ def vehicle_colour(body: int) -> str:
 
 @cache
 def font(size: int) -> Any:
-    """Return Pillow's own font; the size is that in the finished picture."""
+    """Return Pillow's own font; ``size`` is in pixels of the finished picture."""
     return ImageFont.load_default(size * FINE)
 
 
@@ -111,7 +111,6 @@ def picture(scene: Scene) -> Frame:
 
 
 def draw_road(pen: Pen) -> None:
-    """Draw the lane with its edges, the distances and the obstacle."""
     pen.box(0, ROAD_TOP, WIDTH, ROAD_BOTTOM, ASPHALT)
     for place_m in pen.marks(5.0):
         for y in (ROAD_TOP + 5, ROAD_BOTTOM - 5):
@@ -181,7 +180,7 @@ def write_gaps(pen: Pen) -> None:
 
 
 def show_impacts(pen: Pen) -> None:
-    """Draw a star at every recent impact, and say which two were hardest."""
+    """Draw a star at every recent impact, and name the two hardest."""
 
     def x(impact: Impact) -> float:
         return (pen.ends(impact.pair + 1)[1] + pen.ends(impact.pair)[0]) / 2

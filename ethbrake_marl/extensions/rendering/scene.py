@@ -69,7 +69,7 @@ class Scene(NamedTuple):
 
     @property
     def shown_m(self) -> tuple[float, float]:
-        """Places of the ends of the road that is shown: moved forward and widened until it holds the whole line."""
+        """Ends of the road that is shown: ``road_m``, moved forward and widened until it holds the whole line."""
         (left, right), fronts = self.road_m, self.fronts_m
         on = max(fronts[0] + AHEAD_M - right, 0.0)
         return min(left + on, fronts[-1] - BODY_M - BEHIND_M), right + on
@@ -80,7 +80,6 @@ class Scene(NamedTuple):
 
     @property
     def obstacle_m(self) -> float:
-        """Place of the obstacle."""
         return self.front_m + float(self.line[GAP, 0])
 
     def command(self, body: int) -> float:
@@ -170,7 +169,6 @@ class Motion:
         return line, front_m, recent
 
     def scene(self, time_s: float) -> Scene:
-        """Return what there is to see at a time of this motion (s after the alert)."""
         line, front_m, impacts = self.at(time_s)
         learners, ended = tuple(map(int, self.game.rules.learners)), self.ended and time_s == self.until_s
         return Scene(

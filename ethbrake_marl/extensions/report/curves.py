@@ -17,9 +17,9 @@ Curve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
 
 
 def over_seeds(trainings: Sequence[Mapping[Any, float]]) -> Curve:
-    """Return the mean of several training runs, with plus and minus one standard deviation over the seeds.
+    """Return the mean of several training runs, plus and minus one standard deviation over the seeds.
 
-    ``trainings`` has a mapping from step or progress to value for each run. The curve has those that all runs have.
+    ``trainings`` has a mapping from step or progress to value for each run. The curve has the steps of all runs.
     """
     curve = {}
     for step in sorted(set.intersection(*map(set, trainings))):
@@ -41,7 +41,7 @@ def curves_figure(
     """Draw curves with a band between the ends of their intervals, in a panel for each title.
 
     Args:
-        panels: title -> label of a curve -> curve. The first panel, whose labels the legend has, has all of them.
+        panels: title -> label of a curve -> curve. The first panel must have all labels, for the legend.
         x_label: label of the horizontal axes.
         caption: text below the figure.
         lines: title -> label -> value of a horizontal line.

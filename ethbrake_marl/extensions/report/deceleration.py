@@ -25,7 +25,7 @@ POINTS = 2001  # evenly spaced decelerations
 def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float) -> Floats:
     """Return what vehicle ``body`` does by holding decelerations ``at`` [C] (m/s2), [3, C] m2/s2.
 
-    Rows: predicted by the closed form, and simulated, of first impacts and in total. The others do as in ``world``.
+    Rows: predicted by the closed form, and simulated, first-impact and total. The others do as in ``world``.
     """
     braking, wait = np.ascontiguousarray(world.car[0, BRAKING]), world.car[0, LATENCY].copy()
     priced: Any = predicted_harm
@@ -47,7 +47,7 @@ def deceleration_figure(
         known: best known harm of this world over all commands, ``first`` and ``total``, drawn as lines.
         title: of the figure; by default the scenario's name.
 
-    Raises ``InvalidInput`` for something else.
+    Raises ``InvalidInput`` for several worlds or another scenario.
 
     """
     loaded, game = open_game(scenario)

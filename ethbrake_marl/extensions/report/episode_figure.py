@@ -58,7 +58,6 @@ def _rest_s(record: EpisodeRecord) -> float:
 
 
 def _style(body: int) -> dict[str, Any]:
-    """Return the style of the curves of a vehicle (1: Vehicle 1) and of the gap ahead of it."""
     return {"color": vehicle_colour(body), "linestyle": DASHES[(body - 1) % len(DASHES)], "linewidth": 1.6}
 
 

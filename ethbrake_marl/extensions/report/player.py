@@ -1,4 +1,4 @@
-"""The episode player of a page: its data, pieces of motion between which the player computes places."""
+"""The episode player of a page: its data are pieces of motion, between which the player computes places."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ MOST_SHOWN = 3  # agents that are shown at the start
 def player(
     compared: Compared, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
 ) -> Markup:
-    """Return the player of some worlds. The agents that it shows first are the first one, ``focus``, and the last.
+    """Return the player of some worlds. It first shows the first agent, ``focus``, and the last.
 
-    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, in which
-    samples are ``SAMPLE_S`` apart.
+    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, with
+    samples ``SAMPLE_S`` apart.
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
@@ -98,7 +98,7 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 
 
 def moved(pieces: Floats, t: Floats, N: int) -> Floats:
-    """Return what pieces have become ``t`` (s) after their beginning, without the time."""
+    """Return the pieces ``t`` (s) after their beginning, without the time."""
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
     gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]

@@ -34,8 +34,6 @@ WORDS = {
 
 
 class Test(NamedTuple):
-    """Another test of the same agents."""
-
     about: str  # how it differs
     compared: Compared
 
@@ -56,7 +54,6 @@ class Report:
 
     @property
     def html(self) -> str:
-        """The whole page."""
         compared, rows = self.compared, self.compared.table
         focus = self.focus or [row.agent for row in rows if row.policies or row is rows[-1]][-1]
         kinds = shown_worlds(compared.result, focus)
@@ -84,12 +81,10 @@ class Report:
         return whole_page(self.title, lead, opening, [section for section in sections if section.body])
 
     def write(self, path: Path, *, force: bool = False) -> None:
-        """Write the page. Raises the errors of ``write_output``."""
         write_output(path, self.html.encode("utf-8"), force=force)
 
 
 def short_table(agents: SummaryTable) -> Markup:
-    """Return each agent's collision rate and harms."""
     sheet = agents.sheet()
     some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in SHORT)
     return table(replace(some, title="Means with 95 % intervals, m²/s²"))

@@ -27,7 +27,7 @@ KEPT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the shor
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Return whether a scenario is the shipped one of its name, whatever its words say."""
+    """Is a scenario the shipped one of its name, whatever its words say?"""
     return scenario.content(without=WORDS) == load_scenario(scenario.name).content(without=WORDS)
 
 

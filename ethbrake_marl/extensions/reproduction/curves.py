@@ -46,14 +46,14 @@ def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> di
 
 
 def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[str, Floats]:
-    """Return the same in the paper's map, with the policies of its process, [seeds, n]; nothing without trainings."""
+    """The same in the paper's map, with the policies of its process, [seeds, n]; nothing without trainings."""
     found = of_the_process(reading, episodes, settings)
     trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in found.items()}
     return {**lines_of(reading._replace(step_s=MAP_STEP_S), episodes, {}), **trained} if found else {}
 
 
 def estimate(line: Floats, rows: Floats) -> Estimate:
-    """Return the mean harm in some worlds, with its interval; of several seeds over the seeds."""
+    """Return the mean harm in some worlds; its interval is over the worlds, or over the seeds if there are several."""
     return mean(line[rows]) if line.ndim == 1 else mean(line[:, rows].mean(axis=1))
 
 
@@ -64,7 +64,7 @@ def by_distance(reading: Reading, episodes: int, lines: Lines) -> Groups:
 
 
 def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
-    """Compare the harm of a strategy with that of another one, in the same worlds of every group."""
+    """Compare the harm of two strategies, in the same worlds of every group."""
     return [
         Less.of_worlds(f"{smaller} minus {larger}, {group}", lines[smaller][rows], lines[larger][rows])
         for group, (lines, rows) in groups.items()
@@ -99,7 +99,6 @@ def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequ
 
 
 def over_distance(stem: str, readings: Mapping[str, Groups], shown: Sequence[str]) -> Made:
-    """Return figure and tables of harm against the sum of both gaps."""
     return show_harm(stem, "Harm by total distance", readings, shown, "Total distance d1 + d2 at the alert")
 
 
@@ -113,7 +112,6 @@ def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Grou
 
 
 def reproduce_distance(settings: Settings) -> Made:
-    """Reproduce the figure of harm against the sum of both gaps."""
     readings = distances(settings, settings.policies)
     stated, nearest = (statements(groups, settings.policies) for groups in readings.values())
     there, episodes = STATED._replace(base=DISTANCE), min(DISTANCE_WORLDS, settings.episodes)
@@ -143,7 +141,7 @@ def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]
 
 
 def growing(groups: Groups, name: str) -> list[Less]:
-    """Compare the harm of a strategy in each group with that in the next one."""
+    """Compare the harm of a strategy in each group with the next one."""
     each = {group: lines[name][rows] for group, (lines, rows) in groups.items()}
     return [Less.of_lists(f"{one} minus {other}", each[one], each[other]) for one, other in pairwise(each)]
 
@@ -153,7 +151,7 @@ ONE = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # the world 
 
 
 def reproduce_delays(settings: Settings) -> Made:
-    """Reproduce the figure of harm at three delays, in its single world. The delays are our choice."""
+    """Harm at three delays, in the single world of the paper's figure. The delays are our choice."""
     groups, trained, one = {}, {}, np.array([True])
     for delay in DELAYS:
         reading = STATED._replace(base=f"paper-delay-{delay}", others=ONE)
@@ -175,7 +173,7 @@ def reproduce_delays(settings: Settings) -> Made:
 
 
 def reproduce_illustration(settings: Settings) -> Made:
-    """Reproduce the illustration of the hybrid, which "consistently selects the strategy [of] lower harm"."""
+    """The illustration of the hybrid, which "consistently selects the strategy [of] lower harm"."""
     readings = distances(settings, {ALONE: unconverged(settings.folder)})
     hybrid = f"Hybrid {ALONE}"
     counts, shares, texts = [], [], []

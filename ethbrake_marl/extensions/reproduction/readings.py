@@ -30,7 +30,6 @@ WORDS = {  # field of a reading -> its default in words, and another value
 
 
 def say(field: str, value: Any) -> str:
-    """Return a value of a field of a reading in words."""
     default, other = WORDS[field]
     if value == Reading._field_defaults[field]:
         return default

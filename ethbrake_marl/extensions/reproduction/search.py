@@ -5,7 +5,7 @@ The eight independent numbers are collision rate and average harm of four strate
 By the plain mean another reading is as near as the nearest, and which of both is nearer depends on the list of worlds.
 
 The nearest reading is a hypothesis: among so many readings some come near by chance. To judge this, the search also
-looks for tables that nobody has printed. Each of their numbers is from a reading drawn at random, one draw for each.
+looks for tables that nobody has printed, each number of which comes from a reading drawn at random.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def distance(numbers: Floats, printed: Floats = PRINTED) -> Any:
 def by_chance(numbers: Floats) -> Floats:
     """Return the distance of the nearest reading from each of some tables that nobody has printed, [FAKES].
 
-    ``numbers`` [R, 4, 2] are those of all readings.
+    ``numbers`` [R, 4, 2]: all readings.
     """
     drawn = np.random.default_rng(0).integers(len(numbers), size=(FAKES, *PRINTED.shape))
     fakes = np.take_along_axis(numbers, drawn, axis=0)

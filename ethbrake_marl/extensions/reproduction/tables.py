@@ -158,7 +158,7 @@ def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less
 
 
 def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: str, larger: str) -> list[Less]:
-    """Compare both harms of two strategies of the paper's process, ``{}`` for the policy, over its seeds."""
+    """Compare two strategies of the paper's process, ``{}`` for the policy, over its seeds."""
     parts = []
     for name, seeds in process.items():
         one, other = smaller.format(name), larger.format(name)
@@ -192,7 +192,7 @@ def conclusions(found: Mapping[str, Outcome], policies: Iterable[str]) -> dict[s
 
 
 def reproduce_random_table(settings: Settings) -> Made:
-    """Reproduce the table of the random test, and judge the paper's two contributions."""
+    """The table of the random test, and the paper's two contributions."""
     episodes, policies = settings.episodes, settings.policies
     least = least_harm(STATED, episodes)
     rows = {E_V2X_BM: "", NON_E: "", **{f"Hybrid {name}": spec for name, spec in policies.items()}}
@@ -219,7 +219,7 @@ def reproduce_random_table(settings: Settings) -> Made:
 
 
 def reproduce_hybrid_table(settings: Settings) -> Made:
-    """Reproduce the table of 5,000 worlds, with the speeds of the random test."""
+    """The table of 5,000 worlds, with the speeds of the random test."""
     episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged(settings.folder)
     least = least_harm(STATED, episodes)
 

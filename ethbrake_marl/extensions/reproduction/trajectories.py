@@ -84,7 +84,6 @@ def all_records(settings: Settings) -> dict[str, Records]:
 
 
 def reproduce_trajectories(settings: Settings) -> Made:
-    """Reproduce the trajectories."""
     every, parts = all_records(settings), []
     figures = []
     for number, (name, records) in enumerate(every.items(), 1):
@@ -126,7 +125,6 @@ def reproduce_trajectories(settings: Settings) -> Made:
 
 
 def reproduce_accelerations(settings: Settings) -> Made:
-    """Reproduce the commands of Vehicle 2."""
     every, parts = all_records(settings), []
     text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
     figure = Drawn("accelerations", "Acceleration profiles", text, profiles_figure(every, text))
@@ -168,7 +166,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
 def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
     """Return a recorded quantity under PPO, and under SAC at the same times; an episode that has ended stays as it is.
 
-    ``number`` is that of the scenario, ``what`` an attribute of ``EpisodeRecord``, ``column`` a vehicle or pair from 0.
+    ``what`` is an attribute of ``EpisodeRecord``, ``column`` a vehicle or pair from 0.
     """
     pair = [records[name, number] for name in ("PPO", "SAC")]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
@@ -176,7 +174,7 @@ def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
 
 
 def apart(records: Records, number: int, what: str) -> float:
-    """Return the root mean square over time of the difference between PPO and SAC, of Vehicle 2."""
+    """Return the root mean square over time of the difference between PPO and SAC, for Vehicle 2."""
     one, other = both(records, number, what, VEHICLE_2)
     return float(np.sqrt(np.mean((one - other) * (one - other))))
 
@@ -196,7 +194,7 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
 
 
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return the first command of Vehicle 2 and the sum of its changes (m/s2), and how long it brakes while it moves.
+    """Return the first command of Vehicle 2 and the sum of its changes (m/s2), and how long it brakes.
 
     The last is a share of the time in which it moves after its latency.
     """

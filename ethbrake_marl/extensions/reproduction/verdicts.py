@@ -2,7 +2,6 @@
 
 The *chance difference* is the largest difference between means of two random lists of worlds that is due to chance
 alone (95 %): sqrt(2) times half of the interval. A printed number
-
 - *agrees* if ours is within 2 % of it;
 - is *undecided* if ours is within the chance difference of it: too few worlds;
 - *cannot be* if a lower bound that is proven for every strategy is above it by more than the chance difference;
@@ -42,13 +41,11 @@ class Claim(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Outcome and reason."""
         link = " because " if self.outcome in ("differs", "cannot be") else ": "
         return f"{self.outcome}{link}{self.why}" if self.why else self.outcome
 
 
 def claims_sheet(claims: Sequence[Claim]) -> Sheet:
-    """Return the table."""
     rows = [(each.where, each.paper, each.ours, each.nearest, each.verdict) for each in claims]
     headings = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
     return Sheet("", [Column(heading, text=True) for heading in headings], rows)
@@ -88,7 +85,6 @@ class Less(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the interval of the difference is below 0."""
         return self.difference.ends[1] < 0.0
 
 

@@ -1,7 +1,4 @@
-"""The folder of a study, for instance of an ablation.
-
-Only one process at a time may work in the folder, and all processes must use the same settings.
-"""
+"""The folder of a study, for instance of an ablation: one process at a time, and always the same settings."""
 
 from __future__ import annotations
 

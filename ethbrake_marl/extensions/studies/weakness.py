@@ -23,8 +23,6 @@ HINDSIGHT = "best_harm"  # with what regret compares by default
 
 
 class Measured(NamedTuple):
-    """What an agent does in n worlds, m2/s2."""
-
     score: Floats  # [n] value of the measure, the larger the worse for the agent
     harm: Floats  # [n] harm of the agent
     reference: Floats | None  # [n] harm of the other agent, or bound of the agent's shield; None for ``harm``
@@ -32,7 +30,6 @@ class Measured(NamedTuple):
 
 class Measure(NamedTuple):
     """``harm``: the agent's harm. ``regret``: its harm minus that of another agent, by default the best known harm.
-
     ``bound``: its harm minus the bound of its shield at the alert; above 0 the bound is broken.
     """
 
@@ -83,15 +80,9 @@ class Measure(NamedTuple):
 
         Returns the worst worlds at the alert, worst first, what the agent does in them, and the scores of all tried
         worlds [budget] (m2/s2; minus infinity: the scenario rejects the world). For every measure but ``bound``, only
-        worlds with a score above 0 are returned, perhaps none. Raises the errors of ``cube_of``, and ``InvalidInput``
-        if the scenario rejects every tried world.
+        worlds with a score above 0 are returned, perhaps none. Any two of the at most ``most`` worlds differ clearly.
 
-        Args:
-            budget: number of worlds to try.
-            seed: of the search.
-            most: largest number of worlds in the result; any two of them differ clearly.
-            on_round: called with the number of worlds tried so far.
-
+        Raises the errors of ``cube_of``, and ``InvalidInput`` if the scenario rejects every tried world.
         """
         cube = cube_of(self.scenario)
 
