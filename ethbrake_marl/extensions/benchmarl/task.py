@@ -117,7 +117,6 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Let the next reset begin with world 0 of ``seed``; do nothing for None."""
         if seed is not None:
             self.stream.seed, self.stream.next = chosen_seed(seed), 0
 
@@ -128,23 +127,15 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
-    """BenchMARL task for one scenario.
-
-    Args:
-        name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
-        config: mapping with the key ``scenario``, and optionally ``reward``, ``horizon_is_end``, ``shield`` and
-            ``actions``: the arguments of ``LineEnv``.
-
-    """
+    """BenchMARL task for one scenario. ``config``: the key ``scenario``, and perhaps other arguments of ``LineEnv``."""
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        """Return a function without arguments that creates a ``LineEnv`` with ``num_envs`` worlds.
+        """Return a function that creates a ``LineEnv``. ``device`` is unused.
 
-        ``seed`` None: 0. ``device`` is unused. Raises ``InvalidInput`` if only one of task and BenchMARL has continuous
-        actions.
+        Raises ``InvalidInput`` if only one of task and BenchMARL has continuous actions.
         """
         actions = self.config.get("actions")
         if continuous_actions != (actions is None):
@@ -162,7 +153,6 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
-        """Return the largest number of decisions in an episode."""
         scenario: Scenario = self.config["scenario"]
         return round(scenario.horizon_s / scenario.time_step_s) + 1
 
@@ -174,7 +164,6 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return {GROUP: [scenario.vehicle_names[body - 1] for body in scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the learners' observations in ``env``, for a single world."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec["state"]
         return spec

@@ -34,7 +34,6 @@ class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra 
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """Return a task for the scenario file ``path``; None: for this task's shipped scenario."""
         return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
 
 

@@ -130,7 +130,7 @@ class Lines(NamedTuple):
         return cls(body, alert, news, tuple(scenario.roles.values()))
 
     def commands(self, car: Floats, wanted: Floats) -> Floats:
-        """Return the commands of scripts with these capacities, [n, N + 1] m/s2; other learners brake fully."""
+        """Return the commands of scripts, [n, N + 1] m/s2; other learners brake fully."""
         wanted = wanted.copy()
         for other, role in enumerate(self.roles, 1):
             if other != self.body:

@@ -43,7 +43,7 @@ class EstimatedShield(MembersShield):
     Args:
         drivers: body -> agent, as for ``StepShield``.
         scenario: of the worlds.
-        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: what is bounded (``episode.counts``).
         corners: certify also in the corners of the ranges, not only in the median line.
 
     """
@@ -96,12 +96,7 @@ class EstimatedShield(MembersShield):
 class EstimatedEpisodeShield(EpisodeShield):
     """Algorithm 1 in the median line: at the first decision, the policy or E-V2X-BM gets the whole episode.
 
-    Args:
-        drivers: body of the learner -> its policy.
-        scenario: of the worlds.
-        harm_count: what is compared: ``first``, ``total`` or ``honest`` (``episode.counts``).
-        bound: H*: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
-
+    ``harm_count`` is compared; ``bound`` is H*: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
     """
 
     knows = ESTIMATED
@@ -129,13 +124,9 @@ class Estimate(NamedTuple):
 
 
 class EstimatedEV2XBM:
-    """E-V2X-BM in the median line, which chooses again when a message differs from the line's prediction.
+    """E-V2X-BM in the median line, which chooses again when what it receives differs from the line's prediction.
 
-    Args:
-        scenario: of the worlds.
-        is_pairwise: by the paper's closed form, instead of the simulation of the line.
-        count: what is minimised: ``first``, ``total`` or ``honest`` (``episode.counts``).
-
+    ``is_pairwise``: by the paper's closed form, instead of the simulation of the line. ``count`` is minimised.
     """
 
     knows = ESTIMATED

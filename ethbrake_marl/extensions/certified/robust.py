@@ -80,7 +80,7 @@ class RobustShield(MembersShield):
     Args:
         drivers: body -> agent, as for ``StepShield``.
         uncertainty: intervals around the nominal quantities, required, such as ``gaps_m=0.5,mass_t=10%``.
-        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: what is bounded (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
 
     """
@@ -117,7 +117,6 @@ class RobustShield(MembersShield):
 
 
 def opened(game: Game, alerts: State) -> State:
-    """Return worlds at their first decision."""
     return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).reset(alerts)
 
 

@@ -40,7 +40,7 @@ class Interval(NamedTuple):
 
 
 class Side(NamedTuple):
-    """One uncertain number of n worlds: an edge of their boxes."""
+    """One uncertain number of n worlds."""
 
     key: str
     body: int  # column in the arrays of a state
@@ -49,8 +49,6 @@ class Side(NamedTuple):
 
 
 class Uncertainty(NamedTuple):
-    """Intervals around the nominal quantities of a world."""
-
     intervals: tuple[Interval, ...]
 
     def __str__(self) -> str:

@@ -72,7 +72,6 @@ class Ablation:
         return tuple(f"{recipe.name}-{recipe.scheme}" for recipe in self.recipes)
 
     def jobs(self) -> Iterator[tuple[Level, str, Job]]:
-        """Yield each training, seed by seed, with its level and algorithm."""
         for seed in range(self.seeds):
             for recipe, algorithm in zip(self.recipes, self.algorithms, strict=True):
                 for level in (level for level in self.levels if level.scenario.learners):
@@ -126,7 +125,7 @@ def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
 
 
 def measure(plan: Ablation, tell: OnProgress) -> list[Measured]:
-    """Evaluate all levels, each with all algorithms, in the order of the plan. All trainings are finished."""
+    """Evaluate all levels, each with all algorithms, after all trainings have finished."""
     trained: dict[Any, list[Job]] = {}
     for level, name, job in plan.jobs():
         trained.setdefault((level.name, name), []).append(job)
@@ -144,7 +143,6 @@ def measure(plan: Ablation, tell: OnProgress) -> list[Measured]:
 
 
 def driven(level: Level, drawn: Drawn, algorithm: str | None, jobs: Any) -> Measured:
-    """Let the trained teams of a level drive its worlds, and full braking beside them."""
     scenario, measures = level.scenario, []
     named = {f"{algorithm} seed {seed}": f"team@{job.folder}" for seed, job in enumerate(jobs)}
     teams = teams_of(named, scenario) if named else {"scripts": Team("scripts", {})}

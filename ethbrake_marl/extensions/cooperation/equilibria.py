@@ -37,8 +37,6 @@ DRAWING = np.array([PLAN, 40, 25, 25])  # changes begin within 40 decisions, and
 
 
 class Equilibrium(NamedTuple):
-    """Where the search from one start ended."""
-
     profiles: Profiles  # commands of the learners, with one phase for each decision
     borne: Floats  # harm of each vehicle, [n, N] m2/s2
     converged: Bools  # [n] whether no learner gained more than the tolerance in the last round
@@ -77,14 +75,14 @@ def find_equilibria(
 
     Args:
         scenario: with at least one learner.
-        worlds: worlds at the alert.
+        worlds: at the alert.
         objective: of each learner: one for all, such as ``own``, or one for each vehicle; None: the scenario's.
-        count: what counts as harm: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        count: what counts as harm (``episode.counts``).
         budget: number of plans that a learner tries in its turn, in each world.
-        rounds: largest number of rounds.
+        rounds: the most.
 
-    Raises ``InvalidInput`` for a scenario without learners, a script that looks at the state, an objective that is
-    neither a weighted sum of the vehicles' harm nor ``maximin``, and a number out of range.
+    Raises ``InvalidInput`` for a scenario without learners, a script that looks at the state, and an objective that is
+    neither a weighted sum of the vehicles' harm nor ``maximin``.
 
     """
     check_whole_number("rounds", rounds, 1)
@@ -107,7 +105,6 @@ def find_equilibria(
 
 
 def turn_of(game: Game, worlds: State, body: int, declared: Declared, count: str) -> Problem:
-    """Return the problem of all learners, this one first, in which its objective is minimised."""
     bodies = [body, *(other for other in game.rules.learners.tolist() if other != body)]
     problem = problem_of(game, worlds, bodies, count=count)
     return aimed(problem._replace(bodies=problem.bodies[:1]), declared)._replace(bodies=problem.bodies)

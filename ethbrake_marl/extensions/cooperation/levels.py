@@ -68,7 +68,6 @@ def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
 
 
 def _is_other_channel(one: Scenario, other: Scenario) -> bool:
-    """Do two scenarios differ only in ``v2x``?"""
     contents = [each.content(without=("name", *WORDS, "v2x")) for each in (one, other)]
     return one.v2x != other.v2x and contents[0] == contents[1]
 
@@ -111,9 +110,9 @@ def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[Tr
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Drawn]:
     """Draw the worlds of each level; world k has the same line of vehicles at all levels.
 
-    Levels with different ``v2x`` may have different latencies, and some levels an obstacle. Raises ``InvalidInput``,
-    which names level and quantity, if anything else differs. If a sweep varies a key of the vehicles, world k only has
-    the same random numbers.
+    Levels may differ in obstacles and weights of harm and, with different ``v2x``, in latencies. Raises
+    ``InvalidInput``, which names level and quantity, if anything else differs. If a sweep varies a key of the vehicles,
+    world k only has the same random numbers.
     """
     drawn = [level.scenario.draw(episodes, seed) for level in levels]
     if not levels[0].same_vehicles:
@@ -136,7 +135,6 @@ def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Dra
 
 
 def _quantities(level: Level, drawn: Drawn) -> dict[str, Any]:
-    """Return what levels must share: name of a key or a column of the worlds -> values."""
     keys = {key: np.array([str(getattr(level.scenario, key))]) for key in SHARED}
     columns = quantities_of(drawn.worlds)
     return keys | {name: column for name, column in columns.items() if not name.startswith(MAY_DIFFER)}

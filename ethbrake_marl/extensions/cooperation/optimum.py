@@ -36,10 +36,7 @@ class Answer(NamedTuple):
 
 
 def with_optima(plan: Ablation, measured: Sequence[Measured], threads: int, tell: OnProgress) -> list[Measured]:
-    """Return the results, each with the joint optimum of its level, unless the level has no learner.
-
-    Finished chunks of the search are read from the folder of the ablation.
-    """
+    """Add the joint optimum of each level with a learner; finished chunks of the search are read from the folder."""
     tables: dict[bytes, BestHarmTable] = {}
     answers: dict[str, Answer] = {}
     for one in measured:

@@ -21,7 +21,6 @@ from ethbrake_marl.files.store import write_output
 
 
 def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, list[Path]]:
-    """Write the results over those of an earlier run; return the content of the JSON file, and the paths."""
     recipes = zip(plan.algorithms, plan.recipes, strict=True)
     swept, machine = plan.levels[0].swept, this_machine()
     results = {
@@ -44,7 +43,6 @@ def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, 
 
 
 def conditions(plan: Ablation, number: int) -> str:
-    """Return how the policies were trained, and over which ``number`` of worlds the means are."""
     recipes = ", ".join(
         f"{name} (rewarded for {IN_WORDS[recipe.reward.harm_count]})"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)

@@ -25,8 +25,8 @@ CONFIDENCE = 0.95
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
     """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``.
 
-    No interval for only one world or recording, or without a baseline if all values are 0. Without a baseline, the
-    interval of truth values contains Wilson's, because bootstrap intervals of nearly constant values are too narrow.
+    No interval for only one world or recording, or without a baseline if all values are 0. Truth values without a
+    baseline always have one, which contains Wilson's: bootstrap intervals of nearly constant values are too narrow.
     """
     array = np.atleast_2d(np.asarray(values))
     sides = [array, np.zeros((1, array.shape[1])) if baseline is None else np.atleast_2d(baseline)]

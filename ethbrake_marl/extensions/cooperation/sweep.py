@@ -45,8 +45,8 @@ def parse_sweep(text: str) -> list[Swept]:
     """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
 
     A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. After ``KEY=``, single numbers
-    and ranges may stand together. Raises ``InvalidInput`` for a value that is not a number, a range whose length
-    HIGH - LOW is not a multiple of its step, a repeated number, and fewer than 2 or more than ``MOST`` numbers.
+    and ranges may stand together. Raises ``InvalidInput`` for any other text, a range that its step does not divide, a
+    repeated number, and fewer than 2 or more than ``MOST`` numbers.
     """
     key, equals, values = (part.strip() for part in text.partition("="))
     match = WORD.match(values)

@@ -41,20 +41,11 @@ def to_parquet(
 ) -> None:
     """Let agents drive, and write a Parquet file with one row for each agent, world and decision.
 
-    docs/extensions/datasets.md describes the columns and the metadata.
-
-    Args:
-        path: file to write.
-        agents: as in ``eb.evaluate``. Each drives all learners of the scenario in its own episodes.
-        scenario: a ``Scenario``, or its name, path or content.
-        episodes: number of worlds in which each agent drives: the worlds 0 to ``episodes`` - 1 of ``seed``.
-        seed: seed of the worlds.
-        reward: a name such as ``harm``, or the weights of the reward's terms.
-        force: replace an existing file.
+    docs/extensions/datasets.md describes the columns and the metadata. Each of the ``agents`` drives all learners, in
+    the worlds 0 to ``episodes`` - 1 of ``seed``. ``reward``: a name such as ``harm``, or the weights of its terms.
 
     Raises ``InvalidInput`` for an invalid argument, ``AlreadyExists`` if the file exists and ``force`` is false, and
     ``MissingExtra`` without pyarrow.
-
     """
     loaded, game = open_game(scenario, reward=reward)
     if not loaded.learners:

@@ -74,10 +74,7 @@ class Seen(NamedTuple):
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the command for the next time step, [n] m/s2, with a limited growth of the deceleration.
-
-        ``wanted_mps2`` [n] is the acceleration of the law.
-        """
+        """Return the command, [n] m/s2, with a limited growth of the deceleration. ``wanted_mps2`` [n] is the law's."""
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 

@@ -159,7 +159,6 @@ def write_features(scratch, met, i, first, last, time_step_s, value):
 
 
 def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
-    """Return both groups, [n, observers, 42]."""
     check_exact(state, "a forecast of contacts")
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))

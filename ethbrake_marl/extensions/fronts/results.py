@@ -102,7 +102,6 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
 
 
 def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
-    """Return the harm of each vehicle if the learners brake fully from the alert on, [n, N] m2/s2 by count."""
     game = open_game(scenario)[1]
     last = drive(game, drawn.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
     return {count: last.borne_harm(count) for count in COUNTS}

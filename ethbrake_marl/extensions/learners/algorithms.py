@@ -23,7 +23,6 @@ class Vine(Algorithm):
     """One actor drives all learners; or a mixture of experts drives the only one."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        """Return a new model, with the weights of the policy that the recipe's key ``start`` names."""
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
         model = self.new_model(training, environment)
@@ -37,7 +36,6 @@ class Vine(Algorithm):
         return model
 
     def new_model(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        """Return a model with random weights."""
         recipe: Any = training.recipe
         return (VineModel if recipe.experts is None else MixtureModel)(training, environment)
 
@@ -47,12 +45,9 @@ class Vine(Algorithm):
 
 
 class RolloutClassification(Algorithm):
-    """One network drives all learners."""
-
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """Return a new model. At first it acts like the first of the recipe's ``policies``, or brakes fully."""
+        """At first the model acts like the first of the recipe's ``policies``, or brakes fully."""
         return RolloutClassificationModel(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return the averaged weights, and the weights of the policies."""
         return dict(actor.all_tensors())

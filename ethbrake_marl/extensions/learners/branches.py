@@ -69,8 +69,8 @@ def stands_for_good(before: State, after: State, count: Floats) -> Bools:
     """Return where all vehicles stand, and a policy that only looks at its observation never moves one again, [n].
 
     There nothing has changed in this step, and nobody waits for a latency or for news. ``count`` are the weights of
-    what counts (``episode.counts``): a vehicle that presses against a standing one can still push. Always False with
-    scripts or messages that have a memory.
+    what counts (``episode.counts``): a vehicle that presses against a standing one can still push. Always False if
+    scripts, messages or a shield have a memory.
     """
     out = np.zeros(after.n, np.bool_)
     if not after.memories:

@@ -44,8 +44,6 @@ class NoBetterTemplate(EthBrakeError, ValueError):
 
 
 class Stage(NamedTuple):
-    """A range of updates, and what they train."""
-
     expert: int | None  # number of the expert that is trained; None: the gating network
     first: int  # number of its first update, from 0
     end: int  # number of the first update after it
@@ -66,8 +64,6 @@ def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
 
 
 class Mixture(nn.Module):
-    """Experts, the gating network, and the decisions at which it has compared them."""
-
     def __init__(self, inputs: int, recipe: VineRecipe) -> None:
         super().__init__()
         plan, rate = recipe.experts, recipe.learning_rate.at(1.0)
@@ -89,7 +85,6 @@ class Mixture(nn.Module):
         return np.clip(self.means(observations), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of all averaged weights, by their names in a policy file."""
         tensors = self.gate.tensors("gate")
         for name, actor in zip(network.actors, self.actors, strict=True):
             tensors |= actor.tensors(name)
@@ -181,7 +176,6 @@ class MixtureModel(VineModel):
             self.policy.actors[stage.expert].load_state_dict(pupil.state_dict())
 
     def explore(self, acts: list[Act]) -> Explored:
-        """Let the earlier experts drive the first worlds of the training."""
         worlds = self.rows.scenario.sample(self.plan.worlds, self.recipe.seed, channel="training")
         start = self.game.reset(worlds)
         gained, harm = np.full(start.n, -np.inf), np.full(start.n, np.inf)
@@ -191,7 +185,7 @@ class MixtureModel(VineModel):
         return Explored(start, gained, harm)
 
     def drive_from(self, state: State, act: Act, count: str) -> tuple[Floats, Floats]:
-        """Let one policy drive to the end; return its return, and the harm that the learner should make small, [n]."""
+        """Let one policy drive to the end; return its return and its harm, [n]."""
         gained, last = play_on(self.game, state, lambda now: now.ask(act), self.recipe.gamma)
         return gained[:, 0], self.harm(last, count)[:, 0]
 
@@ -229,7 +223,6 @@ class MixtureModel(VineModel):
         return Shown(np.concatenate(seen)[shown], np.concatenate(wanted).astype(np.float32)[shown])
 
     def imitate(self, pupil: Actor, shown: Shown, seed: int) -> None:
-        """Train an expert to act as shown, in a random order of its own."""
         pupil.new_optimizer(self.lr_schedule(1.0))
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)

@@ -32,7 +32,6 @@ def perceptron(inputs: int, outputs: int, hidden: Sequence[int], activation: Act
 
 
 def silent(network: nn.Sequential) -> nn.Sequential:
-    """Set all outputs of a new network to 0, and return it."""
     last = linear_layers(network)[-1]
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
@@ -60,7 +59,7 @@ class Averaged(nn.Module):
         self.optimizer = Adam(weights, lr=begin, eps=1e-5, capturable=on_gpu)
 
     def descend(self, loss: Tensor, keep: float) -> Tensor:
-        """Make one step of the optimiser on a loss, let the average follow, and return the loss."""
+        """Make one step of the optimiser, let the average follow, and return the loss."""
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
@@ -75,7 +74,7 @@ class Averaged(nn.Module):
 
     @torch.no_grad()
     def best(self, observations: Float32s) -> Ints:
-        """Return the output of ``average`` with the highest score for each of the observations [rows, F], [rows]."""
+        """Return the output of ``average`` with the highest score, [rows], for observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observations)).argmax(dim=1).numpy()
         return chosen
 

@@ -262,7 +262,6 @@ class RolloutClassificationRecipe(BranchingRecipe):
         return members
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the network, with the networks of the policies that it can choose."""
         own = {"observation_size": observation_size, "value_hidden": ()}
         among = tuple(each.network.model_copy(update=own) for each in self.members)
         return (

@@ -108,7 +108,6 @@ class Chooser(Averaged):
         return loss
 
     def all_tensors(self) -> dict[str, Float32s]:
-        """Return copies of the averaged weights, and the weights of the policies, by their names in a policy file."""
         return self.tensors("policy") | self.fixed
 
 
@@ -128,7 +127,6 @@ class RolloutClassificationModel(BranchingModel):
         return ["policy", "policy.optimizer"], []
 
     def improve(self, seen: Float32s, states: State) -> None:
-        """Try choices, remember the decisions at which they differ in cost, and learn from the memory."""
         recipe, chooser = self.recipe, self.policy
         self._update_learning_rate(chooser.optimizer)
         rows, tried, costs = self.try_choices(seen, states)

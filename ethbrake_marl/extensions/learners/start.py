@@ -52,7 +52,7 @@ def named_policy(name: str, recipe: str, key: str) -> Policy:
 
 
 def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
-    """Return the weights of ``policy`` for a training by the networks ``wanted``, which observes ``features``.
+    """Return the weights of ``policy`` for the networks ``wanted``, which observe ``features``.
 
     Raises ``InvalidInput`` for a mixture of experts, for other layers, and for a feature that is not observed.
     """

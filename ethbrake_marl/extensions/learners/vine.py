@@ -55,7 +55,6 @@ class Branches(NamedTuple):
     steps: Ints  # [2B] for how many steps
 
     def decisions(self, learners: int) -> Ints:
-        """Return the numbers of the decisions, [B]."""
         return (self.world * learners + self.learner)[: len(self.world) // 2]
 
 
@@ -68,8 +67,6 @@ class Tried(NamedTuple):
 
 
 class VineModel(BranchingModel):
-    """One actor drives all learners, and learns from measured gradients."""
-
     policy: Actor
     recipe: VineRecipe
 
@@ -91,7 +88,6 @@ class VineModel(BranchingModel):
         return Tried(torch.from_numpy(own), torch.from_numpy(policy.means(own)), gradient)
 
     def draw_branches(self, decisions: Ints) -> Branches:
-        """Draw at which of the ``decisions`` actions are moved, by how much, and for how long."""
         rows, offset = drawn(decisions, self.recipe.tried), self.recipe.offset
         ratio = offset.largest / offset.smallest
         sizes: Floats = offset.smallest * ratio ** torch.rand(len(rows), dtype=torch.float64).numpy()
@@ -141,7 +137,6 @@ class VineModel(BranchingModel):
         self.logger.record("train/tried", len(tried.seen))
 
     def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        """Make one step of the optimiser with some decisions; return the loss."""
         loss = (weight * (actor.learning(seen)[:, 0] - target) ** 2).mean()
         return actor.descend(loss, self.recipe.averaging)
 

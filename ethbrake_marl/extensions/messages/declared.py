@@ -52,7 +52,6 @@ class Messages:
     }
 
     def read(self, key: str, value: Any) -> Any:
-        """Return the value of a key, with lists of pieces in the order of ``PIECES``."""
         if key == "persistence":
             require(value in ("first", "periodic"), (key,), value, "must be first or periodic")
             return value
@@ -98,7 +97,6 @@ class Messages:
         require(kept <= MOST_SAMPLES, ("v2x",), v2x, right)
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Memory:
-        """Return the memory of n worlds at the alert."""
         N, v2x = scenario.vehicles, scenario.v2x
         heard, seen = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
         channel: Floats = np.zeros((n, CHANNEL_COLUMNS))

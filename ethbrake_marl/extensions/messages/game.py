@@ -62,12 +62,11 @@ class GameWithMessages(Game):
         return _remembering(state, begin(alert, state.time_s, self.rules.time_step_s))
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """Return the state after one step, and what the step did. The memory of ``state`` is not reused."""
+        """The memory of ``state`` is not reused."""
         after, step = super().follow(state, actions)
         return believed_after(state, after), step
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
-        """Return agents that act on what their vehicles believe, except those that know the true state."""
         return {body: believing(agent) for body, agent in drivers.items()}
 
     def hides(self, alert: State, body: int) -> Bools:
@@ -94,7 +93,6 @@ class GameWithMessages(Game):
 
 
 def believed_after(before: State, after: State) -> State:
-    """Return the state after a step with the memory of what arrived in it."""
     return _remembering(after, after_step(before, after)) if before.memories[NAME].is_periodic else after
 
 

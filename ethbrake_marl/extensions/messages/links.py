@@ -175,7 +175,6 @@ def newest(state: State, observer: int) -> Floats:
 
 
 def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats:
-    """Return the lines as the observer estimates them from what it knows (``estimate_worlds``)."""
     line, bodies, aged = state.line.copy(), known.shape[1], state.memories[NAME].is_periodic
     working = np.empty(bodies), np.empty(bodies, np.bool_)
     estimate_worlds(observer, state.time_s.copy(), state.car[:, LIMIT].copy(), known, news, aged, line, *working)

@@ -94,7 +94,6 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
 
 
 def _check_faults(recording: Recording, faulty: Any, left_out: Counter[str]) -> None:
-    """Count the ``faulty`` vehicles and those that are recorded twice; raise ``InvalidInput`` if they are too many."""
     states = recording.states
     twice = states[states.duplicated(["moment", "vehicle"])]
     number = len(faulty) + len(twice)

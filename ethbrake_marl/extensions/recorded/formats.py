@@ -93,9 +93,9 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
     """Return the format of recorded traffic with this name.
 
     ``columns`` is for the format ``table`` only: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
-    values except ``units`` are names of columns of the file. ``time=t/1000`` means that the column ``t`` contains times
-    in 1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
-    Raises ``InvalidInput`` if ``columns`` has missing, repeated or unknown keys, or unknown units.
+    values except ``units`` are names of columns. ``time=t/1000`` means that the column ``t`` has times in 1/1000 s.
+    ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
+    Raises ``InvalidInput`` for missing, repeated or unknown keys, and unknown units.
     """
     if name != "table":
         if columns:

@@ -37,7 +37,6 @@ class Cells(NamedTuple):
     frame: Any  # quantity -> finite numbers, or texts; in a format with gaps an empty cell is NaN
 
     def place(self, row: int, quantity: str = "") -> str:
-        """Return file, line and column of a row, for messages."""
         with reading(self.file) as stream:
             lines = (number for number, line in enumerate(stream, 1) if number > self.heading and line.strip())
             line = next(islice(lines, row, None))
@@ -65,11 +64,10 @@ def reading(file: Path) -> Iterator[BufferedReader]:
 
 
 def read_cells(file: Path, entry: Format) -> Cells:
-    """Return the columns of a format in a file.
+    """Return the columns of a format in a file, whose first lines may be a heading.
 
-    The first lines may be a heading; then come the names of the columns. Raises ``InvalidInput``, which names file,
-    line and column, if a column is missing or occurs twice, and for a cell that is empty or not a number;
-    ``NotARecording`` if more than half of the columns are missing.
+    Raises ``InvalidInput``, which names file, line and column, if a column is missing or occurs twice, and for a cell
+    that is empty or not a number; ``NotARecording`` if more than half of the columns are missing.
     """
     with reading(file) as stream:
         heading, separator, names, at = _header(file, entry, stream)
@@ -108,7 +106,6 @@ def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str
 
 
 def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
-    """Find the columns of a format among ``names``; return their indices by quantity, and the missing columns."""
     at, missing, twice = dict[str, int](), list[str](), list[str]()
     for quantity, column in entry.columns.items():
         pattern = re.escape(column.lower()).replace(re.escape(NUMBER), "([1-9][0-9]*)")

@@ -114,7 +114,6 @@ def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
 
 
 def _along_road(raw: Any, cells: Cells, entry: Format) -> Any:
-    """Return the states of a format with ids and positions along the road."""
     zero = pd.Series(0.0, raw.index)
     for role, least in (("vehicle", 0.0), ("lane", 0.0), ("ahead", entry.alone)):
         if role in raw:
@@ -165,7 +164,6 @@ def _check(states: Any, cells: Cells, entry: Format) -> None:
 
 
 def _check_positions(recording: Recording, every_s: float) -> None:
-    """Raise ``InvalidInput`` if positions in a lane change otherwise than the speeds say."""
     cells, entry, now = recording.cells, recording.entry, recording.states
     then = now[["moment", "vehicle", "lane", "front", "side", "speed"]].assign(moment=now["moment"] + 1.0)
     both = now.merge(then, on=["moment", "vehicle", "lane"], suffixes=("", "_then"))

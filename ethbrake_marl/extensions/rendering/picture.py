@@ -66,7 +66,6 @@ class Pen:
         return (place_m - self.left_m) / (self.right_m - self.left_m) * WIDTH
 
     def ends(self, body: int) -> tuple[float, float]:
-        """Return rear and front of a body in the picture."""
         if body == 0:
             return self.x(self.scene.obstacle_m), self.x(self.scene.obstacle_m) + 9
         return self.x(self.fronts_m[body - 1] - BODY_M), self.x(self.fronts_m[body - 1])
@@ -127,7 +126,6 @@ def draw_road(pen: Pen) -> None:
 
 
 def draw_vehicle(pen: Pen, body: int) -> None:
-    """Draw a vehicle with its number, its brake lights, and a mark above it if it learns."""
     left, right = pen.ends(body)
     pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
     glass = left + (right - left) * 0.72

@@ -108,7 +108,6 @@ class Scene(NamedTuple):
         return f"harm {first:.2f} by first impacts, {total:.2f} in total (m2/s2)"
 
     def text(self) -> str:
-        """Return the scene in words: the road to scale, then a line for each vehicle."""
         left, right = self.shown_m
 
         def column(place_m: float) -> int:
@@ -145,7 +144,6 @@ class Motion:
         self.front_m, self.impacts, self.ended = 0.0, tuple[Impact, ...](), False
 
     def step(self, state: State) -> None:
-        """Go on to the next decision, at which the worlds are in this state."""
         self.line, self.front_m, self.impacts = self.at(self.until_s)
         self.start_s, self.until_s = self.until_s, float(state.time_s[self.row])
         self.wanted, self.ended = state.wanted[self.row].copy(), bool(state.ended[self.row])

@@ -42,7 +42,6 @@ class Viewer:
         return self.motions[row]
 
     def render(self) -> Any:
-        """Return the present moment, as the mode shows it; of every world if there are many."""
         motions = map(self.motion, range(len(self.motions) or 1))
         shown = [self.show(motion.scene(motion.until_s)) for motion in motions]
         return shown if self.many else shown[0]

@@ -17,14 +17,11 @@ AVOIDABLE = "avoidable"  # whether contact is proven avoidable; where it is fals
 
 
 class BestKnown(NamedTuple):
-    """The least that is known for each world; the same for every agent."""
-
     harm: Mapping[str, Floats]  # count -> [n] m2/s2: both harms and, if it is known, the honest cost
     avoidable: Bools | None  # [n] whether contact can be avoided; None: not proven
 
     @classmethod
     def of(cls, result: Result) -> BestKnown | None:
-        """Return what a result knows; None if it was not measured."""
         columns: Mapping[str, Any] = next(iter(result.columns.values()))
         harm = {count: columns[name] for count, name in BEST.items() if name in columns}
         return cls(harm, columns.get(AVOIDABLE)) if HARM.keys() <= harm.keys() else None

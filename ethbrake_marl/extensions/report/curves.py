@@ -40,13 +40,8 @@ def curves_figure(
 ) -> Figure:
     """Draw curves with a band between the ends of their intervals, in a panel for each title.
 
-    Args:
-        panels: title -> label of a curve -> curve. The first panel must have all labels, for the legend.
-        x_label: label of the horizontal axes.
-        caption: text below the figure.
-        lines: title -> label -> value of a horizontal line.
-        y_label: label of a vertical axis that all panels share; "": each has its own.
-
+    ``panels``: title -> label of a curve -> curve; the first panel must have all labels, for the legend. ``lines``:
+    title -> label -> value of a horizontal line. ``y_label``: shared by all panels; "": each has its own.
     """
     figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
     labels = [*dict.fromkeys(label for curves in panels.values() for label in curves)]

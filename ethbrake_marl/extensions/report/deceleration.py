@@ -39,16 +39,10 @@ def deceleration_figure(
 ) -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of the scenario's learner.
 
-    Marks are the decelerations that E-V2X-BM chooses, by the closed form and by simulation.
+    Marks are the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``known``: best known harm
+    of this world over all commands, ``first`` and ``total``, drawn as lines.
 
-    Args:
-        world: at the alert.
-        scenario: has one learner, and scripts that do not look at the state.
-        known: best known harm of this world over all commands, ``first`` and ``total``, drawn as lines.
-        title: of the figure; by default the scenario's name.
-
-    Raises ``InvalidInput`` for several worlds or another scenario.
-
+    Raises ``InvalidInput`` unless there is one world, one learner, and no script that looks at the state.
     """
     loaded, game = open_game(scenario)
     if world.n != 1 or len(loaded.learners) != 1 or game.scripts:

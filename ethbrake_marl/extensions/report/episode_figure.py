@@ -52,7 +52,6 @@ def trajectories(records: Mapping[str, EpisodeRecord]) -> Figure:
 
 
 def _rest_s(record: EpisodeRecord) -> float:
-    """Return the first sample after which no vehicle moves, or the last one (s)."""
     moving = np.flatnonzero((record.speeds_mps != 0.0).any(axis=1))
     return float(record.time_s[min(moving.max(initial=0) + 1, len(record.time_s) - 1)])
 

@@ -10,7 +10,6 @@ from ethbrake_marl.training.experiment import TEAM, without
 
 
 def learners_sheets(compared: Compared) -> list[Sheet]:
-    """Return who bears what in each count, and what each learner of the trained team adds."""
     return [*(_borne(compared, count) for count in _counts(compared)), _added(compared)]
 
 

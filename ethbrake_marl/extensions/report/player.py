@@ -62,7 +62,6 @@ def player(
 
 
 def episode_data(record: EpisodeRecord) -> dict[str, Any]:
-    """Return what the scripts of the player read of an episode."""
     obstacle = float(record.initial.obstacle_gap_m[0])
     return {
         "pieces": base64.b64encode(np.asarray(pieces_of(record), "<f8").tobytes()).decode("ascii"),
@@ -106,7 +105,6 @@ def moved(pieces: Floats, t: Floats, N: int) -> Floats:
 
 
 def replaced_at_s(record: EpisodeRecord) -> list[float]:
-    """Return the times of the decisions at which a shield replaced an action (s)."""
     shields = [(before.time_s, after.memories.get("shield")) for before, after in pairwise(record.states[1:])]
     return [float(time_s[0]) for time_s, memory in shields if memory is not None and memory.intervened.any()]
 

@@ -91,7 +91,6 @@ def short_table(agents: SummaryTable) -> Markup:
 
 
 def measured(agents: SummaryTable) -> list[Markup]:
-    """Return the conditions, and folded tables of all measures."""
     sheet, more = agents.sheet(), agents.measures()
     whole = replace(sheet.only(sheet.filled()), title="All measures with a column")
     tables = [table(each) for each in (whole, more) if each is not None]
@@ -123,7 +122,6 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
 
 
 def avoidable_section(compared: Compared) -> Section:
-    """Return how harm is distributed over the worlds and, if it is proven, what was avoidable."""
     result, known = compared.result, BestKnown.of(compared.result)
     if known is None:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
@@ -163,7 +161,6 @@ def _tested(test: Test) -> list[str]:
 
 
 def write_evaluation(path: Path, compared: Compared, command: str, *, force: bool = False) -> None:
-    """Write the page of ``ethbrake evaluate --report``. Raises the errors of ``write_output``."""
     scenario, agents = compared.scenario, [row.agent for row in compared.table]
     names = ", ".join(agents)
     scripts = ", ".join(f"{vehicle} by {role}" for vehicle, role in scenario.roles.items() if role != "learner")

@@ -108,7 +108,6 @@ def label_text(text: str, most: int = 40) -> str:
 
 @cache
 def font_signs() -> frozenset[int]:
-    """Return the code points of all characters in the font of the figures."""
     return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())
 
 
@@ -119,7 +118,7 @@ def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Ma
 def finish(
     figure: Figure, caption: str, legend: Axes | None = None, *, columns: int = 6, fontsize: float = 9
 ) -> Figure:
-    """Add a caption and, with ``columns`` and ``fontsize``, the legend of one panel; return the figure."""
+    """Add a caption and, with ``columns`` and ``fontsize``, the legend of one panel."""
     if legend is not None:
         named = legend.get_legend_handles_labels()
         figure.legend(*named, loc="outside upper left", ncols=columns, frameon=False, fontsize=fontsize)

@@ -64,7 +64,6 @@ def by_distance(reading: Reading, episodes: int, lines: Lines) -> Groups:
 
 
 def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
-    """Compare the harm of two strategies, in the same worlds of every group."""
     return [
         Less.of_worlds(f"{smaller} minus {larger}, {group}", lines[smaller][rows], lines[larger][rows])
         for group, (lines, rows) in groups.items()
@@ -72,7 +71,7 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 
 
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequence[str], x_label: str) -> Made:
-    """Return a figure of mean harm, with a panel for each reading, and a table for each. ``shown``: in the figure."""
+    """A figure of mean harm, with a panel for each reading, and a table for each. ``shown``: in the figure."""
     estimates = {
         reading: {
             name: {group: estimate(lines[name], rows) for group, (lines, rows) in groups.items()} for name in names
@@ -103,7 +102,7 @@ def over_distance(stem: str, readings: Mapping[str, Groups], shown: Sequence[str
 
 
 def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Groups]:
-    """Return the groups of the worlds of the figures against distance, as stated and in the nearest reading."""
+    """Groups as stated and in the nearest reading."""
     episodes, found = min(DISTANCE_WORLDS, settings.episodes), {}
     for name, reading in (("as stated", STATED), ("nearest reading", NEAREST)):
         there = reading._replace(base=DISTANCE)
@@ -125,7 +124,6 @@ def reproduce_distance(settings: Settings) -> Made:
 
 
 def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]:
-    """Return what the paper says of its figure: statement -> the comparisons that it needs."""
     lines, shortest = next(iter(groups.values()))
     half = 0.5 * lines[NON_E][shortest]
     return {
@@ -141,7 +139,6 @@ def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]
 
 
 def growing(groups: Groups, name: str) -> list[Less]:
-    """Compare the harm of a strategy in each group with the next one."""
     each = {group: lines[name][rows] for group, (lines, rows) in groups.items()}
     return [Less.of_lists(f"{one} minus {other}", each[one], each[other]) for one, other in pairwise(each)]
 
@@ -173,7 +170,6 @@ def reproduce_delays(settings: Settings) -> Made:
 
 
 def reproduce_illustration(settings: Settings) -> Made:
-    """The illustration of the hybrid, which "consistently selects the strategy [of] lower harm"."""
     readings = distances(settings, {ALONE: unconverged(settings.folder)})
     hybrid = f"Hybrid {ALONE}"
     counts, shares, texts = [], [], []

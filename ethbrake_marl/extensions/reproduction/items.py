@@ -159,7 +159,6 @@ def command(settings: Settings, items: Sequence[Item]) -> str:
 
 
 def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[Drawn] = ()) -> None:
-    """Write figures as SVG and PDF, tables as CSV and LaTeX."""
     if figures or sheets:
         place.mkdir(parents=True, exist_ok=True)
     for drawn in figures:

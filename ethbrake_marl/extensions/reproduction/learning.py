@@ -29,8 +29,6 @@ STATUS = "run.json"  # of a run
 
 
 class Plan(NamedTuple):
-    """Trainings by one recipe in one scenario, one for each seed."""
-
     scenario: str
     recipe: str
     seeds: int
@@ -67,7 +65,7 @@ def trained(folder: Path, group: str) -> dict[str, list[Path]]:
 
 
 def seconds_left(folder: Path, groups: Iterable[str]) -> float:
-    """Return about how long the unfinished runs take, in processor seconds."""
+    """Return about how much processor time the unfinished runs take (s)."""
     plans = [(group, plan) for group in groups for plan in GROUPS[group]]
     return sum(plan.seconds for group, plan in plans for run in runs_of(folder, group, plan) if not is_finished(run))
 
@@ -106,7 +104,7 @@ def unconverged(folder: Path) -> str:
 
 
 def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
-    """Return the trained policies of the paper's process: name -> one spec for each seed."""
+    """Return the trained policies of the paper's process, name -> one spec for each seed; nothing without ``full``."""
     runs = trained(settings.folder, group) if settings.full else {}
     return {
         name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
@@ -179,7 +177,6 @@ def course_of(runs: Sequence[Path]) -> Course:
 
 
 def courses_of(settings: Settings, delay: str) -> dict[str, Course]:
-    """Return the finished trainings at a delay: PPO or SAC -> course; none without ``full``."""
     return {
         NAMES[recipe]: course_of(runs)
         for recipe, runs in (trained(settings.folder, delay) if settings.full else {}).items()
@@ -187,7 +184,6 @@ def courses_of(settings: Settings, delay: str) -> dict[str, Course]:
 
 
 def reproduce_curves(delay: str, settings: Settings) -> Made:
-    """Learning curves at one delay, from the trainings of ``--full``."""
     courses = {each: courses_of(settings, each) for each in (HIGH, LOW)}
     if not all(name in courses[each] for each in courses for name in NAMES.values()):
         why = "needs trainings at both delays; --full does them"

@@ -42,8 +42,6 @@ class Drawn(NamedTuple):
 
 
 class Made(NamedTuple):
-    """What an item shows."""
-
     claims: Sequence[Claim] = ()  # of the paper
     sheets: Sequence[Sheet] = ()  # tables
     figures: Sequence[Drawn] = ()

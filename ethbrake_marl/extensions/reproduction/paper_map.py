@@ -139,7 +139,7 @@ class MappedGame(Game):
         return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """Return the state one sample later, and what the step did. The memory of ``state`` is not reused."""
+        """The memory of ``state`` is not reused."""
         before, rules = one_step.decided(self.rules, self.scripts, state, actions), self.rules
         after, over = sample(before, rules.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])

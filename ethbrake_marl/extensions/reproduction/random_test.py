@@ -96,7 +96,7 @@ def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str 
 
 
 def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
-    """Return what is reported: what happens, or what was predicted at the alert."""
+    """Return what happens, or what was predicted at the alert."""
     if numbers == "predicted":
         return predicted > 0.0, predicted
     return collided, predicted if numbers == "predicted harm, realised collisions" else harm

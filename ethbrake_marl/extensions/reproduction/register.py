@@ -31,7 +31,6 @@ def each(field: str, *values: Any) -> tuple[Reading, ...]:
 
 
 def key(name: str, *values: Any) -> tuple[Reading, ...]:
-    """Return readings with other values of one key of the scenario."""
     return tuple(STATED._replace(others=((name, value),)) for value in values)
 
 

@@ -94,17 +94,17 @@ def search(
 
 
 def numbers_of(table: Table) -> Floats:
-    """Return collision rate and mean harm (m2/s2) of the four rows, [4, 2]."""
+    """Collision rate and mean harm (m2/s2) of the four rows, [4, 2]."""
     return np.array([[each.value for each in row] for row in table.values()])
 
 
 def differences(numbers: Floats, printed: Floats = PRINTED) -> Floats:
-    """Return the differences of numbers [..., 4, 2] from a printed table [4, 2], as [..., 8]."""
+    """Numbers [..., 4, 2], printed [4, 2] -> differences [..., 8]."""
     return np.abs(numbers / printed - 1.0).reshape(*numbers.shape[:-2], -1)
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> Any:
-    """Return the distance of numbers [..., 4, 2] from a printed table, [...]."""
+    """Numbers [..., 4, 2] -> distance [...]."""
     return np.sqrt(np.square(differences(numbers, printed)).mean(axis=-1))
 
 
@@ -119,7 +119,6 @@ def by_chance(numbers: Floats) -> Floats:
 
 
 def reproduce_search(settings: Settings) -> Made:
-    """Search for the nearest reading, with ``full``; measure the nearest ones again in more worlds."""
     if not settings.full:
         return Made(notes=["The search needs `--full`."])
     episodes, again = min(WORLDS, settings.episodes), min(WORLDS_AGAIN, settings.episodes)

@@ -29,7 +29,6 @@ Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the 
 
 @cache
 def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Records:
-    """Return the recorded episodes; ``policies`` are pairs of a name and a spec."""
     records = {}
     for number in SCENARIOS:
         scenario, game = open_game(reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}"))
@@ -61,7 +60,7 @@ def road_figure(records: Records, caption: str) -> Figure:
 
 @in_our_style
 def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
-    """Draw the command of Vehicle 2 over time, a panel for each policy and scenario: label of a curve -> episodes."""
+    """Draw the command of Vehicle 2 over time, a panel for each policy and scenario; ``curves``: label -> episodes."""
     figure, every = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
     for axes, key in zip(every, next(iter(curves.values())), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
@@ -76,7 +75,7 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 
 
 def all_records(settings: Settings) -> dict[str, Records]:
-    """Return the episodes as stated, in the nearest reading, and of the first seed of the paper's process."""
+    """As stated, in the nearest reading, and of the first seed of the paper's process."""
     policies = tuple(settings.policies.items())
     found = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
     trained = tuple((name, specs[0]) for name, specs in process(settings).items())

@@ -52,7 +52,6 @@ def claims_sheet(claims: Sequence[Claim]) -> Sheet:
 
 
 def chance(ours: Estimate) -> float:
-    """Return the chance difference."""
     low, high = ours.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
 
@@ -67,8 +66,6 @@ def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) 
 
 
 class Less(NamedTuple):
-    """One of the comparisons that a statement needs, such as one for each group of worlds."""
-
     where: str
     difference: Estimate  # what should be smaller, minus the other
     both_are_0: bool = False  # in every world: nothing can be smaller
@@ -107,7 +104,7 @@ def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, O
 def judge(
     where: str, paper: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, why: str = "", show: Column = APART
 ) -> Claim:
-    """Return a statement as a claim; ``why``: the reason if it differs."""
+    """``why``: the reason if the statement differs."""
     ours, outcome, numbers = judge_statement(stated, show)
     other = judge_statement(nearest, show)[0] if nearest else ""
     text = f"{why} ({numbers})" if why and outcome == "differs" else numbers

@@ -49,7 +49,7 @@ class Planner:
         self.name, self.scenario, self.count = name, scenario, count
 
     def begin(self, alert: State, body: int) -> Memory:
-        """Choose the commands. Raises ``InvalidInput`` where another vehicle's commands are not known at the alert."""
+        """Choose. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
         game, alert = alone(self.scenario, alert, body)
         problem = problem_of(game, alert, count=self.count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
@@ -60,7 +60,6 @@ class Planner:
         raise NotImplementedError
 
     def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
-        """Return the command of the latest decision, [n] m/s2."""
         step = np.floor((state.time_s - memory.start_s) / self.scenario.time_step_s + ROUNDING).astype(np.int64)
         at = np.clip(step, 0, memory.commands_mps2.shape[1] - 1)
         return memory.commands_mps2[np.arange(state.n), at], memory
@@ -157,7 +156,6 @@ def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:
 
 
 def make_searched(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team whose agents search around their commands. Raises ``InvalidInput`` for a team with a shield."""
     if team.shield is not None:
         raise InvalidInput(
             f"agent {settings.spec!r}: a search around a shield; write +search first: AGENT+search+SHIELD"

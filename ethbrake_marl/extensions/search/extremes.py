@@ -83,7 +83,6 @@ def write_extreme(kind, change, meeting, early, share, step, last, low, high, en
 
 @large
 def write_extremes(at, kind, changes, step, last, low, high, ends, commands):
-    """Write the extreme profiles that change at these times (s), in all ways, [TIMES * WAYS]."""
     row = 0
     for change in changes:
         meeting = meeting_of(at, kind, change)

@@ -132,7 +132,6 @@ def draw(random):
 
 @large
 def draw_below(random, n):
-    """Return a random whole number from 0 to n - 1."""
     return min(int(draw(random) * n), n - 1)
 
 
@@ -250,7 +249,6 @@ def apply_change(change, bounds, ends, commands):
 
 @large
 def copy_profile(ends, commands, to_ends, to_commands):
-    """Copy the phases of a profile over the first phases of another."""
     for p in range(ends.shape[0]):
         to_ends[p] = ends[p]
         for b in range(commands.shape[1]):

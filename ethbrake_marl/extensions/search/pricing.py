@@ -243,17 +243,12 @@ def problem_of(
 
     Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles.
 
-    Args:
-        game: rules of the episodes.
-        alert: worlds at the alert.
-        bodies: controlled vehicles (1: Vehicle 1); None: the learners.
-        count: what is minimised (``episode.counts``).
-        objective: what the controlled vehicles minimise, as under a scenario's key ``objective``.
-        deciders: the first decision is at their shortest latency; None: ``bodies``.
+    ``bodies``: controlled vehicles (1: Vehicle 1); None: the learners. ``count``: what is minimised
+    (``episode.counts``). ``objective``: as a scenario's key. ``deciders``: the first decision is at their shortest
+    latency; None: ``bodies``.
 
     Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is no weighted harm, and
     a script that looks at the state, whose commands are not known at the alert.
-
     """
     check_exact(alert, "a search for the best braking")
     check_count("count", count)
@@ -305,8 +300,7 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
 def aimed(problem: Problem, objective: Declared) -> Problem:
     """Return the problem that minimises the objective of the controlled vehicles.
 
-    Raises ``InvalidInput`` if it is neither a weighted sum of the vehicles' harm nor ``maximin``, or if the controlled
-    vehicles have different ones.
+    Raises ``InvalidInput`` if it is neither a weighted sum of harm nor ``maximin``, or differs among them.
     """
     car, chosen = problem.state.car, [body - 1 for body in problem.bodies.tolist()]
     objectives = objectives_of(objective, problem.state.vehicles)

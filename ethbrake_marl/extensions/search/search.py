@@ -37,17 +37,11 @@ def search_profiles(
 ) -> tuple[Profiles, dict[str, Floats]]:
     """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
 
-    It has at most ``MOST_PHASES`` phases and is at least as good as every given one.
-
-    Args:
-        problem: n worlds, and what is minimised in them.
-        given: profiles with which the search starts, [n * Q]: first the Q profiles of world 0, and so on.
-        budget: about the number of profiles that are simulated in each world.
-        seed: of the random search.
-        threads: the result is the same for any number.
+    It has at most ``MOST_PHASES`` phases and is at least as good as each of the profiles ``given``, [n * Q]: first the
+    Q profiles of world 0, and so on. ``budget`` is about the number of profiles that are simulated in each world. The
+    result is the same for any number of threads.
 
     Raises ``InvalidInput`` for a bad number, and ``PhysicsError`` for worlds in which no profile can be simulated.
-
     """
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
@@ -198,7 +192,6 @@ def field_for(profiles: int, phases: int, controlled: int) -> Field:
 
 
 def prepared(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
-    """Return world k of a problem, and working memory for profiles of so many phases."""
     state = problem.state
     numbers = np.array([problem.time_step_s, problem.horizon_s, problem.aim, stepwise])
     count = problem.harm_count

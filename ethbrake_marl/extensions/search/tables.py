@@ -33,8 +33,6 @@ OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # a
 
 @dataclass(frozen=True, slots=True)
 class BestHarmTable:
-    """The least harm known in n worlds, in one or more counts."""
-
     identity: UInt64s  # [n] hash of each world (``pricing.identities``)
     harm: Mapping[str, Floats]  # count -> [n] m2/s2, or what else the search has minimised
     profiles: Mapping[str, Profiles]  # count -> profiles with this harm
@@ -42,7 +40,7 @@ class BestHarmTable:
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
-        """Read a table, without pickles. Raises ``InvalidInput`` if there is no file, else ``CorruptBundle``."""
+        """Read a table, without pickles. Raises ``InvalidInput`` without a file, ``CorruptBundle`` for a bad one."""
         if not path.exists():
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
@@ -126,14 +124,14 @@ def outdated_tables() -> dict[str, str]:
 
 
 def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
-    """``stored`` in all shipped tables: the least harm of each world, [n] m2/s2, and its profiles."""
+    """``stored`` in all shipped tables."""
     found = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()
     return best_of([each for each in found if np.isfinite(each[0]).any()] or [nothing])
 
 
 def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a .npz file. Raises ``ValueError`` for a damaged or too large one."""
+    """Raises ``ValueError`` for a damaged or too large file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())

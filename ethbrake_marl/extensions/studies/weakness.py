@@ -41,7 +41,7 @@ class Measure(NamedTuple):
 
     @classmethod
     def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> Measure:
-        """Return a measure of an agent; ``against`` is the other one (None: none, or the best known commands).
+        """``against`` is the other agent; None: none, or the best known commands.
 
         Both are names or agents, as ``eb.evaluate`` takes them. Raises ``InvalidInput`` if another agent is not
         compared, or a name means several, and the errors of ``teams_of``.
@@ -59,7 +59,7 @@ class Measure(NamedTuple):
         return cls(name, loaded, game, sum(teams, ()), harm_count)
 
     def __call__(self, worlds: State) -> Measured:
-        """Return what the agent does in each world. Raises ``InvalidInput`` for ``bound`` without a shield."""
+        """Raises ``InvalidInput`` for ``bound`` without a shield."""
         last, *other = (drive(self.game, worlds, team) for team in self.teams)
         harm = last.harm(self.harm_count)
         if self.name == "harm":
