@@ -190,7 +190,8 @@ class MixtureModel(VineModel):
         return gained[:, 0], self.harm(last, count)[:, 0]
 
     def best_templates(self, explored: Explored) -> tuple[Ints, Floats]:
-        """Draw templates in each world; return the worlds in which one does less harm than all experts, and it, [m, T].
+        """Draw templates in each world; return the worlds in which the best one does less harm than all experts, and
+        the actions of these, [m, T].
 
         No search improves a template: a random one with little harm tolerates small errors of its actions, so a policy
         can imitate it.

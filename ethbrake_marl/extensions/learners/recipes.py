@@ -248,7 +248,7 @@ class RolloutClassificationRecipe(BranchingRecipe):
 
     @cached_property
     def members(self) -> tuple[Member, ...]:
-        """The policies that the key ``policies`` names, and those among which one of them chooses.
+        """The policies that the key ``policies`` names; one that chooses among others stands for these.
 
         Raises ``InvalidInput`` if one cannot be used, or if more choices are drawn than there are policies.
         """

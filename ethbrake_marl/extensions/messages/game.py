@@ -148,7 +148,7 @@ class BelievedView(View):
 
 
 class PieceView(View):
-    """A view in which a neighbour's feature that is NaN, for lack of a piece, has the value of an unknown neighbour."""
+    """A view that replaces NaN, for lack of a piece, by a feature's value for an unknown neighbour."""
 
     @cached_property
     def plan(self) -> Plan:

@@ -166,7 +166,7 @@ def outer_contact(at):
 def front_first(at, floor, best, enough, cells):
     """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all at once.
 
-    In a contact of all three vehicles, the closing speeds of the two pairs add up to W, the closing speed of the rear
+    In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
     vehicle relative to the front vehicle, and the front pair's is at least the smallest possible one at this time. Such
     a contact is covered only at times at which a first contact with the front vehicle is possible.
     """

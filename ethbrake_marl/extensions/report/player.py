@@ -97,7 +97,7 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 
 
 def moved(pieces: Floats, t: Floats, N: int) -> Floats:
-    """Return the pieces ``t`` (s) after their beginning, without the time."""
+    """Return the pieces as they are ``t`` (s) after their beginning, without the time."""
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
     gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]
