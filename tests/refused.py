@@ -1,7 +1,6 @@
-"""What every test of a refusal says: the class, and the part of the message that tells what, where and what is right.
+"""What every test of a refusal asserts: the class, and the part of the message that says what, where and what is right.
 
-A table of refusals has the message as its key, so that no two examples show the same one, and what is done as its
-value.
+A table of refusals maps the message to the call, so that no two examples show the same message.
 """
 
 import re

@@ -1,6 +1,6 @@
-"""Nothing in the package runs code that a file brings along, but the places that pyproject.toml names.
+"""Nothing in the package runs code from a file, except in the places that pyproject.toml names.
 
-Ruff's S rules refuse it (`make lint`). What ruff has no rule for is looked for here.
+Ruff's S rules refuse it (`make lint`); this test looks for what ruff has no rule for.
 """
 
 import re

@@ -1,8 +1,8 @@
 """Nothing that shapes a world, an episode, a list or a recorded result has other last bits on another processor.
 
-The C library, numpy and scipy choose their exponentials, powers and matrix products by processor. What the package
-calls of them is listed here, each with why it may stay; ``make programme NAME=machines`` tries recorded results on
-others.
+The C library, numpy and scipy choose their exponentials, powers and matrix products by processor. The package's calls
+of them are listed here, each with the reason why it may stay; ``make programme NAME=machines`` tries recorded results
+on other processors.
 """
 
 import ast

@@ -35,7 +35,6 @@ POINTS, WORLDS, SEED, BUDGET = 12, 2000, 1007, 2000
 
 
 def job_of(test: str, count: str, name: str, seconds: int, folder: Path) -> Job:
-    """Return the training by one recipe for one count of harm."""
     recipe, steps = load_recipe(name), STEPS[name] * seconds // 30
     measured = {"every_updates": max(steps // (recipe.n_envs * recipe.rounds) // POINTS, 1), "worlds": WORLDS}
     recipe = recipe.replace(

@@ -48,8 +48,6 @@ LEARNED = ("level", "recipe, scheme", "objective", "Vehicle 1", "Vehicle 2", "Ve
 
 
 class Level(NamedTuple):
-    """Results of the searches on one level."""
-
     name: str
     ends: Mapping[str, Mapping[str, Equilibrium]]  # objective -> start -> where the best responses end
     seconds: Mapping[str, float]  # objective -> processor seconds of the search
@@ -57,7 +55,6 @@ class Level(NamedTuple):
 
 
 def search(name: str, worlds: int) -> Level:
-    """Search the equilibria of a level for every objective, and its joint optimum."""
     scenario = eb.load_scenario(name)
     lines, ends, seconds = scenario.sample(worlds, SEED), {}, {}
     find_equilibria(scenario, lines.take([0]), "own", budget=10, rounds=1)  # compiles
@@ -71,7 +68,6 @@ def search(name: str, worlds: int) -> Level:
 
 
 def train(folder: Path, name: str, objective: str, recipe: str, seed: int) -> None:
-    """Train a team in the folder, unless the folder exists."""
     import torch
 
     torch.set_num_threads(1)
@@ -123,7 +119,6 @@ def price_rows(level: Level) -> list[list[str]]:
 
 
 def learned_rows(place: Path, name: str, worlds: int) -> list[list[str]]:
-    """Return rows with the harm of each vehicle with trained teams."""
     rows = []
     for recipe, objective in product(SCHEMES, ("own", "total")):
         borne = drive([place / job(name, objective, recipe, seed) for seed in SEEDS[recipe]], name, worlds)
@@ -138,12 +133,10 @@ def job(name: str, objective: str, recipe: str, seed: int) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table in Markdown."""
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *rows))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Train, search, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="folder of the trainings; existing ones are not repeated")
     parser.add_argument("--jobs", type=int, default=1, help="number of parallel processes, with one thread each")

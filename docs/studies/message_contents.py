@@ -46,8 +46,6 @@ HEAD = ["messages contain", *(f"{line}, {what}" for line in LINES for what in ("
 
 
 class Effort(NamedTuple):
-    """Size of the study."""
-
     seeds: int  # trainings per combination
     steps: int  # decisions of each learner in a training
     worlds: int  # worlds of the evaluation
@@ -96,7 +94,6 @@ def table(runs: Path, effort: Effort) -> list[list[str]]:
 
 
 def main() -> None:
-    """Train missing policies, evaluate all policies, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--seeds", type=int, default=5)

@@ -62,7 +62,6 @@ class Limited(Wrapper):  # type: ignore[misc]
 
 
 def train(seconds: float, seed: int) -> tuple[CAPQL, float, int]:
-    """Return a trained agent, its processor seconds and its steps."""
     random.seed(seed)
     torch.manual_seed(seed)
     env = Limited(mo_gymnasium.make("EthBrakeMO-v1", scenario=SCENARIO), seconds)
@@ -97,7 +96,6 @@ def measure(agent: CAPQL, scenario: eb.Scenario) -> dict[str, Any]:
 
 
 def main(words: list[str]) -> int:
-    """Train and evaluate with every seed, and write the numbers to a file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path, help="file for the numbers, JSON")
     parser.add_argument("--seconds", type=float, default=300.0, help="processor seconds of each training")

@@ -89,7 +89,6 @@ def tables(found: Mapping[str, eb.Result]) -> str:
 
 
 def compared(found: Mapping[str, eb.Result], agent: str) -> str:
-    """Return the table of one agent and its exact counterpart."""
     words = (f"`{LIMITS[agent]}`", f"`{agent}`", "price")
     head = ["channel", *(f"{word}, {count}" for count in COUNTS for word in words)]
     lines = []
@@ -104,7 +103,6 @@ def compared(found: Mapping[str, eb.Result], agent: str) -> str:
 
 
 def markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table. All columns except the first are right-aligned."""
     rule = "| --- |" + " ---: |" * (len(head) - 1)
     return "\n".join(["| " + " | ".join(head) + " |", rule, *("| " + " | ".join(cells) + " |" for cells in lines)])
 

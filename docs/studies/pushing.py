@@ -53,7 +53,6 @@ def train(block: str, seed: int) -> PPO:
 
 
 def measure(block: str, model: PPO) -> dict[str, float]:
-    """Return the measures of the policy on worlds that no training uses."""
     agents = {block: eb.policy_agent(model, clip=True)}
     scenario = BLOCKS[block.partition("-")[0]][0]
     asked = "pushed_m,pushed_mps"

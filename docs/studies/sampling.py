@@ -65,7 +65,6 @@ def driven(agent: str, worlds: int, changes: Mapping[str, Any]) -> eb.State:
 
 
 def convergence(agent: str, worlds: int = WORLDS, steps_s: Sequence[float] = STEPS_S) -> Convergence:
-    """Compute exact harm and harm in the map."""
     exact, errors = driven(agent, worlds, {}), []
     for step_s in steps_s:
         last = driven(agent, worlds, {"physics": "paper-map", "time_step_s": step_s})

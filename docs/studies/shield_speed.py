@@ -44,7 +44,6 @@ def single_times(shield: Shield, decisions: int, *, asks: bool = False) -> list[
 
 
 def main(decisions: int = 5_000) -> None:
-    """Print one line per measurement."""
     teams = {
         name: eb.make_agent(f"ppo+{name}", scenario=SCENARIO)
         for name in ("step", "robust:gaps_m=0.5", "robust:braking_capacity_mps2=10%:gaps_m=0.5")

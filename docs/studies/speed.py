@@ -82,8 +82,6 @@ def rates(work: Work, effort: Effort) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Benchmark:
-    """Description of a measurement."""
-
     name: str
     workload: str
     unit: str
@@ -270,7 +268,6 @@ BENCHMARKS: tuple[Benchmark, ...] = (
 
 
 def main() -> None:
-    """Run the measurements, and print a table and the machine."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="coarser: about 20 s instead of one to two minutes")
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -77,7 +77,6 @@ def level_of(name: str) -> eb.Scenario:
 
 
 def load_team(folder: Path | str, scenario: eb.Scenario) -> eb.Team:
-    """Return the team of a training run."""
     return team_of(eb.make_agent(f"team@{folder}", scenario=scenario), scenario)
 
 
@@ -116,7 +115,6 @@ class Clock:
 
 @cache
 def script(name: str) -> Any:
-    """Return the module ``train/NAME.py``."""
     spec = importlib.util.spec_from_file_location(f"train_{name}", DOCS.parent / "train" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -238,13 +236,11 @@ def warm(algorithm: str) -> None:
 
 
 def write(file: Path, content: Results) -> str:
-    """Write the result of a job to ``file``, and return the name of the file."""
     write_file(file, json.dumps(content).encode() + b"\n")
     return file.name
 
 
 def measure_speed(file: Path, algorithm: str, level: str, seconds: float) -> str:
-    """Measure the decisions per processor second in a short training."""
     warm(algorithm)
     steps = max(round(ALGORITHMS[algorithm][1] * seconds / SHORT), 1)
     done, spent, *_ = learn(algorithm, level, steps, 99, worlds=2)[-1]
@@ -252,7 +248,6 @@ def measure_speed(file: Path, algorithm: str, level: str, seconds: float) -> str
 
 
 def train(file: Path, algorithm: str, level: str, steps: int, seed: int) -> str:
-    """Train once, and write the learning curve."""
     warm(algorithm)
     points = learn(algorithm, level, steps, seed)
     return write(file, {"algorithm": algorithm, "level": level, "seed": seed, "points": points})
@@ -271,7 +266,7 @@ def refer(file: Path, level: str) -> str:
 
 
 def finish_jobs(jobs: Mapping[Future[str], str]) -> int:
-    """Wait for jobs, print the end of each job, and return the number of failed jobs."""
+    """Wait for jobs, print their ends, and return the number of failed jobs."""
     failed, begun = 0, time.monotonic()
     for number, job in enumerate(as_completed(jobs), 1):
         error, spent = job.exception(), time.monotonic() - begun
@@ -337,7 +332,6 @@ def gather(folder: Path) -> Results:
 
 
 def text_of(found: Results) -> str:
-    """Return the text of the file of numbers, with one line per learning curve."""
     for curve in found["curves"]:
         curve["points"] = [[int(d), round(s, 2), *(round(h, 4) for h in harms)] for d, s, *harms in curve["points"]]
     whole = {key: json.dumps(value) for key, value in found.items() if key not in ("curves", "speeds")}
@@ -356,7 +350,6 @@ def curves_of(found: Results, level: str, algorithm: str) -> np.ndarray[Any, np.
 
 
 def levels_of(found: Results) -> list[str]:
-    """Return the levels that have a learning curve."""
     return [level for level in LEVELS if any(curve["level"] == level for curve in found["curves"])]
 
 
@@ -413,7 +406,7 @@ def draw(found: Results) -> Figure:
 
 
 def main() -> int:
-    """Run the missing jobs, or draw the results. Return 1 if a job failed, else 0."""
+    """Return 1 if a job failed, else 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", type=Path, help="folder of results; with --draw also a file of numbers")
     parser.add_argument("--seconds", type=float, default=60.0, help="processor seconds of each training")

@@ -1,9 +1,9 @@
 """What commands print, byte for byte, as listed in ``tests/cli/printed/*.txt``: each list is one story in one folder.
 
-Below a command line stands what it writes to stdout, then what it writes to stderr behind ``! ``, then its exit status
-where that is not 0; how far it is (``500 of 2,000``) is left out. ``$ cat FILE`` shows a file, ``$ sed -i`` changes
-one, ``$ rm`` removes one. ``HERE`` and ``ROOT`` stand for folders. With ``ETHBRAKE_SNAPSHOTS=write`` the test writes
-what is printed today: read the difference. What extensions add is hidden here; tests/extensions/printed shows it.
+Below a command line stand its stdout, its stderr behind ``! ``, and its exit status unless it is 0; progress
+(``500 of 2,000``) is left out. ``$ cat FILE`` shows a file, ``$ sed -i`` changes one, ``$ rm`` removes one. ``HERE``
+and ``ROOT`` stand for folders. With ``ETHBRAKE_SNAPSHOTS=write`` the test writes what is printed today: read the
+difference. What extensions add is hidden here; tests/extensions/printed shows it.
 """
 
 import contextlib

@@ -1,6 +1,7 @@
 """Tables and pictures of the pages, and the commands with which ``make figures`` makes them again.
 
-A table is known by how its header begins, a picture by its name. A results page names the commands itself.
+The beginning of its header identifies a table, the name of its file a picture. A results page names the commands
+itself.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""Parts of the user's own: trained with, evaluated, told in every output; refusals: ``test_refusals``."""
+"""Parts that a user registers are trained with, evaluated, and shown in every output; refusals: ``test_refusals``."""
 
 import csv
 import json

@@ -1,8 +1,7 @@
 """Worlds of the shipped scenarios, as digests: a seed gives the same worlds in every version and on every machine.
 
-``worlds.json`` has the lists for evaluation, ``training_worlds.json`` the stream for training, whose worlds were equal
-to version 0.5's, and its number of rejected draws. ``python -m tests.golden.test_worlds`` records them anew,
-which breaks every list of worlds that anybody has used.
+``worlds.json`` has the lists for evaluation, ``training_worlds.json`` the stream for training and its number of
+rejected draws. ``python -m tests.golden.test_worlds`` records them anew, which breaks all lists that people have used.
 """
 
 import hashlib

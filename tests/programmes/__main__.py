@@ -1,9 +1,8 @@
 """Command line of the programmes: ``python -m tests.programmes [NAME [options]]``; without a name it lists them.
 
-A programme is a module of this folder with a function ``cases(given)``. The function yields the name of each case and a
-function that runs it. The optional table ``OPTIONS`` has the programme's own options, with the arguments of
-``add_argument``. A case returns ``Told``: True (good), False (failed) or None (skipped, or without a claim), and one
-line of text. An ``AssertionError`` is a failure.
+A programme is a module of this folder. Its function ``cases(given)`` yields the name of each case and a function that
+runs it and returns ``Told``: True (good), False (failed) or None (skipped, or without a claim), and one line of text.
+An ``AssertionError`` is a failure. The optional table ``OPTIONS`` has arguments of ``add_argument``.
 """
 
 import argparse

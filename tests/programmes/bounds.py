@@ -5,8 +5,7 @@ Each kind and each Python has its own environment in ``.venvs/``:
 - ``lowest``, ``highest``: the project with everything for training and tests; pytest runs there.
 - ``lowest-light``, ``highest-light``: only the core, without torch; the commands of the light wheel run there.
 
-In the environments of lowest versions, the installed versions must equal the bounds of ``pyproject.toml``, so every
-bound has been tried. What cannot be installed is skipped with the reason.
+The lowest versions must equal the bounds of ``pyproject.toml``. What cannot be installed is skipped with the reason.
 """
 
 import json

@@ -1,7 +1,7 @@
 """Planted bugs that some test must find: errors that people make in such code. They are in ``bugs.yaml``.
 
-Each bug is planted in a copy of the repository, never in the working tree. In the copy run the tests in the folder of
-the changed file, and if none of them fails, all tests. A bug is found if a test fails.
+Each bug is planted in a copy of the repository. There run the tests in the folder of the changed file, and if none of
+them fails, all tests.
 """
 
 import os

@@ -1,10 +1,9 @@
 """The core without extensions: a copy passes the core's tests, trains, evaluates and uses the shield.
 
-The copy has neither ``ethbrake_marl/extensions`` nor ``tests/extensions``, and no entry points to them in
-``pyproject.toml``. ``make core`` runs this programme in about 100 s of processor time: the first case of each
-parametrised test, in one process, without the tests of the installation. ``--whole`` runs all tests of the core with
-all cases. ``--each`` instead deletes one extension at a time, with the extensions that use it, and runs the tests that
-remain, the first case of each.
+The copy has no extensions, no tests of them, and no entry points to them. ``make core`` takes about 100 s of processor
+time: the first case of each parametrised test, without the tests of the installation. ``--whole`` runs all tests of the
+core with all cases. ``--each`` instead deletes one extension at a time, with the extensions that use it, and runs the
+tests that remain, the first case of each.
 """
 
 import os

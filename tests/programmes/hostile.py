@@ -1,8 +1,8 @@
 """Hostile files: what somebody could try who sends a scenario, a recipe, a table, a policy or a run.
 
-Each file is read in its own process and folder. It must be refused with one line of error of at most 2,000 characters
-without control characters, within 10 s of processor time and 2 GiB of memory; a case that is marked ``may_be_valid``
-can also succeed. An audit hook of Python reports code that is executed, and prevents changes of files elsewhere.
+Each file is read in its own process and folder. It must be refused (with ``may_be_valid``: may succeed) with one line
+of error of at most 2,000 characters without control characters, within 10 s of processor time and 2 GiB of memory. An
+audit hook of Python reports code that is executed, and prevents changes of files elsewhere.
 """
 
 import io

@@ -1,11 +1,10 @@
 """Other libraries: every program of libraries.md in this folder runs unchanged, and its policy can be used as an agent.
 
-The programs of docs/train.md and docs/extensions/benchmarl.md run, too, in the environment of BenchMARL.
-
-Each library has its own environment in ``.venvs/``, with this project in its present state. A library that cannot be
-installed is skipped with the reason. A policy is evaluated on a fixed list of worlds, together with full braking. If
-the library can evaluate policies itself, its harm is compared with ours, world by world. docs/results/learning.md has
-the printed rows that beat full braking. ``--ci`` runs only the libraries that are cheap to install.
+The programs of docs/train.md and docs/extensions/benchmarl.md run, too, in the environment of BenchMARL. Each library
+has its own environment in ``.venvs/``; one that cannot be installed is skipped with the reason. A policy is evaluated
+on a fixed list of worlds, together with full braking, and compared, world by world, with the library's own evaluation
+if there is one. docs/results/learning.md has the printed rows that beat full braking. ``--ci`` runs only the libraries
+that are cheap to install.
 """
 
 import json

@@ -2,8 +2,7 @@
 
 Each other simulator has its own environment in ``.venvs/``, because some have licences or dependencies that this
 project does not want. If one cannot be installed or measured, the reason is printed. A rate is work per second of
-processor time (all threads) of a process that does nothing else. Imports are inside functions, because each process
-runs in the environment of its simulator.
+processor time (all threads) of a process that does nothing else.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
 """Statements about the package's own code that a solver proves, and planted bugs that must break the proofs.
 
-Every statement is a function that raises ``AssertionError`` if the solver does not prove it. The statements are about
-real numbers, for all values that the assumptions allow; rounding is not covered. Compilation must be switched off
-(``NUMBA_DISABLE_JIT=1``): then the functions of the package run in Python, with symbols instead of numbers, along every
-path of their comparisons. So the proofs are about the code itself.
+The statements are about real numbers, for all values that the assumptions allow; rounding is not covered. Compilation
+must be switched off (``NUMBA_DISABLE_JIT=1``): then the functions of the package run in Python, with symbols instead of
+numbers, along every path of their comparisons. So the proofs are about the code itself.
 """
 
 from __future__ import annotations

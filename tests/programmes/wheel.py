@@ -2,7 +2,7 @@
 
 ``built`` writes wheel and sdist to ``--output`` if two builds have the same SHA-256. ``light`` installs the wheel in an
 empty environment, checks its size, and runs the commands that must work without torch. Then it installs the sdist,
-which must install the same files. ``make programme NAME=wheel ARGS="--only built"`` runs only the first part.
+which must install the same files.
 """
 
 import hashlib

@@ -1,10 +1,7 @@
 """A scenario as a TorchRL environment and as a BenchMARL task; needs ``pip install ethbrake-marl[marl]``.
 
-The environment simulates ``n`` worlds together. All learners of a world form one group in TorchRL, and the episode of a
-world ends for all its learners at the same time. ``state``, the input of a central critic, is the full state of the
-line (``episode.full_state``).
-
-Letters in shapes: ``n`` worlds, ``L`` learners, ``F`` features of an observation, ``S`` features of the state.
+All learners of a world form one group in TorchRL, and its episode ends for all of them at the same time. ``state``, the
+input of a central critic, is the full state of the line (``episode.full_state``).
 """
 
 from __future__ import annotations
@@ -40,14 +37,14 @@ GROUP = "learners"
 class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the extra is not installed
     """TorchRL environment with ``n`` worlds of one scenario and ``L`` learners.
 
-    Shapes: observation [n, L, F], action [n, L, 1] (with discrete actions [n, L]), reward [n, L, 1], state [n, S], done
-    [n, 1].
+    F: features of an observation, S: features of the state. Shapes: observation [n, L, F], action [n, L, 1] (with
+    discrete actions [n, L]), reward [n, L, 1], state [n, S], done [n, 1].
 
     Args:
-        scenario: the scenario, which must have a learner; all learners observe the same features.
+        scenario: must have a learner; all learners observe the same features.
         n: number of worlds.
-        seed: seed from which the worlds are drawn.
-        reward: reward of the learners: a name such as ``harm``, or the weights of the reward's terms.
+        seed: seed of the worlds.
+        reward: a name such as ``harm``, or the weights of the reward's terms.
         horizon_is_end: True: an episode that reaches the horizon is terminated; False: it is truncated.
         shield: mode of the learners' shield, such as ``step``. None: no shield.
         actions: number of discrete actions, for algorithms such as QMIX; None: actions are numbers in [-1, 1].
@@ -97,7 +94,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         self.done_spec = Composite(flag, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Start the next episode in all worlds, or in those where the mask ``_reset`` in ``tensordict`` is True."""
+        """Start the next episode in all worlds, or where the mask ``_reset`` in ``tensordict`` is True."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             self.episode = self.stream.next_episodes(self.batch_size[0])
@@ -120,7 +117,6 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
-        """Let the next reset begin with world 0 of ``seed``; do nothing if it is None."""
         if seed is not None:
             self.stream.seed, self.stream.next = chosen_seed(seed), 0
 
@@ -131,25 +127,15 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
-    """BenchMARL task for one scenario.
-
-    Args:
-        name: name of the task in BenchMARL, such as ``PAPER_RANDOM``.
-        config: mapping with the key ``scenario``, and optionally ``reward``, ``horizon_is_end``, ``shield`` and
-            ``actions``: the arguments of ``LineEnv``.
-
-    """
+    """BenchMARL task for one scenario. ``config``: the key ``scenario``, and perhaps other arguments of ``LineEnv``."""
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        """Return a function without arguments that creates a ``LineEnv`` with ``num_envs`` worlds.
+        """Return a function that creates a ``LineEnv``. ``device`` is unused.
 
-        If ``seed`` is None, the seed is 0. ``device`` is unused.
-
-        Raises ``InvalidInput`` if the task has continuous actions and BenchMARL wants discrete actions, or the other
-        way round.
+        Raises ``InvalidInput`` if only one of task and BenchMARL has continuous actions.
         """
         actions = self.config.get("actions")
         if continuous_actions != (actions is None):
@@ -161,54 +147,43 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return partial(LineEnv, n=num_envs, seed=seed or 0, **self.config)
 
     def supports_continuous_actions(self) -> bool:
-        """Return True if the key ``actions`` in ``config`` is None or missing."""
         return self.config.get("actions") is None
 
     def supports_discrete_actions(self) -> bool:
-        """Return True if the key ``actions`` in ``config`` is a number."""
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
-        """Return the largest number of decisions in an episode."""
         scenario: Scenario = self.config["scenario"]
         return round(scenario.horizon_s / scenario.time_step_s) + 1
 
     def has_render(self, env: Any) -> bool:
-        """Return False, because the environment cannot be drawn."""
         return False
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
-        """Return ``{"learners": names}``: one group with the names of all learners."""
         scenario: Scenario = self.config["scenario"]
         return {GROUP: [scenario.vehicle_names[body - 1] for body in scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the learners' observations in ``env``, for a single world."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec["state"]
         return spec
 
     def info_spec(self, env: Any) -> Any:
-        """Return None, because the environment has no ``info``."""
         return None
 
     def state_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the state in ``env``, for a single world."""
         spec = env.full_observation_spec_unbatched.clone()
         del spec[GROUP]
         return spec
 
     def action_spec(self, env: Any) -> Any:
-        """Return the TorchRL spec of the learners' actions in ``env``, for a single world."""
         return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: Any) -> Any:
-        """Return None, because every action is always allowed."""
         return None
 
     @staticmethod
     def env_name() -> str:
-        """Return ``ethbrake``, the first part of the names of this package's tasks."""
         return "ethbrake"
 
 

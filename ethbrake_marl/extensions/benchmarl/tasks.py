@@ -1,8 +1,7 @@
 """Register every shipped scenario that has a learner as a BenchMARL task (needs the extra ``marl``).
 
-The command ``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` registers
-these tasks and then runs BenchMARL's own command line, which also accepts Hydra overrides. BenchMARL alone does not
-find these tasks, because it searches only its own folder.
+``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` registers these tasks
+and then runs BenchMARL's own command line, with Hydra overrides. BenchMARL alone searches only its own folder.
 """
 
 from __future__ import annotations
@@ -35,10 +34,6 @@ class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra 
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        """Return a task for the scenario file ``path``, or, if ``path`` is None, for this task's shipped scenario.
-
-        The reward of the task is minus the harm, and there is no shield.
-        """
         return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
 
 

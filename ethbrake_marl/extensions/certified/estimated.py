@@ -1,10 +1,10 @@
 """The estimated line of one vehicle: what it has received, completed from the scenario's ranges.
 
-A quantity of another vehicle that nothing has told yet is the median of its distribution, or an end of its range: the
-*lines* are the median line, and perhaps every *corner* of the ranges. Each line is played from the alert on, beside the
-episode, with the vehicle's own actions; the others follow their scripts. A line in which the vehicle would have
+A quantity of another vehicle that no message has told yet is the median of its distribution, or an end of its range:
+the *lines* are the median line, and perhaps every *corner* of the ranges. Each line is played from the alert on, beside
+the episode, with the vehicle's own actions; the others follow their scripts. A line in which the vehicle would have
 received or measured something else than it has is no longer possible. If none is possible, the truth lies between the
-corners: then what was received replaces what was assumed, in all lines, and what nobody has told goes on as before.
+corners: then received values replace assumed ones in all lines, and the rest goes on as before.
 
 Nothing else of the true state is read, so what was not received cannot change a line.
 """
@@ -130,7 +130,7 @@ class Lines(NamedTuple):
         return cls(body, alert, news, tuple(scenario.roles.values()))
 
     def commands(self, car: Floats, wanted: Floats) -> Floats:
-        """Return the commands of scripts with these capacities, [n, N + 1] m/s2; other learners brake fully."""
+        """Return the commands of scripts, [n, N + 1] m/s2; other learners brake fully."""
         wanted = wanted.copy()
         for other, role in enumerate(self.roles, 1):
             if other != self.body:
@@ -140,7 +140,7 @@ class Lines(NamedTuple):
     def at_alert(self, alert: State, state: State) -> State:
         """Return the lines at the alert, M rows for each world, if ``state`` is what is known at the first decision.
 
-        A vehicle of which everything is known then is as it was, and so is the gap between two of them.
+        Vehicles of which everything is known then are as they were, and so is the gap between two of them.
         """
         M, (pieces, news) = self.alert.n, self.received(state)
         lines, true = self.alert.take(np.tile(np.arange(M), alert.n)), alert.take(np.arange(alert.n).repeat(M))
@@ -160,7 +160,7 @@ class Lines(NamedTuple):
     def received(self, state: State) -> tuple[Bools, Floats]:
         """Return which pieces of each body are known, [n, N + 1, PIECES], and its newest sample (``messages.links``).
 
-        The place of the obstacle is known to Vehicle 1, and to who knows the place of Vehicle 1.
+        The place of the obstacle is known to Vehicle 1, and to all who know the place of Vehicle 1.
         """
         if NAME in state.memories:
             pieces, news = known_pieces(state, self.body), newest(state, self.body)
@@ -190,7 +190,7 @@ class Lines(NamedTuple):
         return lines, some, changed
 
     def agrees(self, state: State, lines: State) -> Bools:
-        """Return whether the vehicle would have received and measured in a line what it has, [n, M]."""
+        """Would the vehicle have received and measured in each line what it has? [n, M]."""
         pieces, news = self.received(state)
         mine, theirs = self.told(state, news), self.told(lines, self.received(lines)[1])
         far = np.abs(theirs.reshape(state.n, -1, *mine.shape[1:]) - mine[:, np.newaxis]) > SURPRISE
@@ -208,11 +208,11 @@ class Lines(NamedTuple):
         return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, lines: State) -> State:
-        """Return lines, one for each world, in which what was received replaces what was assumed.
+        """Return lines, one for each world, in which received values replace assumed ones.
 
-        Who was last seen without a force reacts at the earliest then. A sample is moved on to the present by the
-        vehicle's script, without contact. Whose place is unknown keeps its distance to the vehicle, but for the order
-        of the line. The vehicle measures its own motion and its own impacts.
+        A vehicle last seen without a force reacts at the earliest then. A sample is moved on to the present by the
+        vehicle's script, without contact. A vehicle whose place is unknown keeps its distance to this vehicle, within
+        the order of the line. This vehicle measures its own motion and its own impacts.
         """
         body, (pieces, news), time = self.body, self.received(state), state.time_s[:, np.newaxis]
         line, car = lines.line.copy(), lines.car.copy()
@@ -250,7 +250,7 @@ class Lines(NamedTuple):
 def without_channel(game: Game, lines: State) -> tuple[Game, State]:
     """Return the game and its lines as if everybody knew everything: for agents that drive in an estimated line.
 
-    Each vehicle's own latency is then over when it reacts. When the truth would be received is not known in a line.
+    Each vehicle's own latency is then over when it reacts. A line does not say when the truth would be received.
     """
     car = lines.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
@@ -259,9 +259,9 @@ def without_channel(game: Game, lines: State) -> tuple[Game, State]:
 
 
 def in_order(place: Floats, known: Bools) -> Floats:
-    """Return places (m), from a vehicle outwards, so that nobody is nearer than who is before.
+    """Return places (m), from a vehicle outwards, so that nobody is nearer than the vehicle before.
 
-    Who is not ``known`` is at most as far away as the next known one beyond.
+    An unknown place is at most as far away as the next ``known`` one beyond.
     """
     limit = np.where(known, place, np.inf)[:, ::-1]
     within = np.minimum(place, np.minimum.accumulate(limit, axis=1)[:, ::-1])
@@ -272,7 +272,7 @@ def in_order(place: Floats, known: Bools) -> Floats:
 def move_on(speed, way, wanted, onset, limit, age):
     """Move vehicles on by ``age`` (s) without contact; from ``onset`` (s) on they follow ``wanted`` (m/s2).
 
-    All are [n, N + 1].
+    All arrays are [n, N + 1].
     """
     for k in range(speed.shape[0]):
         for i in range(speed.shape[1]):

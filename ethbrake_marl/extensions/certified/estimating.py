@@ -5,7 +5,7 @@ is one of the lines that are possible then, the harm of the episode is at most B
 and whatever messages are lost.
 
 **Proof.** Each line is played by the episode's own step with the actions that are applied, so the line that is the true
-world is the true episode, and it is never found impossible. The proof of the step shield holds in each line that
+world is the true episode, and it never becomes impossible. The proof of the step shield holds in each line that
 remains; with fewer lines the price of the plan does not rise, and another plan is held only if it costs less. ∎
 
 Without corners, in the median line alone, nothing is promised. Between the corners the harm may be above the bound. The
@@ -43,7 +43,7 @@ class EstimatedShield(MembersShield):
     Args:
         drivers: body -> agent, as for ``StepShield``.
         scenario: of the worlds.
-        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: what is bounded (``episode.counts``).
         corners: certify also in the corners of the ranges, not only in the median line.
 
     """
@@ -62,14 +62,12 @@ class EstimatedShield(MembersShield):
         self.lines = lines_of_learner(scenario, corners)
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision ``state``."""
         lines, possible, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
         median = lines.take(np.arange(0, lines.n, self.lines.alert.n))
         memory = self.first_memory(game, median, median, lines, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(lines, state.n), possible))
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Return the action to apply, [n, 1], and the new memory."""
         memory: Memory = state.memories["shield"]
         lines, possible, changed = self.lines.heard(state, joined(memory.members.states))
         trusted = memory.members.trusted & (possible | state.ended)
@@ -81,11 +79,11 @@ class EstimatedShield(MembersShield):
         return super().decide(game, state, proposed, donate=donate)
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
-        """Return the plans if the shield's agents drive on in the median line, where they know everything."""
+        """Roll out in the median line, where the shield's agents know everything."""
         return super().rolled_out(*without_channel(game, state), plans, most)
 
     def planned_again(self, game: Game, memory: Memory, lines: State, rows: Ints) -> Memory:
-        """Return the memory in which the worlds ``rows`` hold the cheapest of their plan and new first plans."""
+        """In the worlds ``rows``, hold the cheapest of the old plan and new first plans."""
         here = part(lines, rows, self.lines.alert.n)
         median = here.take(np.arange(0, here.n, self.lines.alert.n))
         plan, price = memory.plan.copy(), memory.price.copy()
@@ -98,12 +96,7 @@ class EstimatedShield(MembersShield):
 class EstimatedEpisodeShield(EpisodeShield):
     """Algorithm 1 in the median line: at the first decision, the policy or E-V2X-BM gets the whole episode.
 
-    Args:
-        drivers: body of the learner -> its policy.
-        scenario: of the worlds.
-        harm_count: what is compared: ``first``, ``total`` or ``honest`` (``episode.counts``).
-        bound: H*: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
-
+    ``harm_count`` is compared; ``bound`` is H*: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
     """
 
     knows = ESTIMATED
@@ -120,27 +113,20 @@ class EstimatedEpisodeShield(EpisodeShield):
         self.lines = lines_of_learner(scenario, corners=False)
 
     def begin(self, game: Game, alert: State, state: State) -> EpisodeMemory:
-        """Return the memory at the first decision ``state``."""
         median, _, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
         game, median = without_channel(game, median)
         return super().begin(game, median, median)
 
 
 class Estimate(NamedTuple):
-    """What the agent remembers of n episodes."""
-
     median: State  # line at the last decision
     command: Floats  # [n] m/s2; NaN: none yet
 
 
 class EstimatedEV2XBM:
-    """E-V2X-BM in the median line, which chooses again when something is received that the line did not foretell.
+    """E-V2X-BM in the median line, which chooses again when what it receives differs from the line's prediction.
 
-    Args:
-        scenario: of the worlds.
-        is_pairwise: by the paper's closed form, instead of the simulation of the line.
-        count: what is minimised: ``first``, ``total`` or ``honest`` (``episode.counts``).
-
+    ``is_pairwise``: by the paper's closed form, instead of the simulation of the line. ``count`` is minimised.
     """
 
     knows = ESTIMATED
@@ -151,7 +137,6 @@ class EstimatedEV2XBM:
         self.lines: dict[int, Lines] = {}  # body -> its median line
 
     def begin(self, alert: State, body: int) -> Estimate:
-        """Return the median line, and no command."""
         check_exact(alert, self.name)
         if body not in self.lines:
             self.lines[body] = Lines.of(self.scenario, body, corners=False)
@@ -159,7 +144,6 @@ class EstimatedEV2XBM:
         return Estimate(median, np.full(alert.n, np.nan))
 
     def act(self, state: State, memory: Estimate, body: int) -> tuple[Floats, Estimate]:
-        """Return the commands of vehicle ``body``, [n] m/s2, and the new memory."""
         wanted = memory.median.wanted.copy()
         wanted[:, body] = state.wanted[:, body]
         foretold = advanced(memory.median._replace(wanted=wanted), state.time_s)
@@ -174,7 +158,7 @@ class EstimatedEV2XBM:
 
 
 def differ(one: State, other: State) -> Bools:
-    """Return whether lines differ in speeds, gaps or vehicles, [n]. It does not matter since when a vehicle reacts."""
+    """Do lines differ in speeds, gaps or vehicles? [n]. When a vehicle began to react does not matter."""
     parts = []
     for line in (one, other):
         car = line.car[:, :, 1:].copy()
@@ -185,7 +169,6 @@ def differ(one: State, other: State) -> Bools:
 
 
 def lines_of_learner(scenario: Scenario, corners: bool) -> Lines:
-    """Return the lines of the only learner. Raises ``InvalidInput`` if there are several, or none."""
     if len(scenario.learners) != 1:
         raise InvalidInput(
             f"shield: scenario {scenario.name!r} has {len(scenario.learners)} learners; an estimated shield needs"
@@ -195,7 +178,6 @@ def lines_of_learner(scenario: Scenario, corners: bool) -> Lines:
 
 
 def make_e_v2x_bm(argument: str | None, settings: Any) -> EstimatedEV2XBM:
-    """Return the agent ``e_v2x_bm:estimated`` or ``e_v2x_bm:pairwise:estimated``."""
     if argument not in (None, "pairwise"):
         raise InvalidInput(f"agent {settings.spec!r}: must be e_v2x_bm:estimated or e_v2x_bm:pairwise:estimated")
     return EstimatedEV2XBM(settings.needed_scenario(), argument == "pairwise", settings.harm_count)

@@ -1,8 +1,8 @@
 """The robust shield: its bound holds in the nominal world and in every corner of its box of possible worlds.
 
 It is the step shield with one change: the price of a plan is the largest harm over all members of a world
-(``uncertainty``). The members are played beside the episode, with the actions that are applied, by the episode's own
-step; so the proof of the step shield holds in each of them. It does not hold between the corners
+(``uncertainty``). The members are played beside the episode, with the applied actions, by the episode's own step; so
+the proof of the step shield holds in each of them. It does not hold between the corners
 (docs/internals/proofs/shield.md).
 """
 
@@ -30,8 +30,6 @@ INSIDE = 1e-9  # by which a gap (m) or speed (m/s) may lie outside the range of 
 
 
 class Members(NamedTuple):
-    """The states that n worlds may be in."""
-
     states: State  # arrays [n, M, ...], the nominal state first
     trusted: Bools  # [n] whether everything that was observed was possible
 
@@ -64,14 +62,13 @@ class MembersShield(StepShield):
         return [*plans, held(game, actions[best])]
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Return the actions to apply, [n, L], and the new memory, whose members have made the step."""
+        """Decide, and let the members make the step."""
         applied, memory = super().decide(game, state, proposed, donate=donate)
         states = joined(memory.members.states)
         after, _ = game.follow(states, applied.repeat(states.n // state.n, axis=0))
         return applied, memory._replace(members=memory.members._replace(states=apart(after, state.n)))
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Return what users may want to know: name -> [n] or [n, N]."""
         return {**super().infos(game, state), "trusted": state.memories["shield"].members.trusted}
 
 
@@ -82,8 +79,8 @@ class RobustShield(MembersShield):
 
     Args:
         drivers: body -> agent, as for ``StepShield``.
-        uncertainty: intervals around the nominal quantities, which it needs, such as ``gaps_m=0.5,mass_t=10%``.
-        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        uncertainty: intervals around the nominal quantities, required, such as ``gaps_m=0.5,mass_t=10%``.
+        harm_count: what is bounded (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
 
     """
@@ -102,7 +99,7 @@ class RobustShield(MembersShield):
         self.uncertainty = parse_uncertainty(uncertainty)
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision. Raises ``InvalidInput`` where the intervals do not fit."""
+        """Return the memory at the first decision. Raises ``InvalidInput`` if the intervals do not fit."""
         states = opened(game, self.uncertainty.members(alert))
         if (states.time_s >= game.rules.horizon_s).any():
             raise InvalidInput(
@@ -113,7 +110,6 @@ class RobustShield(MembersShield):
         return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Return the actions to apply, [n, L], and the new memory."""
         members: Members = state.memories["shield"].members
         trusted = members.trusted & may_be_in(state, members.states)
         applied, memory = super().decide(game, state, proposed, donate=donate)
@@ -121,22 +117,21 @@ class RobustShield(MembersShield):
 
 
 def opened(game: Game, alerts: State) -> State:
-    """Return worlds at their first decision."""
     return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).reset(alerts)
 
 
 def apart(states: State, n: int) -> State:
-    """Return states, M rows for each of n worlds, as arrays [n, M, ...], which have one row per world."""
+    """M rows for each of n worlds -> arrays [n, M, ...]."""
     return mapped(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
 
 
 def joined(states: State) -> State:
-    """Return states with arrays [n, M, ...] as M rows for each world."""
+    """Arrays [n, M, ...] -> M rows for each world."""
     return mapped(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
 
 
 def may_be_in(state: State, members: State) -> Bools:
-    """Return whether gaps and speeds lie in the range of the members, [n]; True once anybody has had an impact.
+    """Do gaps and speeds lie in the range of the members? [n]; True once anybody has had an impact.
 
     Before any impact, gaps and speeds are monotone in each quantity, so every world in the box lies in this range.
     """

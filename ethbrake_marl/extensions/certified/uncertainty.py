@@ -32,8 +32,6 @@ NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 class Interval(NamedTuple):
-    """Interval around one quantity, of one vehicle or pair, or of all."""
-
     text: str  # as it was written, such as mass_t.vehicle_2=10%
     quantity: str
     half_width: float  # in the quantity's unit, or a share of its value below 1
@@ -42,7 +40,7 @@ class Interval(NamedTuple):
 
 
 class Side(NamedTuple):
-    """One uncertain number of n worlds: an edge of their boxes."""
+    """One uncertain number of n worlds."""
 
     key: str
     body: int  # column in the arrays of a state
@@ -51,8 +49,6 @@ class Side(NamedTuple):
 
 
 class Uncertainty(NamedTuple):
-    """Intervals around the nominal quantities of a world; ``parse_uncertainty`` makes it."""
-
     intervals: tuple[Interval, ...]
 
     def __str__(self) -> str:
@@ -62,7 +58,7 @@ class Uncertainty(NamedTuple):
         """Return the members of worlds at the alert, M rows for each world: itself, then the corners of its box.
 
         Corners are in the order of binary numbers, with the first interval as the lowest bit (0: smallest value).
-        Raises ``InvalidInput`` where an interval does not fit the worlds, and for more than ``MOST_CORNERS`` corners.
+        Raises ``InvalidInput`` if an interval does not fit the worlds, and for more than ``MOST_CORNERS`` corners.
         """
         sides = self.sides(alert)
         if 2 ** len(sides) > MOST_CORNERS:
@@ -77,7 +73,7 @@ class Uncertainty(NamedTuple):
         return whole.take(np.arange(whole.n).reshape(-1, alert.n).T.ravel())
 
     def draw(self, alert: State, rng: np.random.Generator, *, corners: bool = False) -> State:
-        """Return one world of the box of each: uniformly from the whole box, or one of its corners."""
+        """Return one world from each box: uniform in the whole box, or one of its corners."""
         sides = self.sides(alert)
         shares = rng.random((alert.n, len(sides)))
         return placed(alert, sides, np.round(shares) if corners else shares)
@@ -119,8 +115,8 @@ def values_of(alert: State, key: str) -> Floats:
 def placed(alert: State, sides: list[Side], shares: Floats) -> State:
     """Return worlds whose uncertain numbers are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
 
-    Who brakes fully does so with the new capacity. Without a V2X channel, who reacts later also learns all later.
-    Raises ``InvalidInput`` if a script's command is beyond a capacity.
+    A vehicle that brakes fully does so with the new capacity. Without a V2X channel, a vehicle that reacts later also
+    learns everything later. Raises ``InvalidInput`` if a script's command is beyond a capacity.
     """
     line, car, know, wanted = alert.line.copy(), alert.car.copy(), alert.know.copy(), alert.wanted.copy()
     for (key, body, low, high), at in zip(sides, shares.T, strict=True):

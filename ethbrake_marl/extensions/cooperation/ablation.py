@@ -42,8 +42,6 @@ QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_epis
 
 @dataclass(frozen=True)
 class Ablation:
-    """Settings of an ablation."""
-
     folder: Path  # of all results
     levels: tuple[Level, ...]
     recipes: tuple[TrainingRecipe, ...]  # each has its scheme for several learners
@@ -70,11 +68,10 @@ class Ablation:
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """Names of the compared algorithms, each in the form ``RECIPE-SCHEME``."""
+        """Names of the compared algorithms, ``RECIPE-SCHEME``."""
         return tuple(f"{recipe.name}-{recipe.scheme}" for recipe in self.recipes)
 
     def jobs(self) -> Iterator[tuple[Level, str, Job]]:
-        """Yield each training, seed by seed, with its level and algorithm."""
         for seed in range(self.seeds):
             for recipe, algorithm in zip(self.recipes, self.algorithms, strict=True):
                 for level in (level for level in self.levels if level.scenario.learners):
@@ -89,7 +86,6 @@ class Ablation:
                     yield level, algorithm, Job(training, folder, noted)
 
     def study_folder(self) -> AbstractContextManager[None]:
-        """Context manager: the folder, which refuses results of other settings."""
         settings = {
             "levels": [level.scenario.content(without=WORDS) for level in self.levels],
             "recipes": [recipe.model_dump(mode="json", exclude=set(WORDS)) for recipe in self.recipes],
@@ -116,9 +112,9 @@ class Measured(NamedTuple):
 
 
 def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
-    """Start or continue every training until it ends, ``jobs`` at a time; return False if Ctrl-C stopped one.
+    """Start or continue every training, ``jobs`` at a time; return False if Ctrl-C stopped one.
 
-    Raises ``InvalidInput`` for a folder with something else than the right training.
+    Raises ``InvalidInput`` for a folder that holds anything but the right training.
     """
     every = [job for _, _, job in plan.jobs()]
     for done, finished in enumerate(run_each(((job.finish,) for job in every), jobs), 1):
@@ -129,7 +125,7 @@ def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
 
 
 def measure(plan: Ablation, tell: OnProgress) -> list[Measured]:
-    """Evaluate all levels, each with all algorithms, in the order of the plan. All trainings are finished."""
+    """Evaluate all levels, each with all algorithms, after all trainings have finished."""
     trained: dict[Any, list[Job]] = {}
     for level, name, job in plan.jobs():
         trained.setdefault((level.name, name), []).append(job)
@@ -147,7 +143,6 @@ def measure(plan: Ablation, tell: OnProgress) -> list[Measured]:
 
 
 def driven(level: Level, drawn: Drawn, algorithm: str | None, jobs: Any) -> Measured:
-    """Let the trained teams of a level drive its worlds, and full braking beside them."""
     scenario, measures = level.scenario, []
     named = {f"{algorithm} seed {seed}": f"team@{job.folder}" for seed, job in enumerate(jobs)}
     teams = teams_of(named, scenario) if named else {"scripts": Team("scripts", {})}

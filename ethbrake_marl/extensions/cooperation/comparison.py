@@ -25,7 +25,7 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
     - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
     - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking, or none.
 
-    The joint optimum was searched in the first ``searched`` worlds; comparisons with it use only these.
+    The joint optimum is known in the first ``searched`` worlds; comparisons with it use only these.
     """
     steps = []
     for algorithm in dict.fromkeys(each.algorithm for each in measured if each.algorithm is not None):
@@ -48,13 +48,11 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
 
 
 def place_of(one: Measured) -> Json:
-    """Return the level's name and, in a sweep, the swept number."""
     swept = one.level.swept
     return {"level": one.level.name} | ({} if swept is None else {"swept_number": swept.number})
 
 
 def _level(one: Measured, searched: int) -> Json:
-    """Return the results of one level with one algorithm, as means over seeds and worlds."""
     scenario = one.level.scenario
     mean = partial(mean_over_seeds, clusters=one.clusters)
     entry: Json = {
@@ -81,7 +79,6 @@ def _level(one: Measured, searched: int) -> Json:
 
 
 def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
-    """Return the results in the first worlds, in which the joint optimum was searched."""
     first = None if one.clusters is None else one.clusters[:searched]
     reached, braking = one.reached[COLUMN[count]][:, :searched], one.braking[COLUMN[count]][:, :searched]
     best = None if one.best is None else one.best[count]
@@ -98,10 +95,7 @@ def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Return the change of harm between two levels, of the line and of each vehicle.
-
-    Seed k of one level is compared with seed k of the other, or with its only seed.
-    """
+    """Seed k of one level is compared with seed k of the other, or with its only seed."""
     entry: Json = {"algorithm": algorithm}
     for word, one in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}
@@ -119,5 +113,5 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
 
 
 def _borne(one: Measured, column: str) -> list[Floats]:
-    """Return the harm that each vehicle bears, [seeds, n] each, front to rear."""
+    """Return each vehicle's harm, [seeds, n] each, front to rear."""
     return [one.reached[f"{column}_{i}"] for i in range(1, one.level.scenario.vehicles + 1)]

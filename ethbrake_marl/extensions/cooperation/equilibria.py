@@ -37,8 +37,6 @@ DRAWING = np.array([PLAN, 40, 25, 25])  # changes begin within 40 decisions, and
 
 
 class Equilibrium(NamedTuple):
-    """Where the search from one start ended."""
-
     profiles: Profiles  # commands of the learners, with one phase for each decision
     borne: Floats  # harm of each vehicle, [n, N] m2/s2
     converged: Bools  # [n] whether no learner gained more than the tolerance in the last round
@@ -46,7 +44,7 @@ class Equilibrium(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """How much the equilibria from different starts differ in each world; those that did not converge are left out."""
+    """How much the equilibria from different starts differ in each world, among those that converged."""
 
     found: Ints  # [n] number of starts that converged
     differs: Bools  # [n] whether the harm of a vehicle differs
@@ -65,8 +63,8 @@ def find_equilibria(
 ) -> dict[str, Equilibrium]:
     """Search equilibria of the scenario's learners by best responses in turn, once from each start in ``STARTS``.
 
-    Where no learner changes its plan in a round, the result is an equilibrium of plans; it is approximate, because a
-    turn tries only ``budget`` plans. A world may have further equilibria. The result depends on no other world.
+    If no learner changes its plan in a round, the result is an equilibrium of plans; it is approximate, because a turn
+    tries only ``budget`` plans. A world may have other equilibria. The result depends on no other world.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -76,15 +74,15 @@ def find_equilibria(
     (['braking', 'driving', 'random'], (5,))
 
     Args:
-        scenario: of the worlds, with at least one learner.
-        worlds: worlds at the alert.
+        scenario: with at least one learner.
+        worlds: at the alert.
         objective: of each learner: one for all, such as ``own``, or one for each vehicle; None: the scenario's.
-        count: what counts as harm: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        count: what counts as harm (``episode.counts``).
         budget: number of plans that a learner tries in its turn, in each world.
-        rounds: largest number of rounds.
+        rounds: the most.
 
-    Raises ``InvalidInput`` for a scenario without learners, a script that looks at the state, an objective that is
-    neither a weighted sum of the vehicles' harm nor ``maximin``, and a number out of range.
+    Raises ``InvalidInput`` for a scenario without learners, a script that looks at the state, and an objective that is
+    neither a weighted sum of the vehicles' harm nor ``maximin``.
 
     """
     check_whole_number("rounds", rounds, 1)
@@ -107,14 +105,13 @@ def find_equilibria(
 
 
 def turn_of(game: Game, worlds: State, body: int, declared: Declared, count: str) -> Problem:
-    """Return the problem of all learners, this one first, in which its objective is minimised."""
     bodies = [body, *(other for other in game.rules.learners.tolist() if other != body)]
     problem = problem_of(game, worlds, bodies, count=count)
     return aimed(problem._replace(bodies=problem.bodies[:1]), declared)._replace(bodies=problem.bodies)
 
 
 def _settle(turns: list[Problem], plans: Floats, budget: int, rounds: int, seed: int) -> tuple[Bools, Ints]:
-    """Let the learners improve ``plans`` [n, T, L] in turn, in place; return who converged, [n], and after how long."""
+    """Let the learners improve ``plans`` [n, T, L] in place; return whether they converged, [n], and rounds, [n]."""
     active, taken = np.arange(len(plans)), np.zeros(len(plans), np.int64)
     for turn in range(rounds):
         moved = np.zeros(len(active), np.bool_)
@@ -135,7 +132,7 @@ def _settle(turns: list[Problem], plans: Floats, budget: int, rounds: int, seed:
 
 
 def respond(problem: Problem, plans: Floats, budget: int, seed: int) -> Floats:
-    """Return plans [n, T, B] in which the first controlled vehicle has the best commands that were found.
+    """Return plans [n, T, B] in which the first controlled vehicle has the best commands of a search.
 
     The best few of its own plan, of plans of two commands and of random ones are improved by changes of some decisions
     at a time. Raises ``PhysicsError`` for a world in which no plan can be simulated.
@@ -189,7 +186,6 @@ def other_plans(plan: Floats, bounds: Floats, number: int) -> Floats:
 
 
 def compare_starts(ends: Mapping[str, Equilibrium]) -> Spread:
-    """Compare the equilibria that were reached from different starts, world by world."""
     converged = np.stack([each.converged for each in ends.values()])
     borne = np.where(converged[:, :, np.newaxis], np.stack([each.borne for each in ends.values()]), np.nan)
     line, rows = borne.sum(axis=2), np.arange(borne.shape[1])
@@ -203,8 +199,8 @@ def best_joint_harm(
 ) -> Floats:
     """Return the harm of each vehicle in the joint optimum, [n, N] m2/s2.
 
-    In each world it is the result with the least harm of the line among ``ends``, whatever objectives they are of, and
-    of ``best_harm``, which searches the commands of all learners together.
+    In each world this is the result with the least harm of the line, among ``ends`` (of any objectives) and
+    ``best_harm``, which searches the commands of all learners together.
     """
     game = open_game(scenario)[1]
     table = best_harm(game, worlds, counts=(count,), budget=budget, threads=1)
@@ -218,8 +214,9 @@ def best_joint_harm(
 def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
     """Return (line's mean harm in equilibrium) / (line's mean harm in the joint optimum), with its interval.
 
-    Of the worst equilibria (``Spread.worst``) this is the price of anarchy, of the best ones the price of stability.
-    Both are [n, N] m2/s2; worlds with NaN (no equilibrium) are left out. None if the joint optimum does no harm.
+    For the worst equilibria (``Spread.worst``) this is the price of anarchy, for the best ones the price of stability.
+    Both arguments are [n, N] m2/s2; worlds with NaN (no equilibrium) are left out. None if the joint optimum does no
+    harm.
     """
     rows = np.isfinite(borne).all(axis=1)
     saved = decrease(borne[rows].sum(axis=1), optimum[rows].sum(axis=1))

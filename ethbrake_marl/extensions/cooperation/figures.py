@@ -1,7 +1,4 @@
-"""Figure of an ablation or a sweep: harm of the trained policies, of full braking and of the joint optimum.
-
-``results`` is the content of ``ablation.json``.
-"""
+"""Figure of an ablation or a sweep, from the content of ``ablation.json``."""
 
 from __future__ import annotations
 
@@ -26,7 +23,7 @@ Json = dict[str, Any]
 def ablation_figure(results: Json, caption: str) -> Figure:
     """Draw both harms and the honest cost at each level or swept value, with 95 % intervals and a dot for each seed.
 
-    All means are over the worlds in which the joint optimum was searched.
+    All means are over the worlds in which the joint optimum is known.
     """
     levels, swept = results["levels"], results["settings"]["swept"]
     names = list(dict.fromkeys(level["level"] for level in levels))
@@ -52,7 +49,6 @@ def ablation_figure(results: Json, caption: str) -> Figure:
 
 
 def _draw_bounds(axes: Axes, points: list[tuple[float, str | None, Json]], half: float) -> None:
-    """Draw full braking and the joint optimum at each level as short horizontal lines."""
     for key, label, colour in (
         ("full_brake", "full braking", GREY),
         ("best_known", "joint optimum", series_style(3)["color"]),

@@ -34,8 +34,6 @@ SAME_VEHICLES = ("objective", "obstacle_gap_m", "roles", "v2x")  # keys whose sw
 
 
 class Level(NamedTuple):
-    """One of the scenarios that an ablation compares."""
-
     name: str  # of the scenario; in a sweep followed by the swept value, such as ``cooperation-3-pair-social-15``
     scenario: Scenario
     before: str | None = None  # name of the level with which it is compared
@@ -43,7 +41,7 @@ class Level(NamedTuple):
 
     @property
     def same_vehicles(self) -> bool:
-        """Whether world k has the same vehicles at all levels."""
+        """World k has the same vehicles at all levels."""
         return self.swept is None or self.swept.key.partition(".")[0] in SAME_VEHICLES
 
 
@@ -51,8 +49,7 @@ def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
     """Load the levels of an ablation.
 
     A level that differs from an earlier one only in ``v2x`` is compared with it. The others form a ladder, in which
-    each level is compared with the previous one. Raises ``InvalidInput`` for fewer than two levels and for a repeated
-    one.
+    each level is compared with the previous one. Raises ``InvalidInput`` for fewer than two levels, or one given twice.
     """
     levels: list[Level] = []
     ladder: list[Level] = []
@@ -71,7 +68,6 @@ def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
 
 
 def _is_other_channel(one: Scenario, other: Scenario) -> bool:
-    """Return whether two scenarios differ only in ``v2x``."""
     contents = [each.content(without=("name", *WORDS, "v2x")) for each in (one, other)]
     return one.v2x != other.v2x and contents[0] == contents[1]
 
@@ -114,9 +110,9 @@ def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[Tr
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Drawn]:
     """Draw the worlds of each level; world k has the same line of vehicles at all levels.
 
-    Levels with different ``v2x`` may have different latencies, and a level may have an obstacle that others have not.
-    Raises ``InvalidInput``, which names level and quantity, if anything else differs. If a sweep varies a key of the
-    vehicles, world k only has the same random numbers.
+    Levels may differ in obstacles and weights of harm and, with different ``v2x``, in latencies. Raises
+    ``InvalidInput``, which names level and quantity, if anything else differs. If a sweep varies a key of the vehicles,
+    world k only has the same random numbers.
     """
     drawn = [level.scenario.draw(episodes, seed) for level in levels]
     if not levels[0].same_vehicles:
@@ -139,7 +135,6 @@ def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Dra
 
 
 def _quantities(level: Level, drawn: Drawn) -> dict[str, Any]:
-    """Return what levels must share: name of a key or a column of the worlds -> values."""
     keys = {key: np.array([str(getattr(level.scenario, key))]) for key in SHARED}
     columns = quantities_of(drawn.worlds)
     return keys | {name: column for name, column in columns.items() if not name.startswith(MAY_DIFFER)}

@@ -1,4 +1,4 @@
-"""Joint optimum of a level: in each world, the least harm or cost known that its learners can cause together.
+"""Joint optimum of a level: in each world, the least known harm or cost that its learners can cause together.
 
 It depends on worlds, learners and scripts, but not on what the learners know or minimise, so levels that differ only in
 that share one search. The best commands of one level count for every other level whose learners can give the same ones.
@@ -28,8 +28,6 @@ ON_GRID = 1e-9  # part of a step by which decisions of two levels may differ
 
 
 class Answer(NamedTuple):
-    """What is known of a level with learners."""
-
     scenario: Scenario
     game: Game
     worlds: State  # at the alert, in which the joint optimum was searched, [m]
@@ -38,10 +36,7 @@ class Answer(NamedTuple):
 
 
 def with_optima(plan: Ablation, measured: Sequence[Measured], threads: int, tell: OnProgress) -> list[Measured]:
-    """Return the results, each with the joint optimum of its level, unless the level has no learner.
-
-    Finished chunks of the search are read from the folder of the ablation.
-    """
+    """Add the joint optimum of each level with a learner; finished chunks of the search are read from the folder."""
     tables: dict[bytes, BestHarmTable] = {}
     answers: dict[str, Answer] = {}
     for one in measured:
@@ -91,7 +86,7 @@ def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
 
 
 def can_imitate(own: Answer, other: Answer) -> Bools:
-    """Return for each world, [m], whether learners of ``own`` can give the commands of the learners of ``other``.
+    """Can the learners of ``own`` give the commands of the learners of ``other``? [m].
 
     They can if each learner of ``other`` learns in ``own``, the other vehicles of ``own`` have the same roles, lines
     and latencies are the same, and each decision of ``other`` is also one of ``own``. Only ``own`` may have an

@@ -21,7 +21,6 @@ from ethbrake_marl.files.store import write_output
 
 
 def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, list[Path]]:
-    """Write the results, and replace those of an earlier run; return the content of the JSON file, and the paths."""
     recipes = zip(plan.algorithms, plan.recipes, strict=True)
     swept, machine = plan.levels[0].swept, this_machine()
     results = {
@@ -44,7 +43,6 @@ def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, 
 
 
 def conditions(plan: Ablation, number: int) -> str:
-    """Return how the policies were trained, and of which ``number`` worlds means are."""
     recipes = ", ".join(
         f"{name} (rewarded for {IN_WORDS[recipe.reward.harm_count]})"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
@@ -87,7 +85,6 @@ Columns = list[tuple[Column, str]]
 
 
 def tables(results: Json) -> list[Sheet]:
-    """Return the tables for the terminal, for each count of harm."""
     swept, levels = results["settings"]["swept"], results["levels"]
     several = len(results["settings"]["recipes"]) > 1
     algorithm: Columns = [(Column("Algorithm", text=True), "algorithm")] if several else []
@@ -132,5 +129,4 @@ def sheet(title: str, rows: Sequence[Json], columns: Columns) -> Sheet:
 
 
 def share(heading: str) -> Column:
-    """Return a column of percentages."""
     return Column(heading, digits=1, scale=100.0, unit=" %")

@@ -1,8 +1,8 @@
 """Means over training runs with different seeds; their intervals say what to expect of other seeds and other worlds.
 
 The bootstrap resamples the seeds of each side, and the worlds, or recordings, of all sides together. ``values``,
-``baseline``, ``worst`` and ``best`` have one number per seed and world, [seeds, worlds], for the same worlds; the
-numbers of seeds may differ. ``clusters`` has the name of each world's recording, [worlds]; None: all are independent.
+``baseline``, ``worst`` and ``best`` are [seeds, worlds], for the same worlds; the numbers of seeds may differ.
+``clusters`` has the name of each world's recording, [worlds]; None: all are independent.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ CONFIDENCE = 0.95
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
     """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``.
 
-    There is no interval if there is only one world or recording, or if no baseline is given and all values are 0.
-    Without a baseline, the interval of truth values contains Wilson's, because bootstrap intervals of nearly constant
-    values are too narrow.
+    No interval for only one world or recording, or without a baseline if all values are 0. Truth values without a
+    baseline always have one, which contains Wilson's: bootstrap intervals of nearly constant values are too narrow.
     """
     array = np.atleast_2d(np.asarray(values))
     sides = [array, np.zeros((1, array.shape[1])) if baseline is None else np.atleast_2d(baseline)]
@@ -49,7 +48,7 @@ def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None
 def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clusters = None) -> Estimate | None:
     """Return the share of the possible reduction ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``.
 
-    None where ``mean(best) >= mean(worst)``, and where at least 5 % of the resamples leave almost nothing to reduce.
+    None if ``mean(best) >= mean(worst)``, or if at least 5 % of the resamples leave almost nothing to reduce.
     """
     sides = [np.atleast_2d(each) for each in (values, worst, best)]
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)

@@ -23,7 +23,6 @@ class Swept(NamedTuple):
 
     @property
     def number(self) -> float:
-        """The number in the value, such as 15 in ``social:15``."""
         return float(self.text)
 
     @property
@@ -33,7 +32,7 @@ class Swept(NamedTuple):
 
     @property
     def axis(self) -> str:
-        """What varies, as the label of an axis: ``v2x.lost`` or ``objective = social:…``."""
+        """The label of an axis: ``v2x.lost`` or ``objective = social:…``."""
         return f"{self.key} = {self.word}…" if self.word else self.key
 
     @property
@@ -46,8 +45,8 @@ def parse_sweep(text: str) -> list[Swept]:
     """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
 
     A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. After ``KEY=``, single numbers
-    and ranges may stand together. Raises ``InvalidInput`` for a value that is not a number, for a range whose length
-    HIGH - LOW is not a multiple of its step, for a repeated number, and for fewer than 2 or more than ``MOST`` numbers.
+    and ranges may stand together. Raises ``InvalidInput`` for any other text, a range that its step does not divide, a
+    repeated number, and fewer than 2 or more than ``MOST`` numbers.
     """
     key, equals, values = (part.strip() for part in text.partition("="))
     match = WORD.match(values)

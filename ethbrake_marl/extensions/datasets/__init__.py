@@ -2,7 +2,7 @@
 
 An agent's command is a float64 number in m/s2, and a learner's action a float32 number in [-1, 1]. So each world is
 simulated twice: first the agent drives, and its commands are rounded to actions; then learners take these actions. The
-file contains the second episode. An environment that gets the recorded actions repeats this episode bit for bit.
+file contains the second episode, which an environment repeats bit for bit from the recorded actions.
 """
 
 from __future__ import annotations
@@ -41,20 +41,11 @@ def to_parquet(
 ) -> None:
     """Let agents drive, and write a Parquet file with one row for each agent, world and decision.
 
-    docs/extensions/datasets.md describes the columns and the metadata.
+    docs/extensions/datasets.md describes the columns and the metadata. Each of the ``agents`` drives all learners, in
+    the worlds 0 to ``episodes`` - 1 of ``seed``. ``reward``: a name such as ``harm``, or the weights of its terms.
 
-    Args:
-        path: file to write.
-        agents: as in ``eb.evaluate``. Each drives all learners of the scenario in its own episodes.
-        scenario: a ``Scenario``, or its name, path or content.
-        episodes: number of worlds in which each agent drives: the worlds 0 to ``episodes`` - 1 of ``seed``.
-        seed: seed from which the worlds are drawn.
-        reward: reward to record: a name such as ``harm``, or the weights of the reward's terms.
-        force: whether to replace an existing file.
-
-    Raises ``InvalidInput`` if an argument is invalid, ``AlreadyExists`` if the file exists and ``force`` is false, and
-    ``MissingExtra`` if pyarrow is not installed.
-
+    Raises ``InvalidInput`` for an invalid argument, ``AlreadyExists`` if the file exists and ``force`` is false, and
+    ``MissingExtra`` without pyarrow.
     """
     loaded, game = open_game(scenario, reward=reward)
     if not loaded.learners:

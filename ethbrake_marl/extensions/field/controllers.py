@@ -26,7 +26,7 @@ SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
 
 
 class Parameters:
-    """Parameters of one law, with the names in ``LAWS``, in SI units."""
+    """Parameters of one law, in SI units."""
 
     def __init__(self, **values: float) -> None:
         self.__dict__.update(values)
@@ -74,10 +74,7 @@ class Seen(NamedTuple):
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the command for the next time step, [n] m/s2, with a limited growth of the deceleration.
-
-        ``wanted_mps2`` [n] is the acceleration of the law; ``rate_mps3`` is the largest growth per second, m/s3.
-        """
+        """Return the command, [n] m/s2, with a limited growth of the deceleration. ``wanted_mps2`` [n] is the law's."""
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
@@ -134,7 +131,7 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
     """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n].
 
-    Each criterion is a number from 0 (no danger) to 1 (full danger). ``p`` are parameters of the law ``r157_fsm``.
+    0: no danger, 1: full danger. ``p`` are parameters of the law ``r157_fsm``.
     """
     speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
     ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
@@ -171,8 +168,6 @@ def _aeb(seen: Seen, p: Parameters) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """One controller from the literature: a formula for the acceleration, its parameters and its source."""
-
     about: str  # name of the controller
     source: str  # publication of the formula
     parameters: Mapping[str, float]  # default value of each parameter, in SI units
@@ -227,13 +222,6 @@ class Controller:
     Its memory is the time at which it noticed a danger, [n] s: infinite if it has noticed none, NaN before the first
     decision. The reaction time begins then; if there is a danger at the first decision, it begins at the alert, so it
     overlaps with the latency. It ends with the danger, and the next danger starts a new one, unless ``law.stays``.
-
-    Args:
-        name: name of the agent, such as ``idm:T=1.0``.
-        law: the law.
-        parameters: value of each parameter of the law.
-        step_s: time between two decisions (s).
-
     """
 
     knows = MESSAGES
@@ -243,7 +231,6 @@ class Controller:
         self.name, self.law, self.parameters, self.step_s = name, law, Parameters(**parameters), step_s
 
     def check(self, game: Game, body: int) -> None:
-        """Raise ``InvalidInput`` if decisions come at another time step."""
         step_s = game.rules.time_step_s
         if not math.isclose(step_s, self.step_s):
             raise InvalidInput(
@@ -252,11 +239,9 @@ class Controller:
             )
 
     def begin(self, alert: State, body: int) -> Floats:
-        """Return the memory before the first decision: an array [n] of NaN."""
         return np.full(alert.n, np.nan)
 
     def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
-        """Return the command, [n] m/s2, limited by the vehicle's capacities, and the new memory [n]."""
         seen, p = Seen.of(state, body, self.step_s), self.parameters
         command = self.law.command(seen, p)
         if self.law.notices is not None:
@@ -273,8 +258,8 @@ class Controller:
 def make_controller(argument: str | None, settings: Any) -> Controller:
     """Return the controller with the name ``settings.spec``, such as ``idm:T=1.0``.
 
-    ``argument`` are values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``; None: default values. Raises
-    ``UnknownName`` for a parameter that the law does not have, and ``InvalidInput`` for a bad value.
+    ``argument``: values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``; None: default values. Raises ``UnknownName``
+    for a parameter that the law does not have, and ``InvalidInput`` for a bad value.
     """
     law, where = LAWS[settings.spec.partition(":")[0]], f"agent {settings.spec!r}"
     parameters: dict[str, float] = {}

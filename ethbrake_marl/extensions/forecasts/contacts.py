@@ -82,7 +82,7 @@ CONTACT_FAR = tuple(feature for command, held in COMMANDS.items() for feature in
 def known_line(line, car, know, time, i, known, parameters, commands):
     """Copy a world as body i knows it, with what is assumed of the others; return the first and last known body.
 
-    Bodies that it does not know are at rest and out of reach.
+    Unknown bodies are at rest and out of reach.
     """
     first, last = i, i
     while first > 1 and time >= know[i, first - 1]:
@@ -159,7 +159,6 @@ def write_features(scratch, met, i, first, last, time_step_s, value):
 
 
 def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
-    """Return both groups, [n, observers, 42]."""
     check_exact(state, "a forecast of contacts")
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))

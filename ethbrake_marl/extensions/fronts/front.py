@@ -1,8 +1,8 @@
 """The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
 A point of the front is the mean harm of each vehicle over the worlds, for one choice of weights. The points approximate
-the convex part of the Pareto front; a search finds them, and there is no proof that no better ones exist. N is the
-number of vehicles, W that of choices of weights.
+the convex part of the Pareto front; a search finds them, and there is no proof that no better ones exist. N vehicles, W
+choices of weights.
 """
 
 from __future__ import annotations
@@ -88,18 +88,18 @@ def search_front(
     True
 
     Args:
-        scenario: of the worlds; its learners are controlled.
+        scenario: its learners are controlled.
         worlds: n worlds at the alert.
         weights: weights of the vehicles' harm, [W, N].
-        count: what is weighted: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        count: what is weighted (``episode.counts``).
         budget: number of profiles that are tried for each world and choice of weights.
         threads: of the search.
-        agents: names of agents for the one learner. For each choice of weights they drive every world, with these
-            weights as the scenario's ``harm_weight``, and the objective ``preference``.
+        agents: drive every world for each choice of weights, with these weights as the scenario's ``harm_weight``, and
+            the objective ``preference``; only with one learner.
         on_progress: called with the number of finished searches and of all, two for each world and choice.
 
-    Raises ``InvalidInput`` if ``agents`` are given but several vehicles learn, for weights that are no table of numbers
-    with a column for each vehicle, and for a row that cannot be a ``harm_weight``.
+    Raises ``InvalidInput`` for ``agents`` with several learners, and for weights that are no table of numbers with a
+    column for each vehicle, or cannot be a ``harm_weight``.
 
     """
     check_count("count", count)
@@ -165,7 +165,7 @@ def _tried(
 
 
 def observes_weights(team: Team) -> bool:
-    """Return whether what a team does may depend on the weights of harm: not for policies that do not observe them."""
+    """May a team's commands depend on the weights of harm? Not for policies that do not observe them."""
     policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
     seen = [() if policy is None else policy.observation.names for policy in policies]
     return team.shield is not None or any(not names or any("harm_weight" in name for name in names) for names in seen)
@@ -193,7 +193,6 @@ class Pool:
         self.borne: dict[str, list[Floats]] = {each: [] for each in COUNTS}
 
     def add(self, profiles: Profiles) -> Borne:
-        """Add one profile for each world; return each vehicle's harm, [n, N] m2/s2 by count."""
         self.profiles.append(profiles)
         last = self.problem.follow(profiles)
         for count, each in self.borne.items():
@@ -208,7 +207,6 @@ class Pool:
         return np.asarray(np.where(amounts == least, borne.sum(axis=2), np.inf).argmin(axis=0))
 
     def best(self, weights: Floats) -> Profiles:
-        """Return each world's best profile, [n]."""
         chosen, rows = self.choice(weights), np.arange(self.problem.n)
         used = np.unique(chosen)
         ends, commands = zip(*Profiles.padded([self.profiles[k] for k in used]), strict=True)

@@ -10,17 +10,15 @@ MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of 
 
 
 def hypervolume(points: Floats, reference: Floats) -> float:
-    """Return the volume of the region that ``points`` [Q, N] dominate, up to the point ``reference`` [N].
+    """Return the exact volume of the region that ``points`` [Q, N] dominate, up to the point ``reference`` [N].
 
-    Smaller coordinates are better. A point of which a coordinate is not below the same coordinate of the reference
-    point is ignored. The volume is exact; the function cuts the region into slices along the last coordinate (Zitzler
-    1999, "hypervolume by slicing objectives").
+    Smaller coordinates are better. A point is ignored unless all its coordinates are below the reference point's. The
+    region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
 
     >>> import numpy as np
     >>> from ethbrake_marl.extensions.fronts.hypervolume import hypervolume
     >>> hypervolume(np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([3.0, 3.0]))
     3.0
-
     """
     points = points[(points < reference).all(axis=1)]
     if not len(points):

@@ -35,14 +35,7 @@ def front_results(
 
     All means have 95 % intervals over worlds or, if these come from recordings, over recordings. For each choice of
     weights, ``ratio`` is the mean weighted harm divided by the front's (null if that is 0), ``above`` their difference.
-
-    Args:
-        front: of these worlds.
-        scenario: of the worlds.
-        drawn: the worlds.
-        beside: results beside the front: name -> count -> harm of each vehicle, [n, N] m2/s2; ``full_brake`` is one.
-        seed: of the worlds, if known.
-
+    ``beside``: results beside the front, name -> count -> harm of each vehicle, [n, N] m2/s2; ``full_brake`` is one.
     """
     by = clusters_of(columns_of(drawn))
     return {
@@ -109,7 +102,6 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
 
 
 def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
-    """Return the harm of each vehicle if the learners brake fully from the alert on, [n, N] m2/s2 by count."""
     game = open_game(scenario)[1]
     last = drive(game, drawn.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
     return {count: last.borne_harm(count) for count in COUNTS}
@@ -118,8 +110,8 @@ def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
 def front_sheet(results: Json) -> Sheet:
     """Return a table with one row for each choice of weights, and for each result beside the front.
 
-    A row has the mean of what is weighted for each vehicle, and the mean of every count for the line; that of a choice
-    of weights also the ``ratio`` of each agent.
+    A row has the mean of what is weighted for each vehicle, the mean of every count for the line and, for a choice of
+    weights, the ``ratio`` of each agent.
     """
     count, agents = results["harm_count"], results["agents"]
 
@@ -149,7 +141,6 @@ def front_sheet(results: Json) -> Sheet:
 
 
 def hypervolume_sheet(results: Json) -> Sheet:
-    """Return a table of the hypervolumes."""
     share = Column("Share of the front", digits=1, scale=100.0, unit=" %")
     rows = [
         (each["reference"], name, *volume.values())

@@ -19,8 +19,8 @@ SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides be
 def weight_grid(vehicles: int, steps: int) -> Floats:
     """Return W evenly spaced choices of weights, [W, N]. In each choice the weights of the N vehicles sum to 1.
 
-    From each row to the next, the weight of one vehicle rises by 1 / ``steps``, and the weight of another vehicle falls
-    by 1 / ``steps``. Raises ``InvalidInput`` if there would be more than ``MOST`` choices.
+    From each row to the next, one weight rises by 1 / ``steps``, and another falls by 1 / ``steps``. Raises
+    ``InvalidInput`` for more than ``MOST`` choices.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
@@ -47,10 +47,9 @@ def _divisions(vehicles: int, steps: int) -> list[list[int]]:
 
 
 def corners(vehicles: int) -> Floats:
-    """Return one choice of weights for each of the N vehicles, [N, N], with almost all weight on this vehicle.
+    """Return a choice of weights for each vehicle, [N, N]: 1 for this vehicle, ``SLIGHT`` for the others.
 
-    In row i, vehicle i has the weight 1, and the others ``SLIGHT``. Their harm decides only between commands under
-    which vehicle i has almost the same harm.
+    The others' harm decides only between commands under which this vehicle has almost the same harm.
     """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 

@@ -20,10 +20,9 @@ from ethbrake_marl.training.training import Training
 
 
 class Vine(Algorithm):
-    """Vine: one actor drives all learners; or a mixture of experts drives the only one."""
+    """One actor drives all learners; or a mixture of experts drives the only one."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        """Return a new model, with the weights of the policy that the recipe's key ``start`` names."""
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
         model = self.new_model(training, environment)
@@ -37,23 +36,18 @@ class Vine(Algorithm):
         return model
 
     def new_model(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        """Return a new model with random weights."""
         recipe: Any = training.recipe
         return (VineModel if recipe.experts is None else MixtureModel)(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return the averaged weights."""
         one = {"policy.log_std": np.full(1, -3.0, np.float32)}  # which never counts, because vine does not explore
         return dict(actor.tensors("policy") | one if network.networks == 1 else actor.tensors(network))
 
 
 class RolloutClassification(Algorithm):
-    """Rollout classification: one network drives all learners."""
-
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """Return a new model. At first it acts like the first of the recipe's ``policies``, or brakes fully."""
+        """At first the model acts like the first of the recipe's ``policies``, or brakes fully."""
         return RolloutClassificationModel(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return the averaged weights, and the weights of the policies."""
         return dict(actor.all_tensors())

@@ -1,7 +1,7 @@
 """Branches: copies of running episodes that are played to their end with other actions.
 
-Branches of one state have the same random numbers, so they differ only in the actions. n: branches, or worlds; m: those
-that still run; L: learners, front to rear; F: features.
+Branches of one state have the same random numbers, so they differ only in the actions. n: branches, or worlds; m:
+branches that still run; L: learners, front to rear; F: features.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ Decide = Callable[[Moment], Floats]  # returns the learners' actions, [m, L]
 def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least: int = 0) -> tuple[Floats, State]:
     """Play episodes to the end; return each learner's discounted return, [n, L], and the last states.
 
-    ``decide`` is asked for those that still run. If harm is the only term of the reward, an episode also ends once
-    everything stands for good, but not in its first ``at_least`` steps.
+    If harm is the only term of the reward, an episode also ends once everything stands for good, but not in its first
+    ``at_least`` steps.
     """
     learners, only_harm = game.rules.learners, set(game.rewarding.counted) <= {"harm"}
     gained, over = np.zeros((state.n, len(learners))), state.ended
@@ -69,8 +69,8 @@ def stands_for_good(before: State, after: State, count: Floats) -> Bools:
     """Return where all vehicles stand, and a policy that only looks at its observation never moves one again, [n].
 
     There nothing has changed in this step, and nobody waits for a latency or for news. ``count`` are the weights of
-    what counts (``episode.counts``): a vehicle that presses against a standing one can still push. It is never sure
-    with scripts or messages that have a memory.
+    what counts (``episode.counts``): a vehicle that presses against a standing one can still push. Always False if
+    scripts, messages or a shield have a memory.
     """
     out = np.zeros(after.n, np.bool_)
     if not after.memories:
@@ -82,7 +82,6 @@ def stands_for_good(before: State, after: State, count: Floats) -> Bools:
 def find_standing(
     before: Floats, line: Floats, car: Floats, know: Floats, clock: Floats, count: Floats, out: Bools
 ) -> None:
-    """Set ``out`` [n] where worlds stand for good; ``before`` and ``clock`` are those of the step before."""
     bodies = line.shape[2]
     for k in range(len(out)):
         time = clock[k, TIME]

@@ -40,19 +40,17 @@ LIKELY_ACTIONS, THEIR_SHARES = np.array([-1.0, 1.0, 0.0]), np.array([0.35, 0.5, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """No template has a higher return than the earlier experts, so a further expert has nothing to learn."""
+    """No template has a higher return than the earlier experts, so a new expert has nothing to learn."""
 
 
 class Stage(NamedTuple):
-    """A range of updates, and what they train."""
-
     expert: int | None  # number of the expert that is trained; None: the gating network
     first: int  # number of its first update, from 0
     end: int  # number of the first update after it
 
 
 def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
-    """Return the stages of a training of so many updates. One with a small share may have none."""
+    """Return the stages of a training of so many updates; a small share may get none."""
     shares, others = plan.shares, plan.networks - 1
     parts: list[tuple[int | None, float]] = [(0, shares.pretraining_first)]
     parts += [(k + 1, shares.pretraining_others / others) for k in range(others)]
@@ -66,8 +64,6 @@ def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
 
 
 class Mixture(nn.Module):
-    """Experts, the gating network, and the decisions at which it has compared them."""
-
     def __init__(self, inputs: int, recipe: VineRecipe) -> None:
         super().__init__()
         plan, rate = recipe.experts, recipe.learning_rate.at(1.0)
@@ -86,11 +82,9 @@ class Mixture(nn.Module):
         return means
 
     def act(self, observations: Float32s) -> Float32s:
-        """Return the actions."""
         return np.clip(self.means(observations), -1.0, 1.0)
 
     def tensors(self, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return copies of all averaged weights, by their names in a policy file."""
         tensors = self.gate.tensors("gate")
         for name, actor in zip(network.actors, self.actors, strict=True):
             tensors |= actor.tensors(name)
@@ -113,12 +107,9 @@ class Shown(NamedTuple):
 
 
 class MixtureModel(VineModel):
-    """Trains a mixture of experts for one learner."""
-
     policy: Mixture  # type: ignore[assignment]
 
     def new_policy(self) -> nn.Module:
-        """Return experts and gating network."""
         assert self.recipe.experts is not None
         self.plan = self.recipe.experts
         self.stage: Stage | None = None
@@ -151,7 +142,6 @@ class MixtureModel(VineModel):
         return np.concatenate(seen), State.join(states)
 
     def improve(self, seen: Float32s, states: State) -> None:
-        """Train what this stage trains."""
         stage, policy = self.stage, self.policy
         assert stage is not None
         self._update_current_progress_remaining(self.number - stage.first, stage.end - stage.first)
@@ -164,9 +154,9 @@ class MixtureModel(VineModel):
     def enter(self, stage: Stage) -> None:
         """Prepare a stage that begins, or is resumed.
 
-        A second or later expert first imitates templates; then the worlds of its training are selected. All this
-        depends on the earlier experts only, so a resumed training repeats it exactly. Raises ``NoBetterTemplate`` if
-        there is no better template, or no world to select.
+        A second or later expert first imitates templates; then the worlds of its training are selected. This depends
+        only on the earlier experts, so a resumed training repeats it exactly. Raises ``NoBetterTemplate`` if there is
+        no better template, or no world to select.
         """
         self.stage, self.own = stage, None
         if not stage.expert:
@@ -186,7 +176,6 @@ class MixtureModel(VineModel):
             self.policy.actors[stage.expert].load_state_dict(pupil.state_dict())
 
     def explore(self, acts: list[Act]) -> Explored:
-        """Let the earlier experts drive the first worlds of the training."""
         worlds = self.rows.scenario.sample(self.plan.worlds, self.recipe.seed, channel="training")
         start = self.game.reset(worlds)
         gained, harm = np.full(start.n, -np.inf), np.full(start.n, np.inf)
@@ -196,15 +185,16 @@ class MixtureModel(VineModel):
         return Explored(start, gained, harm)
 
     def drive_from(self, state: State, act: Act, count: str) -> tuple[Floats, Floats]:
-        """Let one policy drive to the end; return its return, and the harm that the learner should make small, [n]."""
+        """Let one policy drive to the end; return its return and its harm, [n]."""
         gained, last = play_on(self.game, state, lambda now: now.ask(act), self.recipe.gamma)
         return gained[:, 0], self.harm(last, count)[:, 0]
 
     def best_templates(self, explored: Explored) -> tuple[Ints, Floats]:
-        """Draw templates in each world; return the worlds in which one does less harm than all experts, and it, [m, T].
+        """Draw templates in each world; return the worlds in which the best one does less harm than all experts, and
+        the actions of these, [m, T].
 
-        A random template with little harm tolerates small errors of its actions, so a policy can imitate it. Therefore
-        no search improves it.
+        No search improves a template: a random one with little harm tolerates small errors of its actions, so a policy
+        can imitate it.
         """
         count, start = self.recipe.reward.harm_count, explored.start
         generator = np.random.default_rng(self.recipe.seed)
@@ -234,7 +224,6 @@ class MixtureModel(VineModel):
         return Shown(np.concatenate(seen)[shown], np.concatenate(wanted).astype(np.float32)[shown])
 
     def imitate(self, pupil: Actor, shown: Shown, seed: int) -> None:
-        """Train an expert to act as shown, in a random order of its own."""
         pupil.new_optimizer(self.lr_schedule(1.0))
         seen, wanted = torch.from_numpy(shown.seen), torch.from_numpy(shown.action)
         generator = torch.Generator().manual_seed(seed)
@@ -248,7 +237,7 @@ class MixtureModel(VineModel):
     def worlds_of(self, act: Act, explored: Explored) -> State:
         """Return the worlds in which a new expert is to be trained: it is better there, or not much worse.
 
-        Left out are worlds in which it is as good as the best earlier expert, or in which that one does no harm.
+        Left out are worlds in which it is as good as the best earlier expert, or that expert does no harm.
         """
         gained, _ = self.drive_from(explored.start, act, self.recipe.reward.harm_count)
         more = gained - explored.gained

@@ -66,7 +66,7 @@ class BranchingModel(BaseAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """Train until the learners have made ``total_timesteps`` decisions, with arguments of Stable-Baselines3."""
+        """Train until the learners have made ``total_timesteps`` decisions."""
         total, callback = self._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total:
@@ -83,7 +83,7 @@ class BranchingModel(BaseAlgorithm):
         return self.visit(callback, self.policy.act)
 
     def visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions; return observations [decisions L, F], and the states there."""
+        """Drive all worlds for ``n_steps`` decisions; return as ``collect``."""
         seen, states, every = [], [], np.arange(self.rows.n)
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
@@ -99,7 +99,6 @@ class BranchingModel(BaseAlgorithm):
         return np.concatenate(seen), State.join(states)
 
     def dump_logs(self) -> None:
-        """Write a row of the logs."""
         self.logger.dump(step=self.num_timesteps)
 
     def harm(self, state: State, count: str) -> Floats:

@@ -28,12 +28,10 @@ for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_
 
 
 def perceptron(inputs: int, outputs: int, hidden: Sequence[int], activation: Activation) -> nn.Sequential:
-    """Return a new network."""
     return nn.Sequential(*create_mlp(inputs, outputs, list(hidden), ACTIVATIONS[activation]))
 
 
 def silent(network: nn.Sequential) -> nn.Sequential:
-    """Let all outputs of a new network be 0, and return it."""
     last = linear_layers(network)[-1]
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
@@ -41,7 +39,6 @@ def silent(network: nn.Sequential) -> nn.Sequential:
 
 
 def linear_layers(network: nn.Sequential) -> list[nn.Linear]:
-    """Return the layers that have weights."""
     return [layer for layer in network if isinstance(layer, nn.Linear)]
 
 
@@ -62,7 +59,7 @@ class Averaged(nn.Module):
         self.optimizer = Adam(weights, lr=begin, eps=1e-5, capturable=on_gpu)
 
     def descend(self, loss: Tensor, keep: float) -> Tensor:
-        """Make one step of the optimiser on a loss, let the average follow, and return the loss."""
+        """Make one step of the optimiser, let the average follow, and return the loss."""
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
@@ -77,7 +74,7 @@ class Averaged(nn.Module):
 
     @torch.no_grad()
     def best(self, observations: Float32s) -> Ints:
-        """Return the output of ``average`` with the highest score for each of the observations [rows, F], [rows]."""
+        """Return the output of ``average`` with the highest score, [rows], for observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observations)).argmax(dim=1).numpy()
         return chosen
 
@@ -89,7 +86,6 @@ class Averaged(nn.Module):
         return {f"{place}.{part}": getattr(layer, part).detach() for place, layer in layers for part in PARTS}
 
     def tensors(self, name: str) -> dict[str, Float32s]:
-        """Return copies of ``weights``."""
         return {place: weight.cpu().numpy().copy() for place, weight in self.weights(name).items()}
 
 
@@ -114,7 +110,6 @@ class Memory(nn.Module):
         self.known += m
 
     def __len__(self) -> int:
-        """Return the number of decisions that can be recalled."""
         return min(int(self.known), self.size)
 
 

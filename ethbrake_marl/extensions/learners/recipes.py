@@ -157,12 +157,10 @@ class VineRecipe(BranchingRecipe):
     )
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the actor, or the experts and the gating network."""
         spec, plan = super().network_spec(observation_size), self.experts
         return spec if plan is None else spec.model_copy(update={"networks": plan.networks, "gate_hidden": plan.gating})
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` for a mixture of experts with several learners."""
         if self.experts is not None and learners != 1:
             raise InvalidInput(
                 f"recipe {self.name!r}: experts: a mixture of experts can drive only one learner, but the scenario has"
@@ -250,7 +248,7 @@ class RolloutClassificationRecipe(BranchingRecipe):
 
     @cached_property
     def members(self) -> tuple[Member, ...]:
-        """The policies that the key ``policies`` names, and those among which one of them chooses.
+        """The policies that the key ``policies`` names; one that chooses among others stands for these.
 
         Raises ``InvalidInput`` if one cannot be used, or if more choices are drawn than there are policies.
         """
@@ -264,7 +262,6 @@ class RolloutClassificationRecipe(BranchingRecipe):
         return members
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the network, and those of the policies that it can choose."""
         own = {"observation_size": observation_size, "value_hidden": ()}
         among = tuple(each.network.model_copy(update=own) for each in self.members)
         return (

@@ -36,7 +36,6 @@ class TorchActor(Actor):
 
     @torch.no_grad()
     def forward(self, layers: Layers, x: Float32s) -> Float32s:
-        """Return the outputs [outputs, rows] of a network."""
         activation = torch.relu if self.spec.activation == "relu" else torch.tanh
         y: Tensor = torch.from_numpy(x)
         for number, (weight, bias) in enumerate(layers, 1):
@@ -49,8 +48,8 @@ class TorchActor(Actor):
 class Chooser(Averaged):
     """Takes the choice with the highest score: first come trained policies, then actions from -1 to 1.
 
-    ``first`` is the number of the first action, full braking. The *extra cost* of a choice is its cost minus that of
-    the cheapest choice tried at the same decision.
+    ``first`` is the number of the first action, full braking. The *extra cost* of a choice is its cost minus the cost
+    of the cheapest choice tried at the same decision.
     """
 
     memory: Memory  # seen [F]; tried [C]: numbers of choices, the chooser's own one first; more [C]: their extra costs
@@ -70,7 +69,6 @@ class Chooser(Averaged):
         self.register_buffer("usual", torch.zeros(scenarios, dtype=torch.float64))
 
     def take(self, choices: Ints, observations: Float32s) -> Float32s:
-        """Return the actions of given choices, [rows]."""
         actions: Float32s = self.actor.chosen(choices, observations.T)[0]
         return actions
 
@@ -98,8 +96,8 @@ class Chooser(Averaged):
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
         """Return the loss at remembered decisions: expected extra cost of a choice, plus ``guide`` times a convex term.
 
-        A choice has the probability softmax of the scores. Where one is close to 0 or 1 the gradient of the expected
-        cost nearly vanishes, that of the convex term does not: it lowers the score of every tried choice but the
+        A choice has the probability softmax of the scores. Where one is close to 0 or 1, the gradient of the expected
+        cost nearly vanishes, but the convex term's does not: it lowers the score of every tried choice but the
         cheapest, in proportion to its extra cost.
         """
         seen, tried, more = (self.memory.get_buffer(name)[some] for name in ("seen", "tried", "more"))
@@ -110,13 +108,10 @@ class Chooser(Averaged):
         return loss
 
     def all_tensors(self) -> dict[str, Float32s]:
-        """Return copies of the averaged weights, and the weights of the policies, by their names in a policy file."""
         return self.tensors("policy") | self.fixed
 
 
 class RolloutClassificationModel(BranchingModel):
-    """One network drives all learners, and learns from the costs of tried choices."""
-
     policy: Chooser
     recipe: RolloutClassificationRecipe
 
@@ -126,14 +121,12 @@ class RolloutClassificationModel(BranchingModel):
 
     @property
     def scenario(self) -> Scenario:
-        """In which it is trained."""
         return self.rows.scenario
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
     def improve(self, seen: Float32s, states: State) -> None:
-        """Try choices, remember those decisions at which they differ in cost, and learn from the memory."""
         recipe, chooser = self.recipe, self.policy
         self._update_learning_rate(chooser.optimizer)
         rows, tried, costs = self.try_choices(seen, states)
@@ -152,7 +145,7 @@ class RolloutClassificationModel(BranchingModel):
         self.logger.record("train/loss", float(np.mean(losses)))
 
     def choices_at(self, seen: Float32s) -> Ints:
-        """Return which choices to try at decisions with the observations ``seen`` [B, F], [B, C]; its own one first."""
+        """Return the choices to try at decisions with the observations ``seen`` [B, F], [B, C]; its own one first."""
         recipe, chooser = self.recipe, self.policy
         first, last, count = chooser.first, recipe.network.choices - 1, len(seen)
         own = chooser.best(seen)
@@ -212,9 +205,9 @@ class RolloutClassificationModel(BranchingModel):
         return rows, tried, costs
 
     def usual_costs(self, numbers: Ints, least: Floats) -> Floats:
-        """Update the running mean of the least cost in each scenario of a mixture; return that of each decision, [B].
+        """Update the running mean of the least cost in each scenario of a mixture; return it for each decision, [B].
 
-        ``numbers`` [B] are those of the worlds of the decisions, ``least`` [B] the costs of the cheapest choices.
+        ``numbers`` [B]: worlds of the decisions. ``least`` [B]: costs of the cheapest choices.
         """
         known, back = np.unique(numbers, return_inverse=True)
         member = member_numbers(self.scenario, known, self.recipe.seed, "training")[back]

@@ -1,4 +1,4 @@
-"""Trained policies in a new training: to start from, or to choose among. It may observe more features than they do."""
+"""Trained policies in a new training, which may observe more features: to start from, or to choose among."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from ethbrake_marl.policies.policy import Policy
 
 
 class Member(NamedTuple):
-    """The actor of a trained policy."""
-
     network: NetworkSpec
     tensors: dict[str, Float32s]
     features: tuple[str, ...]  # that it observes
@@ -44,8 +42,8 @@ def members_of(policy: Policy) -> list[Member]:
 def named_policy(name: str, recipe: str, key: str) -> Policy:
     """Return the policy that a name for ``--agents`` stands for: ``ppo``, ``policy@runs/mine``.
 
-    ``key`` of the recipe with the name ``recipe`` names the policy, for messages. Raises the errors of ``make_agent``,
-    and ``InvalidInput`` for an agent that is no policy.
+    ``recipe`` and its ``key`` are for messages. Raises the errors of ``make_agent``, and ``InvalidInput`` for an agent
+    that is no policy.
     """
     driver = make_agent(name)
     if not isinstance(driver, LearnedAgent):
@@ -54,7 +52,7 @@ def named_policy(name: str, recipe: str, key: str) -> Policy:
 
 
 def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
-    """Return the weights of ``policy`` for a training by the networks ``wanted``, which observes ``features``.
+    """Return the weights of ``policy`` for the networks ``wanted``, which observe ``features``.
 
     Raises ``InvalidInput`` for a mixture of experts, for other layers, and for a feature that is not observed.
     """

@@ -43,7 +43,6 @@ class Actor(Averaged):
         return means
 
     def act(self, observations: Float32s) -> Float32s:
-        """Return the actions, [rows]."""
         return np.clip(self.means(observations), -1.0, 1.0)
 
 
@@ -56,7 +55,6 @@ class Branches(NamedTuple):
     steps: Ints  # [2B] for how many steps
 
     def decisions(self, learners: int) -> Ints:
-        """Return the numbers of the decisions, [B]."""
         return (self.world * learners + self.learner)[: len(self.world) // 2]
 
 
@@ -69,20 +67,16 @@ class Tried(NamedTuple):
 
 
 class VineModel(BranchingModel):
-    """One actor drives all learners, and learns from measured gradients."""
-
     policy: Actor
     recipe: VineRecipe
 
     def new_policy(self) -> nn.Module:
-        """Return the actor."""
         return Actor(len(self.features), self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
     def improve(self, seen: Any, states: Any) -> None:
-        """Measure gradients, and follow them."""
         self.train_actor(self.policy, self.try_out(seen, states, self.policy))
 
     def try_out(self, seen: Float32s, states: State, policy: Actor) -> Tried:
@@ -94,7 +88,6 @@ class VineModel(BranchingModel):
         return Tried(torch.from_numpy(own), torch.from_numpy(policy.means(own)), gradient)
 
     def draw_branches(self, decisions: Ints) -> Branches:
-        """Draw at which of the ``decisions`` actions are moved, by how much, and for how long."""
         rows, offset = drawn(decisions, self.recipe.tried), self.recipe.offset
         ratio = offset.largest / offset.smallest
         sizes: Floats = offset.smallest * ratio ** torch.rand(len(rows), dtype=torch.float64).numpy()
@@ -104,7 +97,7 @@ class VineModel(BranchingModel):
     def play(self, states: State, branches: Branches, policy: Actor) -> tuple[Floats, Floats]:
         """Play branches to the end; return what their learners gained, and by how much their actions were moved, [2B].
 
-        An action stays in [-1, 1], so it may move by less than was asked for. The steps are summed.
+        An action stays in [-1, 1], so it may move by less than ``size``. The steps are summed.
         """
         world, learner, size, steps = branches
         moved, longest = np.zeros(len(size)), int(steps.max(initial=0))
@@ -123,7 +116,7 @@ class VineModel(BranchingModel):
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
-        """Return the gradient at each decision, [B] float32, of the returns and moves of two branches each, [2B]."""
+        """Return the gradient at each decision, [B] float32, from the returns and moves of two branches each, [2B]."""
         (up, down), (higher, lower) = gained.chunk(2), moved.chunk(2)
         measured = (up - down) / (higher - lower)
         gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)
@@ -132,7 +125,6 @@ class VineModel(BranchingModel):
         return gradient.float()
 
     def train_actor(self, actor: Actor, tried: Tried) -> None:
-        """Move an actor's outputs towards their targets."""
         recipe = self.recipe
         self._update_learning_rate(actor.optimizer)
         lesson, losses = (tried.seen, *trusted_targets(tried, recipe.trust_radius, recipe.anchor)), []
@@ -145,7 +137,6 @@ class VineModel(BranchingModel):
         self.logger.record("train/tried", len(tried.seen))
 
     def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        """Make one step of the optimiser with some decisions; return the loss."""
         loss = (weight * (actor.learning(seen)[:, 0] - target) ** 2).mean()
         return actor.descend(loss, self.recipe.averaging)
 

@@ -91,7 +91,7 @@ def believed(state: State, observer: int) -> State:
 
 
 def believed_whole(state: State, observer: int) -> State:
-    """Return what the body ``observer`` believes of bodies that it can predict. To it, the others are not known.
+    """Return what the body ``observer`` believes of bodies that it can predict, as if it did not know the others.
 
     It can predict a body of which it knows all pieces but the intent.
     """
@@ -129,7 +129,7 @@ def require_pieces(
 ) -> None:
     """Raise ``InvalidInput`` if messages lack a piece that ``who``, who drives ``observers``, needs of ``senders``.
 
-    None: of all vehicles. One that drives several vehicles needs messages of them, too.
+    ``senders`` None: all vehicles. Who drives several vehicles needs messages of them, too.
     """
     senders = range(1, state.vehicles + 1) if senders is None else senders
     for sender in senders if NAME in state.memories else ():

@@ -52,7 +52,6 @@ class Messages:
     }
 
     def read(self, key: str, value: Any) -> Any:
-        """Return the value of a key; lists of pieces in the order of ``PIECES``."""
         if key == "persistence":
             require(value in ("first", "periodic"), (key,), value, "must be first or periodic")
             return value
@@ -81,7 +80,7 @@ class Messages:
         return ("message_period_s", "loss_begins", "loss_ends") if _is_periodic(v2x) else ()
 
     def is_random(self, v2x: V2X) -> bool:
-        """Return whether messages after the first may be lost."""
+        """May messages after the first be lost?"""
         return _is_periodic(v2x) and v2x.loss_begins > 0.0
 
     def check(self, scenario: Scenario) -> None:
@@ -98,7 +97,6 @@ class Messages:
         require(kept <= MOST_SAMPLES, ("v2x",), v2x, right)
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Memory:
-        """Return the memory of n worlds at the alert."""
         N, v2x = scenario.vehicles, scenario.v2x
         heard, seen = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
         channel: Floats = np.zeros((n, CHANNEL_COLUMNS))
@@ -109,7 +107,6 @@ class Messages:
         return silent(_contents(scenario), heard, seen, channel, _kept(scenario))
 
     def game(self, game: Game) -> Game:
-        """Return the game with messages."""
         return GameWithMessages.of(game)
 
 

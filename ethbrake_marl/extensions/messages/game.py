@@ -52,24 +52,21 @@ class GameWithMessages(Game):
 
     @classmethod
     def of(cls, game: Game) -> GameWithMessages:
-        """Return the game with vehicles and scripts that believe what messages and sensors tell them."""
         views = tuple(believed_view(view) for view in game.views)
         return cls(*game._replace(views=views, scripts={i: Believer(script) for i, script in game.scripts.items()}))
 
     def first_decision(self, alert: State) -> State:
-        """Return the episodes at their first decision, with what has been received by then."""
         state = super().first_decision(alert)
         if not state.memories[NAME].is_periodic:
             return state
         return _remembering(state, begin(alert, state.time_s, self.rules.time_step_s))
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """Return the state after one step, and what the step did. The memory of ``state`` is not reused."""
+        """The memory of ``state`` is not reused."""
         after, step = super().follow(state, actions)
         return believed_after(state, after), step
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
-        """Return agents that act on what their vehicles believe, except those that know the true state."""
         return {body: believing(agent) for body, agent in drivers.items()}
 
     def hides(self, alert: State, body: int) -> Bools:
@@ -96,7 +93,6 @@ class GameWithMessages(Game):
 
 
 def believed_after(before: State, after: State) -> State:
-    """Return the state after a step with the memory of what arrived in it."""
     return _remembering(after, after_step(before, after)) if before.memories[NAME].is_periodic else after
 
 
@@ -114,7 +110,6 @@ def believing(agent: Any) -> Any:
 
 @cache
 def believed_view(view: View) -> BelievedView:
-    """Return the view of what the observer believes."""
     return BelievedView(view)
 
 
@@ -141,7 +136,6 @@ class BelievedView(View):
         ]
 
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
-        """Return the observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
         seen = np.empty((state.n, len(observers), len(self.names)), np.float32)
         for o, body in enumerate(observers.tolist()):
             known = known_pieces(state, body)
@@ -154,11 +148,10 @@ class BelievedView(View):
 
 
 class PieceView(View):
-    """A view in which a neighbour's feature that is NaN, for lack of a piece, has the value of an unknown neighbour."""
+    """A view that replaces NaN, for lack of a piece, by a feature's value for an unknown neighbour."""
 
     @cached_property
     def plan(self) -> Plan:
-        """How this view is computed."""
         plan = View(self.names).plan
         return plan._replace(own=tuple((column, _or_unknown(own), offset) for column, own, offset in plan.own))
 
@@ -177,18 +170,15 @@ def _is_partly_known(state: State, other: int) -> Bools:
 
 
 class Believer:
-    """A script that acts on what its vehicle believes."""
-
     def __init__(self, script: Script) -> None:
         self.script = script
 
     @property
     def name(self) -> str:
-        """Name of the script."""
         return str(getattr(self.script, "name", type(self.script).__name__))
 
     def begin(self, alert: State, body: int) -> Any:
-        """Return the script's memory for new episodes. Raises ``InvalidInput`` if it will not know what it needs.
+        """Begin the script. Raises ``InvalidInput`` if it will not know what it needs.
 
         A script may have ``needs_ahead``: pieces of a message that it needs of the vehicle ahead, until it sees it.
         """
@@ -198,7 +188,7 @@ class Believer:
         return self.script.begin(believed(alert, body), body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Return the commands [n] m/s2 and the new memory. Raises ``InvalidInput`` for a script that needs more."""
+        """Let the script act. Raises ``InvalidInput`` for a script that needs more than its vehicle knows."""
         commands, memory = self.script.act(believed(state, body), memory, body)
         if not np.isfinite(commands).all():
             require_pieces(state, [body], f"script of vehicle_{body}", PIECES[:-1])

@@ -78,7 +78,7 @@ class Memory(NamedTuple):
 
     @property
     def is_periodic(self) -> bool:
-        """Whether what is known may be old."""
+        """What is known may be old."""
         return self.samples.shape[1] > 0
 
 
@@ -136,7 +136,6 @@ def begin(alert: State, start_s: Floats, time_step_s: float) -> Memory:
 
 
 def after_step(before: State, after: State) -> Memory:
-    """Return the memory after a step."""
     memory = _own(before.memories[NAME])
     _, way = _advanced(before._replace(wanted=after.wanted), after.time_s)
     _sample(memory, after, way, after.time_s > before.time_s)
@@ -176,7 +175,6 @@ def newest(state: State, observer: int) -> Floats:
 
 
 def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats:
-    """Return the lines as the observer estimates them from what it knows (``estimate_worlds``)."""
     line, bodies, aged = state.line.copy(), known.shape[1], state.memories[NAME].is_periodic
     working = np.empty(bodies), np.empty(bodies, np.bool_)
     estimate_worlds(observer, state.time_s.copy(), state.car[:, LIMIT].copy(), known, news, aged, line, *working)
@@ -246,8 +244,8 @@ def estimate_worlds(observer, time, limit, known, news, aged, line, place, fresh
 
     From the newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], it goes on with the same force and without
     contact. Between two samples of now the gap is the true one. A place that is not ``known`` [n, N + 1, PIECES] is
-    that of the next body towards the observer, a speed or force 0. If news may be old (``aged``), the observer knows
-    of no impact between others.
+    the place of the next body towards the observer; an unknown speed or force is 0. If news may be old (``aged``), the
+    observer knows of no impact between others.
     """
     bodies = line.shape[2]
     for k in range(len(time)):

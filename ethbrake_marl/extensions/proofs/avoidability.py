@@ -4,7 +4,7 @@ The *largest trajectory* is farther ahead at every time than any other that stay
 the rear vehicle can be avoided if and only if the rear vehicle stays behind the largest trajectory.
 
 docs/internals/proofs/avoidable-contact.md derives every formula. They use only + - * / and sqrt, so they give the same
-bits on every machine. Gaps are in m, speeds in m/s, capacities in m/s2; ``line`` explains ``at``.
+bits on every machine.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Avoidability(NamedTuple):
 
     @property
     def avoidable(self) -> Bools:
-        """Whether some commands avoid all contact, and therefore every impact, [n]."""
+        """Some commands avoid all contact, and therefore every impact, [n]."""
         return np.asarray(self.reason == AVOIDABLE)
 
     @property
@@ -93,11 +93,11 @@ def spare_gap(gap, v_l, a_l, v_f, a_f):
 
 @kernel
 def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
-    """Return how long a vehicle can drive with ``u`` (m/s2) before it must brake fully to stay behind the leader (s).
+    """Return how long (s) a vehicle can drive with ``u`` before it must brake fully to stay behind the braking leader.
 
     Also the time at which the gap becomes 0 (s), and whether both still move then: if so, ``a_f > a_l`` and both are
     equally fast; otherwise the follower comes to rest behind the standing leader. Both times are infinite if the
-    follower never moves. The leader brakes from now on. Requires ``spare_gap >= 0``.
+    follower never moves. Requires ``spare_gap >= 0``.
     """
     w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
     if relief > 0.0 and v_l > 0.0:
@@ -121,7 +121,7 @@ def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
 
 @large
 def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
-    """Return the results of ``drive_before_braking`` for a follower with the speed limit ``limit`` (m/s)."""
+    """``drive_before_braking`` of a follower with the speed limit ``limit`` (m/s)."""
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         drive, touch, moving = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
@@ -150,13 +150,13 @@ def lowest_while_coasting(at):
 
 @kernel
 def met(gap, closing):
-    """Return whether a pair with this gap (m) and closing speed (m/s) has or had an impact."""
+    """Has or had a pair with this gap (m) and closing speed (m/s) an impact?"""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > TOUCH_MPS)
 
 
 @kernel
 def plan_behind(at, ahead, v_l, out):
-    """Return the plan of the largest trajectory from the start, and write the columns DRIVE, TOUCH and FOLLOW.
+    """Return the plan of the largest trajectory, and write the columns DRIVE, TOUCH and FOLLOW.
 
     The vehicle drives as hard as it can, then brakes fully, then follows the front vehicle, which is ``ahead`` (m) at
     the start and has the speed ``v_l`` (m/s).
@@ -170,7 +170,7 @@ def plan_behind(at, ahead, v_l, out):
 
 @large
 def decide(at, out):
-    """Decide whether contact is avoidable in one world, and write the verdict to ``out`` [VERDICT].
+    """Write the verdict on one world to ``out`` [VERDICT].
 
     Its columns: REASON; MARGIN (m); SPARE, what full braking leaves of the gap ahead (m); DRIVE and TOUCH, end of the
     drive and of the full braking after it (s after the *start*, from which the vehicle may act); FOLLOW, the command
@@ -212,7 +212,7 @@ def decide(at, out):
 
 @large
 def decide_worlds(rows, out):
-    """Decide every world: ``rows`` [n, COLUMNS] -> ``out`` [n, VERDICT]."""
+    """``rows`` [n, COLUMNS] -> ``out`` [n, VERDICT]."""
     for k in range(len(out)):
         decide(rows[k], out[k])
 
@@ -240,9 +240,7 @@ def avoidability(state: State, body: int = 2) -> Avoidability:
 
 
 def _check_covered(state: State, body: int) -> None:
-    """Raise ``InvalidInput`` for a physics and worlds that the theorem does not cover.
-
-    An obstacle that Vehicle 1 does not reach under full braking has no effect: only a push could bring it there, and a
+    """An obstacle that Vehicle 1 does not reach under full braking is allowed: only a push could bring it there, and a
     push begins with an impact.
     """
     check_exact(state, "a proof")

@@ -3,7 +3,8 @@
 A first contact has a time and a closing speed. Its harm is its squared closing speed plus the harm that must follow
 (``followers.after``). A *cell* is a set of first contacts: a range of times and a range of closing speeds. The search
 halves the cell with the smallest bound until this bound is close to the smallest harm that it has reached.
-docs/internals/proofs/lower-bound.md has the proof; ``proofs/__init__.py`` explains the arguments.
+
+Proof: docs/internals/proofs/lower-bound.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def gentlest_between(kind, at, early, late):
 def decision_around(at, early, late):
     """Return start and end (s) of the decision step that contains both ``early`` and ``late``.
 
-    Both are ``late`` if there are no decision steps, or if the two lie in different ones.
+    Twice ``late`` if there are no decision steps, or if the two lie in different ones.
     """
     step = at[TIME_STEP]
     if step <= 0.0:
@@ -78,7 +79,7 @@ def lacking(kind, at, early, late, softest, hard, begin):
 
 @large
 def harm_of(kind, at, early, late, soft, hard, floor):
-    """Return a lower bound (m2/s2) on the harm of the first contacts in a range of times and closing speeds."""
+    """Return a lower bound (m2/s2) on the harm of the first contacts in a cell."""
     begin, end = decision_around(at, early, late)
     lack = 0.0
     if end > late:
@@ -98,7 +99,7 @@ def put(kind, at, floor, cells, count, least, early, late, soft, hard):
 
 @kernel
 def lowest(cells, count):
-    """Return the row of the cell with the smallest bound, which is infinite without cells."""
+    """Return the row of the cell with the smallest bound, and this bound; without cells it is infinite."""
     row = 0
     for k in range(1, count):
         if cells[k, HARM] < cells[row, HARM]:
@@ -110,8 +111,8 @@ def lowest(cells, count):
 def divide(kind, at, floor, count, row, cells):
     """Split the cell in ``row`` into two halves.
 
-    Returns the new number of cells, and the bound (m2/s2) for one single first contact in the cell, which the smallest
-    bound of all first contacts does not exceed.
+    Returns the new number of cells, and the bound (m2/s2) for one first contact in the cell; the smallest bound of all
+    first contacts is at most this.
     """
     cell = cells[row]
     harm, early, late, soft, hard = cell[HARM], cell[EARLY], cell[LATE], cell[SOFT], cell[HARD]

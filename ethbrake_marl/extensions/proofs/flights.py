@@ -1,7 +1,7 @@
 """An upper bound on the speed of a vehicle relative to the centre of mass of its pair after a first contact.
 
 The *pair* is the controlled vehicle and its *partner*, the neighbour of its first contact. A *flight* is a period in
-which the two are not in contact. docs/internals/proofs/lower-bound.md has the proofs.
+which the two are not in contact. Proofs: docs/internals/proofs/lower-bound.md.
 
 - ``pair``: ``(share, press, reach, bounce)``. ``share``: mass of the partner divided by the mass of the pair, 0 to 1.
   ``press``: acceleration of the two towards each other under the extreme command (m/s2). ``reach``: largest amount by
@@ -102,7 +102,7 @@ def largest_lead(pair, opening, lost, late, end, since, until):
 
     The bound is the maximum over three cases: the last flight before the contact with the neighbour outside the pair
     begins with the first impact, within the window, or after it. That contact comes between ``since`` and ``until``.
-    All times are in s after the first contact.
+    Times are in s after the first contact.
     """
     share, press, reach, bounce = pair
     if since < end:

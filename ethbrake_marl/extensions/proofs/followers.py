@@ -3,11 +3,12 @@
 The time and the closing speed of the first contact determine the state of all three vehicles. After it the extreme
 command (full drive or full braking) is best for the centre of mass of the two vehicles in contact. The controlled
 vehicle moves faster or slower than this centre only until it meets the first neighbour again; ``flights.largest_lead``
-bounds the difference. docs/internals/proofs/lower-bound.md has the proofs.
+bounds the difference.
 
 Each function computes one bound for all first contacts between the times ``early`` and ``late``, from the state at
-``early``. From ``late`` to ``end`` the command of the earlier decision still applies. ``proofs/__init__.py`` explains
-the arguments that functions share.
+``early``. From ``late`` to ``end`` the command of the earlier decision still applies.
+
+Proofs: docs/internals/proofs/lower-bound.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def value_of(line, time):
 
 @kernel
 def least_of_line(line, since, until):
-    """Return the smallest value of a piecewise linear function from ``since`` to ``until``."""
+    """Return the smallest value of a piecewise linear function (``value_of``) from ``since`` to ``until``."""
     first, second = min(max(line[2], since), until), min(max(line[4], since), until)
     return min(value_of(line, since), value_of(line, until), value_of(line, first), value_of(line, second))
 
@@ -64,7 +65,7 @@ def least_closing(line, pair, opening, lost, late, end, until):
     It is a difference v - d: v is the closing speed of the second neighbour relative to the centre of mass of the pair,
     which ``line`` describes as a function of time (``value_of``; a bend may be negative); d, from ``largest_lead``, is
     the largest difference between the controlled vehicle and this centre. ``until`` is the latest time of the contact.
-    All times are in s after the first contact.
+    Times are in s after the first contact.
     """
     best = least_of_line(line, 0.0, until) - largest_lead(pair, opening, lost, late, end, 0.0, until)
     for k in range(len(LEADS)):
@@ -79,8 +80,8 @@ def least_closing(line, pair, opening, lost, late, end, until):
 
 @kernel
 def rear_after(at, early):
-    """Return how the rear vehicle comes after a first contact in front at ``early``: how far it is behind the leader
-    (m), its speed (m/s), and its onset (s), counted from ``early``.
+    """Return how far (m) the rear vehicle is behind the leader at ``early``, its speed (m/s), and its onset (s) after
+    ``early``.
     """
     speed, way = follower(at, early)
     return max(at[GAP_L] + at[GAP_R] + leader(at, early)[1] - way, 0.0), speed, max(at[ONSET_R] - early, 0.0)
@@ -119,7 +120,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 def held_by_leader(at, early, late, closing):
     """Return the smallest closing speed (m/s) of the rear pair after a first contact with a leader that brakes harder.
 
-    The controlled vehicle stays near it. The result is 0 if nothing is proven.
+    The controlled vehicle stays near it. 0: none proven.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]

@@ -1,8 +1,8 @@
 """One world as the proofs see it: the controlled vehicle and its two neighbours, in one row of numbers.
 
-The columns of ``at`` count from the moment of the state: L is the front vehicle (leader), F the controlled vehicle
-(follower), R the rear vehicle; V is a speed (m/s), A a braking capacity and U a driving capacity (m/s2). A neighbour
-that is missing is infinitely far away.
+In the columns of ``at``, L is the front vehicle (leader), F the controlled vehicle (follower), R the rear vehicle; V is
+a speed (m/s), A a braking capacity and U a driving capacity (m/s2). Times count from the moment of the state. A missing
+neighbour is infinitely far away.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """``lower_bound``: a proven lower bound on the harm of every world, whatever the controlled vehicle does.
 
-docs/internals/proofs/lower-bound.md has the proof; ``proofs/__init__.py`` explains the arguments that functions share.
+Proof: docs/internals/proofs/lower-bound.md. Arguments: ``proofs/__init__.py``.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 
 
 class LowerBound(NamedTuple):
-    """Proven lower bounds on the harm of each world; every array is [n], in m2/s2."""
+    """Lower bounds on the harm of each world, [n] m2/s2."""
 
     harm: Floats  # no command does less
     early: Floats  # harm before the controlled vehicle may act
@@ -83,7 +83,7 @@ class LowerBound(NamedTuple):
 
     @property
     def impact_proven(self) -> Bools:
-        """Whether every command certainly leads to an impact, [n]; False: none is proven, it may be unavoidable."""
+        """Every command certainly leads to an impact, [n]. False: not proven; the impact may still be unavoidable."""
         return np.asarray(self.harm > 0.0)
 
 
@@ -98,7 +98,7 @@ def front_bound(at):
 
 @kernel
 def rear_bound(at):
-    """Return the same of the rear pair. Full drive attains both; the time is infinite if it avoids the contact."""
+    """The same for the rear pair. Full drive attains both; the time is infinite if it avoids the contact."""
     _, time, squared = before_rear(at, driving_first(at, math.inf), rest_of_rear(at))
     return squared, time
 
@@ -166,9 +166,9 @@ def outer_contact(at):
 def front_first(at, floor, best, enough, cells):
     """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all at once.
 
-    In a contact of all three vehicles, the closing speeds of the two pairs add up to W, that of the rear vehicle
-    relative to the front vehicle, and the front pair's is at least the smallest that is possible at this time. It is
-    covered only at times at which a first contact with the front vehicle is possible.
+    In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
+    vehicle relative to the front vehicle, and the front pair's is at least the smallest possible one at this time. Such
+    a contact is covered only at times at which a first contact with the front vehicle is possible.
     """
     first = meet_front(at, math.inf)
     if first == math.inf and at[GAP_L] <= TOUCHING_M:
@@ -252,10 +252,10 @@ def combined_bound(at, until, front, rear, cells):
 
 @large
 def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
-    """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2): of each pair alone, and of both together.
+    """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2).
 
-    ``rows`` [n, COLUMNS] at the start; later harm than ``until`` [n] (s) does not count. ``has_front`` and ``has_rear``
-    [n]: whether there is this neighbour and the pair's next impact counts. ``unavoidable`` [n]: contact is.
+    ``rows`` [n, COLUMNS]; harm after ``until`` [n] (s) does not count. ``has_front`` and ``has_rear`` [n]: there is
+    this neighbour, and the pair's next impact counts. ``unavoidable`` [n]: contact is.
     """
     for k in range(len(out)):
         for column in range(BOUNDS):
@@ -290,8 +290,8 @@ def lower_bound(
             is larger than with None, but holds only for commands that change at decisions, and takes ten times as long.
             None: commands may change at any time.
 
-    Raises ``InvalidInput`` for a physics or lines that ``avoidability`` does not cover, for an unknown count, for a
-    time step below ``LEAST_TIME_STEP_S``, and for a horizon that is not finite or lies before the vehicle may act.
+    Raises ``InvalidInput`` where ``avoidability`` does, for an obstacle, an unknown count, a time step below
+    ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
 
     """
     reason = avoidability(state, body).reason

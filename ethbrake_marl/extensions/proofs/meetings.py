@@ -1,8 +1,8 @@
 """The gentlest first contact (smallest closing speed) of the controlled vehicle with a neighbour at a given time.
 
-Times count from the moment at which the controlled vehicle may act. The front vehicle already brakes; the rear vehicle
-coasts until its latency has elapsed, then brakes. ``drive`` is how long (s) a vehicle drives before it brakes,
-``brake`` how long it brakes before it drives. docs/internals/proofs/lower-bound.md has the proofs.
+The front vehicle already brakes; the rear vehicle coasts until its latency has elapsed, then brakes. ``drive`` is how
+long (s) a vehicle drives before it brakes, ``brake`` how long it brakes before it drives. Times count from the moment
+at which the controlled vehicle may act. Proofs: docs/internals/proofs/lower-bound.md.
 """
 
 from __future__ import annotations
@@ -37,8 +37,7 @@ _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speed
 def gentlest_front(at, time):
     """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and its ``drive``.
 
-    The vehicle reaches the place of the contact at ``time`` with the smallest possible speed if it drives first and
-    then brakes.
+    To be at a place at a time with the smallest speed, drive first and then brake.
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[GAP_L] + way, at[V_F], at[U_F], at[A_F]
@@ -73,7 +72,7 @@ def braked_then_driven(at, brake, time):
 
 @large
 def braking_to_rear(at, time):
-    """Return ``brake`` of the vehicle that has contact with the rear vehicle at ``time``."""
+    """Return the ``brake`` that leads to contact with the rear vehicle at ``time``."""
     place = follower(at, time)[1] - at[GAP_R]
     low, high = 0.0, time
     for _ in range(HALVINGS):
@@ -89,8 +88,8 @@ def braking_to_rear(at, time):
 def gentlest(kind, at, time):
     """Return the smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake``.
 
-    The vehicle reaches the rear vehicle at ``time`` with the largest possible speed if it brakes first and then drives.
-    ``brake`` is infinite if it reaches its speed limit by then.
+    To be at a place at a time with the largest speed, brake first and then drive. ``brake`` is infinite if the vehicle
+    reaches its speed limit by then.
     """
     if kind == FRONT_FIRST:
         return gentlest_front(at, time)
@@ -101,25 +100,21 @@ def gentlest(kind, at, time):
 
 @kernel
 def behind_leader(at, plan, until):
-    """Walk the controlled vehicle with a plan behind the front vehicle."""
     return walk(at[GAP_L], at[V_L], braking(0.0, at[A_L]), at[V_F], plan, until)
 
 
 @kernel
 def before_rear(at, plan, until):
-    """Walk the controlled vehicle with a plan ahead of the rear vehicle."""
     return walk(at[GAP_R], at[V_F], plan, at[V_R], braking(at[ONSET_R], at[A_R]), until)
 
 
 @kernel
 def driving_first(at, drive):
-    """Return the plan of the controlled vehicle that drives first and then brakes."""
     return drive_then_brake(at[V_F], at[U_F], at[LIMIT_F], drive, at[A_F])
 
 
 @kernel
 def braking_first(at, brake):
-    """Return the plan of the controlled vehicle that brakes first and then drives."""
     return brake_then_drive(at[V_F], at[U_F], at[LIMIT_F], brake, at[A_F])
 
 
@@ -131,23 +126,23 @@ def rest_of_rear(at):
 
 @large
 def meet_front(at, drive):
-    """Return when (s) a vehicle that drives first and then brakes meets the front vehicle; infinite: never."""
+    """Return when (s) a vehicle that drives first meets the front vehicle; infinite: never."""
     return behind_leader(at, driving_first(at, drive), math.inf)[1]
 
 
 @large
 def meet_rear(at, brake):
-    """Return when (s) a vehicle that brakes first and then drives meets the rear vehicle; infinite: never."""
+    """Return when (s) a vehicle that brakes first meets the rear vehicle; infinite: never."""
     return before_rear(at, braking_first(at, brake), rest_of_rear(at))[1]
 
 
 @large
 def stays_ahead(at, drive, until):
-    """Return whether a vehicle that drives first and then brakes avoids the rear vehicle until ``until`` (s)."""
+    """Does a vehicle that drives first avoid the rear vehicle until ``until`` (s)?"""
     return before_rear(at, driving_first(at, drive), until)[0] >= -AHEAD_M
 
 
 @large
 def stays_behind(at, brake, until):
-    """Return whether a vehicle that brakes first and then drives avoids the front vehicle until ``until`` (s)."""
+    """Does a vehicle that brakes first avoid the front vehicle until ``until`` (s)?"""
     return behind_leader(at, braking_first(at, brake), until)[0] >= -AHEAD_M

@@ -15,15 +15,13 @@ from ethbrake_marl.motion.contact import contact
 
 @kernel
 def braking(onset, deceleration):
-    """Return the plan: coast until ``onset`` (s), then brake to rest."""
+    """Coast until ``onset`` (s), then brake to rest."""
     return 0.0, onset, 0.0, onset, 0.0, onset, -deceleration, math.inf
 
 
 @kernel
 def with_window(u, late, end, change, turn, step):
-    """Return the plan: the acceleration ``u``, by ``step`` higher from ``turn`` on, and by ``change`` from ``late`` to
-    ``end``.
-    """
+    """Accelerate with ``u``; by ``step`` more from ``turn`` on, and by ``change`` more from ``late`` to ``end``."""
     second = u + step if turn < late else u + change
     third = u + step + change if turn < end else u
     return u, min(turn, late), second, min(max(turn, late), end), third, max(turn, end), u + step, math.inf
@@ -37,23 +35,20 @@ def time_to_limit(v, u, limit):
 
 @kernel
 def drive_then_brake(v, u, limit, drive, deceleration):
-    """Return the plan: drive with ``u`` (m/s2) up to the speed limit for ``drive`` seconds, then brake to rest."""
+    """Drive with ``u`` (m/s2) up to the speed limit for ``drive`` seconds, then brake to rest."""
     return u, min(time_to_limit(v, u, limit), drive), 0.0, drive, 0.0, drive, -deceleration, math.inf
 
 
 @kernel
 def brake_then_drive(v, u, limit, brake, deceleration):
-    """Return the plan: brake for ``brake`` seconds, at most to rest, then drive up to the speed limit."""
+    """Brake for ``brake`` seconds, at most to rest, then drive up to the speed limit."""
     cap = brake + time_to_limit(max(v - deceleration * brake, 0.0), u, limit)
     return -deceleration, brake, u, cap, 0.0, cap, 0.0, math.inf
 
 
 @kernel
 def piece_at(plan, now, v):
-    """Return the acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops at that time.
-
-    ``v`` is the speed at ``now`` (m/s).
-    """
+    """Return the acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops then."""
     k = 0
     while now >= plan[k + 1]:
         k += 2
@@ -70,10 +65,10 @@ def piece_at(plan, now, v):
 def walk(gap, v_front, front, v_rear, rear, until):
     """Return the smallest gap of two vehicles (m), the time (s) of their first contact, and its squared closing speed.
 
-    They have the gap ``gap`` (m) and the speeds ``v_front`` and ``v_rear`` (m/s, at least 0), and follow the plans
-    ``front`` and ``rear`` until ``until`` (s), as if they could pass through each other: a negative smallest gap is the
-    depth of their overlap. Without contact the time is infinite and the square 0. A gap that reaches 0 and opens again
-    is no contact; one that reaches 0 and would become negative is, even at closing speed 0.
+    They begin with ``gap`` (m), ``v_front`` and ``v_rear`` (m/s, at least 0), and follow the plans ``front`` and
+    ``rear`` until ``until`` (s), as if they could pass through each other: a negative smallest gap is the depth of
+    their overlap. Without contact the time is infinite and the square 0. A gap that reaches 0 and opens again is no
+    contact; one that reaches 0 and would become negative is, even at closing speed 0.
     """
     lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0
     while now < until:

@@ -19,8 +19,6 @@ from ethbrake_marl.motion.layout import Floats
 
 
 class Chains(NamedTuple):
-    """The chains of a recording."""
-
     numbers: Floats  # [chains, 2 N - 1] gaps (m) and speeds (m/s) from front to rear
     vehicles: list[str]  # the vehicles of each chain, such as ``2-3-4``
     longest: int  # number of vehicles in the longest queue
@@ -30,8 +28,8 @@ class Chains(NamedTuple):
 def cut_chains(recording: Recording, vehicles: int) -> Chains:
     """Return the chains of a recording, in order of time and of the vehicle at the front of the queue.
 
-    The first chain of a queue begins with its front vehicle, the next chain directly behind the first, and so on. At
-    one moment, a vehicle belongs to at most one chain. Raises ``InvalidInput`` if too many vehicles have faulty data.
+    The first chain of a queue begins with its front vehicle, the next one directly behind it, and so on. Raises
+    ``InvalidInput`` if too many vehicles have faulty data.
     """
     left_out = Counter[str]()
     states = recording.states[~recording.states.duplicated(["moment", "vehicle"])].reset_index(drop=True)
@@ -65,8 +63,8 @@ def cut_chains(recording: Recording, vehicles: int) -> Chains:
 def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
     """Return the states of vehicles that follow another one, with ``gap`` (m) and ``front_car``.
 
-    ``front_car`` is the index of the vehicle ahead in ``states``, which has each vehicle once per moment. Data that are
-    left out are added to ``left_out``. Raises ``InvalidInput`` if too many vehicles have faulty data.
+    ``front_car`` is the index of the vehicle ahead in ``states``, which has each vehicle once per moment. Counts in
+    ``left_out`` what it leaves out.
     """
     entry = recording.entry
     if entry.by_lane:
@@ -96,7 +94,6 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
 
 
 def _check_faults(recording: Recording, faulty: Any, left_out: Counter[str]) -> None:
-    """Count the ``faulty`` vehicles and those that are recorded twice; raise ``InvalidInput`` if they are too many."""
     states = recording.states
     twice = states[states.duplicated(["moment", "vehicle"])]
     number = len(faulty) + len(twice)

@@ -17,8 +17,6 @@ NUMBER = "<number>"  # placeholder for the number of a vehicle in the name of a 
 
 
 class Format(NamedTuple):
-    """One format of recorded traffic."""
-
     title: str  # name of the data set
     files: tuple[str, ...]  # patterns of the names of its files, in lower case
     # Quantity -> name of its column. A name with ``NUMBER`` means one column for each vehicle: Speed1, Speed2, ... The
@@ -40,12 +38,12 @@ class Format(NamedTuple):
 
     @property
     def gaps(self) -> bool:
-        """Whether files contain gaps instead of positions and lengths; an empty cell means it was not measured."""
+        """Files contain gaps instead of positions and lengths; an empty cell means that the gap was not measured."""
         return "gap" in self.columns
 
     @property
     def by_lane(self) -> bool:
-        """Whether the vehicle ahead must be determined from lanes and positions, because no column contains its id."""
+        """The vehicle ahead must be determined from lanes and positions, because no column contains its id."""
         return "ahead" not in self.columns and not self.gaps
 
 
@@ -92,13 +90,12 @@ _ROLES = ("time", "vehicle", "lane", "front", "length", "speed")  # keys of ``--
 
 
 def format_of(name: DataFormat, columns: str = "") -> Format:
-    """Return the format of recorded traffic with the name ``name``.
+    """Return the format of recorded traffic with this name.
 
     ``columns`` is for the format ``table`` only: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
-    values except ``units`` are names of columns of the file. ``time=t/1000`` means that the column ``t`` contains times
-    in 1/1000 s. ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
-
-    Raises ``InvalidInput`` if ``columns`` has missing, repeated or unknown keys, or unknown units.
+    values except ``units`` are names of columns. ``time=t/1000`` means that the column ``t`` has times in 1/1000 s.
+    ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
+    Raises ``InvalidInput`` for missing, repeated or unknown keys, and unknown units.
     """
     if name != "table":
         if columns:

@@ -25,7 +25,7 @@ OTHER_NAMES = {"preceeding": "preceding"}  # misspelt column in some files of NG
 
 
 class NotARecording(InvalidInput):
-    """Raised for a file that is not a recording, because it lacks more than half of the format's columns."""
+    """The file lacks more than half of the format's columns."""
 
 
 class Cells(NamedTuple):
@@ -37,17 +37,15 @@ class Cells(NamedTuple):
     frame: Any  # quantity -> finite numbers, or texts; in a format with gaps an empty cell is NaN
 
     def place(self, row: int, quantity: str = "") -> str:
-        """Return the place of a row for error messages: file, line and column."""
         with reading(self.file) as stream:
             lines = (number for number, line in enumerate(stream, 1) if number > self.heading and line.strip())
             line = next(islice(lines, row, None))
         return f"{self.file}, line {line}{f', column {self.names[quantity]}' if quantity else ''}"
 
     def refuse(self, bad: Any, quantity: str, values: Any, right: str) -> None:
-        """Raise ``InvalidInput``, which names file, line and column, if at least one value is wrong.
+        """Raise ``InvalidInput``, with file, line and column, at the first value that is ``bad``.
 
-        ``bad`` and ``values`` are series with the number of the row as index. The message shows the first wrong value;
-        ``right`` is its end, which says what a valid value is.
+        ``bad`` and ``values`` are series with the number of the row as index; ``right`` says what a valid value is.
         """
         if bad.any():
             row = bad.idxmax()
@@ -56,7 +54,7 @@ class Cells(NamedTuple):
 
 @contextmanager
 def reading(file: Path) -> Iterator[BufferedReader]:
-    """Open a file; bytes that are no text, and what goes wrong inside pyarrow, are one ``InvalidInput``."""
+    """Open a file. Bytes that are no text, and errors inside pyarrow, become ``InvalidInput``."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             yield stream
@@ -66,11 +64,10 @@ def reading(file: Path) -> Iterator[BufferedReader]:
 
 
 def read_cells(file: Path, entry: Format) -> Cells:
-    """Return the columns of a format in a file.
+    """Return the columns of a format in a file, whose first lines may be a heading.
 
-    The first lines may be a heading; then come the names of the columns. Raises ``InvalidInput``, which names file,
-    line and column, if a column is missing or occurs twice, and for a cell that is empty or not a number;
-    ``NotARecording`` if more than half of the columns are missing.
+    Raises ``InvalidInput``, which names file, line and column, if a column is missing or occurs twice, and for a cell
+    that is empty or not a number; ``NotARecording`` if more than half of the columns are missing.
     """
     with reading(file) as stream:
         heading, separator, names, at = _header(file, entry, stream)
@@ -109,7 +106,6 @@ def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str
 
 
 def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
-    """Find the columns of a format among ``names``; return their indices by quantity, and the missing columns."""
     at, missing, twice = dict[str, int](), list[str](), list[str]()
     for quantity, column in entry.columns.items():
         pattern = re.escape(column.lower()).replace(re.escape(NUMBER), "([1-9][0-9]*)")

@@ -1,6 +1,6 @@
 """Create a scenario (a YAML file, and a CSV file with gaps and speeds) from a folder of recorded traffic.
 
-Only one file's states are in memory at a time, besides the rows: gaps and speeds of a chain of vehicles at one moment.
+Besides the rows, only one file's states are in memory at a time.
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ LISTED = 10  # largest number of skipped files that a note names
 
 
 class Rows(NamedTuple):
-    """Gaps and speeds of chains of vehicles from all recordings in a folder, and information on the files."""
-
     numbers: Floats  # [k, 2 N - 1] gaps (m) and speeds (m/s) of each row
     of: list[tuple[str, str]]  # recording and vehicles of each row
     seen: int  # number of chains in the recordings; there can be fewer rows
@@ -48,11 +46,9 @@ class Rows(NamedTuple):
 
     @property
     def recordings(self) -> str:
-        """Number of recordings, in words."""
         return count_of(len({file for file, _ in self.of}), "recording")
 
     def found(self, vehicles: int, every_s: float) -> list[str]:
-        """Return phrases that say what the recordings contain, and which data were left out."""
         groups = {2: "pair", 3: "trio"}.get(vehicles, "queue")
         parts = [
             f"{count_of(self.seen, 'chain')} of {vehicles} vehicles, every {every_s:g} s; at one time, a vehicle is in"
@@ -67,8 +63,6 @@ class Rows(NamedTuple):
 
 
 class FromData(NamedTuple):
-    """A scenario that was created from a folder of recordings, and information on the files."""
-
     text: str  # content of the scenario file (YAML)
     csv: str  # content of the file of its rows (CSV): gaps (m), speeds (m/s), and the column ``recording``
     found: list[str]  # sentences that say what the recordings contain, and what was left out
@@ -93,10 +87,10 @@ def scenario_from_data(
     rows than the table of a scenario may have, only every k-th row is used.
 
     Args:
-        name: name of the scenario.
+        name: of the scenario.
         folder: folder with the files, or one file.
-        format: format of the files.
-        columns: for the format ``table`` only: names of the columns, see ``format_of``.
+        format: of the files.
+        columns: for the format ``table`` only (``format_of``).
         based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
         every_s: time between two moments at which chains are formed, s.
         progress: called with ``files``, the number of files read so far, and the number of all files.
@@ -144,8 +138,8 @@ def read_rows(
 ) -> Rows:
     """Read the chains of vehicles in all recordings of a folder and its subfolders, or in one file.
 
-    If a file has an error, none of its chains are used, and the result contains the error message. A file with the
-    content of another one is skipped. Raises ``InvalidInput`` if there is no recording of this format, and no row.
+    A file with an error is refused as a whole. A file with the content of another one is skipped. Raises
+    ``InvalidInput`` if there is no recording of this format, or no row.
     """
     longest, left_out, refused, skipped = 0, Counter[str](), list[str](), list[str]()
     numbers, of, seen, others = [np.empty((0, 2 * vehicles - 1))], list[tuple[str, str]](), set[bytes](), list[str]()

@@ -44,7 +44,6 @@ class Recording(NamedTuple):
     names: dict[float, str]  # number of a vehicle or lane -> its name, if files have names instead of numbers
 
     def name(self, number: float) -> str:
-        """Return the name of a vehicle or lane."""
         return self.names.get(number) or f"{number:.0f}"
 
 
@@ -115,7 +114,6 @@ def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
 
 
 def _along_road(raw: Any, cells: Cells, entry: Format) -> Any:
-    """Return the states of a format with ids and positions along the road."""
     zero = pd.Series(0.0, raw.index)
     for role, least in (("vehicle", 0.0), ("lane", 0.0), ("ahead", entry.alone)):
         if role in raw:
@@ -166,7 +164,6 @@ def _check(states: Any, cells: Cells, entry: Format) -> None:
 
 
 def _check_positions(recording: Recording, every_s: float) -> None:
-    """Raise ``InvalidInput`` if positions in a lane change otherwise than the speeds say."""
     cells, entry, now = recording.cells, recording.entry, recording.states
     then = now[["moment", "vehicle", "lane", "front", "side", "speed"]].assign(moment=now["moment"] + 1.0)
     both = now.merge(then, on=["moment", "vehicle", "lane"], suffixes=("", "_then"))
@@ -186,9 +183,8 @@ def _check_positions(recording: Recording, every_s: float) -> None:
 def _openacc(raw: Any, cells: Cells, entry: Format) -> Any:
     """Return the states of cars of which speeds and gaps were recorded, in numbered columns.
 
-    Car k + 1 follows car k if the speeds of both cars and the gap between these cars (column ``IVS`` with the number k)
-    are recorded. The first car of a queue has position 0. The position of every other car is minus the sum of the
-    gaps between it and the first car of its queue.
+    Car k + 1 follows car k if the speeds of both cars and the gap between them (column ``IVS`` with the number k) are
+    recorded. The first car of a queue has position 0, every other car minus the sum of the gaps up to the first.
     """
     cars = sorted(int(name.removeprefix("speed")) for name in raw if name.startswith("speed"))
     gap_of = {k: f"gap{k - 1}" for k in cars if k - 1 in cars and f"gap{k - 1}" in raw}

@@ -24,7 +24,7 @@ ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a pictu
 
 
 def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
-    """Let a team drive one world; return 25 scenes per second from the alert on, and the final one."""
+    """Return 25 scenes per second from the alert on, and the final one."""
     motion, scenes = Motion(game, world, 0), list[Scene]()
     for _, state in play(game, world, team):
         motion.step(state)
@@ -58,7 +58,6 @@ Films = Mapping[str, Sequence[Scene]]  # title -> scenes, of one world
 
 
 def stacked(films: Films) -> Iterator[Frame]:
-    """Yield the pictures of a film in order: all films at one time, one below the other."""
     for k in range(max(map(len, films.values()))):
         each = (scenes[min(k, len(scenes) - 1)]._replace(title=title) for title, scenes in films.items())
         yield np.concatenate([picture(scene) for scene in each])

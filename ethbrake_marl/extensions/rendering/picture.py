@@ -40,7 +40,7 @@ def vehicle_colour(body: int) -> str:
 
 @cache
 def font(size: int) -> Any:
-    """Return Pillow's own font; the size is that in the finished picture."""
+    """Return Pillow's own font; ``size`` is in pixels of the finished picture."""
     return ImageFont.load_default(size * FINE)
 
 
@@ -66,7 +66,6 @@ class Pen:
         return (place_m - self.left_m) / (self.right_m - self.left_m) * WIDTH
 
     def ends(self, body: int) -> tuple[float, float]:
-        """Return rear and front of a body in the picture."""
         if body == 0:
             return self.x(self.scene.obstacle_m), self.x(self.scene.obstacle_m) + 9
         return self.x(self.fronts_m[body - 1] - BODY_M), self.x(self.fronts_m[body - 1])
@@ -111,7 +110,6 @@ def picture(scene: Scene) -> Frame:
 
 
 def draw_road(pen: Pen) -> None:
-    """Draw the lane with its edges, the distances and the obstacle."""
     pen.box(0, ROAD_TOP, WIDTH, ROAD_BOTTOM, ASPHALT)
     for place_m in pen.marks(5.0):
         for y in (ROAD_TOP + 5, ROAD_BOTTOM - 5):
@@ -128,7 +126,6 @@ def draw_road(pen: Pen) -> None:
 
 
 def draw_vehicle(pen: Pen, body: int) -> None:
-    """Draw a vehicle with its number, its brake lights, and a mark above it if it learns."""
     left, right = pen.ends(body)
     pen.box(left, LANE - BODY, right, LANE + BODY, vehicle_colour(body))
     glass = left + (right - left) * 0.72
@@ -181,7 +178,7 @@ def write_gaps(pen: Pen) -> None:
 
 
 def show_impacts(pen: Pen) -> None:
-    """Draw a star at every recent impact, and say which two were hardest."""
+    """Draw a star at every recent impact, and name the two hardest."""
 
     def x(impact: Impact) -> float:
         return (pen.ends(impact.pair + 1)[1] + pen.ends(impact.pair)[0]) / 2

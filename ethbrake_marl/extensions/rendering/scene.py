@@ -69,7 +69,7 @@ class Scene(NamedTuple):
 
     @property
     def shown_m(self) -> tuple[float, float]:
-        """Places of the ends of the road that is shown: moved forward and widened until it holds the whole line."""
+        """Ends of the road that is shown: ``road_m``, moved forward and widened until it holds the whole line."""
         (left, right), fronts = self.road_m, self.fronts_m
         on = max(fronts[0] + AHEAD_M - right, 0.0)
         return min(left + on, fronts[-1] - BODY_M - BEHIND_M), right + on
@@ -80,7 +80,6 @@ class Scene(NamedTuple):
 
     @property
     def obstacle_m(self) -> float:
-        """Place of the obstacle."""
         return self.front_m + float(self.line[GAP, 0])
 
     def command(self, body: int) -> float:
@@ -109,7 +108,6 @@ class Scene(NamedTuple):
         return f"harm {first:.2f} by first impacts, {total:.2f} in total (m2/s2)"
 
     def text(self) -> str:
-        """Return the scene in words: the road to scale, then a line for each vehicle."""
         left, right = self.shown_m
 
         def column(place_m: float) -> int:
@@ -146,7 +144,6 @@ class Motion:
         self.front_m, self.impacts, self.ended = 0.0, tuple[Impact, ...](), False
 
     def step(self, state: State) -> None:
-        """Go on to the next decision, at which the worlds are in this state."""
         self.line, self.front_m, self.impacts = self.at(self.until_s)
         self.start_s, self.until_s = self.until_s, float(state.time_s[self.row])
         self.wanted, self.ended = state.wanted[self.row].copy(), bool(state.ended[self.row])
@@ -170,7 +167,6 @@ class Motion:
         return line, front_m, recent
 
     def scene(self, time_s: float) -> Scene:
-        """Return what there is to see at a time of this motion (s after the alert)."""
         line, front_m, impacts = self.at(time_s)
         learners, ended = tuple(map(int, self.game.rules.learners)), self.ended and time_s == self.until_s
         return Scene(

@@ -30,7 +30,6 @@ class Viewer:
         self.stepped(state)
 
     def stepped(self, state: State) -> None:
-        """Remember the step that led to this state, in every world."""
         for row, motion in enumerate(self.motions):
             if state.steps[row] == 0:
                 self.motions[row] = Motion(self.environment.game, state, row)
@@ -38,19 +37,16 @@ class Viewer:
                 motion.step(state)
 
     def motion(self, row: int) -> Motion:
-        """Return the last step of a world."""
         if not self.motions:
             raise InvalidInput("render: no episode has started; call reset first")
         return self.motions[row]
 
     def render(self) -> Any:
-        """Return the present moment, as the mode shows it; of every world if there are many."""
         motions = map(self.motion, range(len(self.motions) or 1))
         shown = [self.show(motion.scene(motion.until_s)) for motion in motions]
         return shown if self.many else shown[0]
 
     def show(self, scene: Scene) -> Any:
-        """Return a scene as a picture, [304, 800, 3] uint8."""
         from ethbrake_marl.extensions.rendering.picture import picture
 
         return picture(scene)
@@ -71,7 +67,6 @@ class Words(Viewer):
     """Mode ``ansi``: the present moment as plain text."""
 
     def show(self, scene: Scene) -> Any:
-        """Return a scene as text."""
         return scene.text()
 
 
@@ -87,13 +82,11 @@ class Window(Viewer):
         self.closed = False
 
     def began(self, state: State) -> None:
-        """Open the window."""
         super().began(state)
         self.closed = False
         self._play()
 
     def stepped(self, state: State) -> None:
-        """Show the step in real time."""
         super().stepped(state)
         self._play()
 
@@ -134,7 +127,6 @@ class Window(Viewer):
 
 
 def _open(pygame: Any, size: tuple[int, int]) -> Any:
-    """Return a new window. Raises ``InvalidInput`` without a display."""
     try:
         pygame.display.init()
         return pygame.Window("EthBrake", size)

@@ -1,4 +1,4 @@
-"""The best known harm of each world, if a result has it: a package that searches registers measures of these names."""
+"""The best known harm of each world, if another extension has measured it: ``MEASURES`` are its names."""
 
 from __future__ import annotations
 
@@ -17,21 +17,17 @@ AVOIDABLE = "avoidable"  # whether contact is proven avoidable; where it is fals
 
 
 class BestKnown(NamedTuple):
-    """What is the least that is known for each world; the same for every agent."""
-
     harm: Mapping[str, Floats]  # count -> [n] m2/s2: both harms and, if it is known, the honest cost
     avoidable: Bools | None  # [n] whether contact can be avoided; None: not proven
 
     @classmethod
     def of(cls, result: Result) -> BestKnown | None:
-        """Return what a result knows; None if it was not measured."""
         columns: Mapping[str, Any] = next(iter(result.columns.values()))
         harm = {count: columns[name] for count, name in BEST.items() if name in columns}
         return cls(harm, columns.get(AVOIDABLE)) if HARM.keys() <= harm.keys() else None
 
     @property
     def in_words(self) -> str:
-        """What is known of the worlds as a whole."""
         first, total = (float(self.harm[count].mean()) for count in HARM)
         words = (
             f"Mean best known harm of these worlds, where pushing is free: {first:.2f} first-impact, {total:.2f} total."

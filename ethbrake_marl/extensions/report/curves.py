@@ -17,9 +17,9 @@ Curve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
 
 
 def over_seeds(trainings: Sequence[Mapping[Any, float]]) -> Curve:
-    """Return the mean of several training runs, with plus and minus one standard deviation over the seeds.
+    """Return the mean of several training runs, plus and minus one standard deviation over the seeds.
 
-    ``trainings`` has a mapping from step or progress to value for each run. The curve has those that all runs have.
+    ``trainings`` has a mapping from step or progress to value for each run. The curve has the steps of all runs.
     """
     curve = {}
     for step in sorted(set.intersection(*map(set, trainings))):
@@ -40,13 +40,8 @@ def curves_figure(
 ) -> Figure:
     """Draw curves with a band between the ends of their intervals, in a panel for each title.
 
-    Args:
-        panels: title -> label of a curve -> curve. The first panel, whose labels the legend has, has all of them.
-        x_label: label of the horizontal axes.
-        caption: text below the figure.
-        lines: title -> label -> value of a horizontal line.
-        y_label: label of a vertical axis that all panels share; "": each has its own.
-
+    ``panels``: title -> label of a curve -> curve; the first panel must have all labels, for the legend. ``lines``:
+    title -> label -> value of a horizontal line. ``y_label``: shared by all panels; "": each has its own.
     """
     figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
     labels = [*dict.fromkeys(label for curves in panels.values() for label in curves)]

@@ -25,7 +25,7 @@ POINTS = 2001  # evenly spaced decelerations
 def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float) -> Floats:
     """Return what vehicle ``body`` does by holding decelerations ``at`` [C] (m/s2), [3, C] m2/s2.
 
-    Rows: predicted by the closed form, and simulated, of first impacts and in total. The others do as in ``world``.
+    Rows: predicted by the closed form, and simulated, first-impact and total. The others do as in ``world``.
     """
     braking, wait = np.ascontiguousarray(world.car[0, BRAKING]), world.car[0, LATENCY].copy()
     priced: Any = predicted_harm
@@ -39,16 +39,10 @@ def deceleration_figure(
 ) -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of the scenario's learner.
 
-    Marks are the decelerations that E-V2X-BM chooses, by the closed form and by simulation.
+    Marks are the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``known``: best known harm
+    of this world over all commands, ``first`` and ``total``, drawn as lines.
 
-    Args:
-        world: at the alert.
-        scenario: has one learner, and scripts that do not look at the state.
-        known: best known harm of this world over all commands, ``first`` and ``total``, drawn as lines.
-        title: of the figure; by default the scenario's name.
-
-    Raises ``InvalidInput`` for something else.
-
+    Raises ``InvalidInput`` unless there is one world, one learner, and no script that looks at the state.
     """
     loaded, game = open_game(scenario)
     if world.n != 1 or len(loaded.learners) != 1 or game.scripts:

@@ -52,13 +52,11 @@ def trajectories(records: Mapping[str, EpisodeRecord]) -> Figure:
 
 
 def _rest_s(record: EpisodeRecord) -> float:
-    """Return the first sample after which no vehicle moves, or the last one (s)."""
     moving = np.flatnonzero((record.speeds_mps != 0.0).any(axis=1))
     return float(record.time_s[min(moving.max(initial=0) + 1, len(record.time_s) - 1)])
 
 
 def _style(body: int) -> dict[str, Any]:
-    """Return the style of the curves of a vehicle (1: Vehicle 1) and of the gap ahead of it."""
     return {"color": vehicle_colour(body), "linestyle": DASHES[(body - 1) % len(DASHES)], "linewidth": 1.6}
 
 

@@ -47,14 +47,13 @@ def shown_worlds(result: Result, focus: str) -> dict[int, str]:
 
 
 def worst_rows(result: Result, focus: str) -> Ints:
-    """Return at most ten rows in which an agent did worst, the worst first: by total harm minus the best known."""
+    """Return at most ten rows in which an agent did worst, worst first: by total harm, minus the best known if any."""
     known = BestKnown.of(result)
     value = result[focus][HARM["total"]] if known is None else known.regret(result, focus, "total")
     return largest(value, value > 0.0)[:WORST]
 
 
 def largest(value: Floats, among: Bools) -> Ints:
-    """Return the rows that are true in ``among``, those with the largest value first."""
     order: Ints = np.argsort(-value, kind="stable")
     return order[among[order]]
 

@@ -53,7 +53,7 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
 
 
 def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Compare an agent with full braking in the same worlds: "as much" where the 95 % interval contains 0."""
+    """Compare an agent with full braking in the same worlds: "as much" if the 95 % interval contains 0."""
     difference = row[f"{harm}_difference"]
     if difference is None or (difference.interval is None and row.episodes > 1):
         return "as much"

@@ -111,7 +111,6 @@ def harm_against_total_gap(result: Result) -> Figure:
 
 
 def line(result: Result) -> str:
-    """Return the worlds of a result in one line."""
     by = result.clusters
     recordings = {} if by is None else {"recordings": len(np.unique(by))}
     return caption({**result.about, **recordings, **ranges_of(result.worlds)})

@@ -10,7 +10,6 @@ from ethbrake_marl.training.experiment import TEAM, without
 
 
 def learners_sheets(compared: Compared) -> list[Sheet]:
-    """Return who bears what in each count, and what each learner of the trained team adds."""
     return [*(_borne(compared, count) for count in _counts(compared)), _added(compared)]
 
 
@@ -33,7 +32,7 @@ def _borne(compared: Compared, count: str) -> Sheet:
 
 
 def _added(compared: Compared) -> Sheet:
-    """Return (harm if a learner brakes fully) - (harm of the whole team), for each learner."""
+    """For each learner: (harm if it brakes fully) - (harm of the whole team)."""
     result, counts, rows = compared.result, _counts(compared), list[Row]()
     for name in (compared.scenario.vehicle_names[body - 1] for body in compared.scenario.learners):
         pairs = ((result[without(name)][COLUMN[count]], result[TEAM][COLUMN[count]]) for count in counts)

@@ -30,8 +30,6 @@ _STAY = "\u00a0"  # no-break space
 
 
 class Section(NamedTuple):
-    """Section of a page."""
-
     title: str  # heading, and entry in the table of contents
     body: Sequence[str]  # HTML (``Markup``), and texts, which become paragraphs
 
@@ -44,21 +42,19 @@ def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Seque
 
 
 def part(name: str, *values: object) -> Markup:
-    """Return a part of a page: the macro ``name`` of ``parts.html.j2``, filled with values."""
+    """Return the macro ``name`` of ``parts.html.j2``, filled with values."""
     macros = _environment().get_template("parts.html.j2").module
     return Markup(getattr(macros, name)(*values))
 
 
 def table(sheet: Sheet) -> Markup:
-    """Return a table, which can be scrolled if it is wider than the page."""
     return Markup(sheet.html())
 
 
 def drawing(figure: Figure, title: str, description: str) -> Markup:
     """Return a figure with a title and a description.
 
-    Its caption becomes text of the page, and leaves the figure, because the text of a wide figure is too small on a
-    phone.
+    Its caption becomes text of the page, because the text of a wide figure is too small on a phone.
     """
     caption = " ".join(figure.get_supxlabel().split())
     figure.supxlabel("")
@@ -71,7 +67,7 @@ def drawing(figure: Figure, title: str, description: str) -> Markup:
 def data(name: str, content: object) -> Markup:
     """Return ``content`` as JSON for the scripts of the page, in an HTML element with the id ``name``.
 
-    The characters < > and & are escaped, so the content cannot end the element or begin a new element.
+    The characters < > and & are escaped, so the content cannot end the element or begin a new one.
     """
     text = json.dumps(content, allow_nan=False, separators=(",", ":"))
     for sign in "<>&":
@@ -91,7 +87,6 @@ def shown(value: object) -> str:
 
 @cache
 def read_file(name: str) -> str:
-    """Return the text of the file ``name`` in the folder of this module."""
     return files(__package__).joinpath(name).read_text("utf-8")
 
 

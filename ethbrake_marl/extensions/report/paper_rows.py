@@ -64,12 +64,11 @@ SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant
 
 
 def is_papers_test(scenario: Scenario) -> bool:
-    """Return whether results in a scenario can be compared with the paper's: it is one of these, as shipped."""
+    """Can results in this scenario be compared with the paper's?"""
     return scenario.name in SHOWN_WITH and is_as_shipped(scenario)
 
 
 def printed_sheet(rows: tuple[PaperRow, ...]) -> Sheet:
-    """Return one of the paper's two tables as printed."""
     columns = ("Strategy", Column("Collisions"), Column("Rate"), Column("Average harm"), Column("Decrease"))
     shown = [
         (

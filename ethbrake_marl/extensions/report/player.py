@@ -1,4 +1,4 @@
-"""The episode player of a page: its data, pieces of motion between which the player computes places."""
+"""The episode player of a page: its data are pieces of motion, between which the player computes places."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ MOST_SHOWN = 3  # agents that are shown at the start
 def player(
     compared: Compared, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
 ) -> Markup:
-    """Return the player of some worlds. The agents that it shows first are the first one, ``focus``, and the last.
+    """Return the player of some worlds. It first shows the first agent, ``focus``, and the last.
 
-    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, in which
-    samples are ``SAMPLE_S`` apart.
+    ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, with
+    samples ``SAMPLE_S`` apart.
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
@@ -62,7 +62,6 @@ def player(
 
 
 def episode_data(record: EpisodeRecord) -> dict[str, Any]:
-    """Return what the scripts of the player read of an episode."""
     obstacle = float(record.initial.obstacle_gap_m[0])
     return {
         "pieces": base64.b64encode(np.asarray(pieces_of(record), "<f8").tobytes()).decode("ascii"),
@@ -98,7 +97,7 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 
 
 def moved(pieces: Floats, t: Floats, N: int) -> Floats:
-    """Return what pieces have become ``t`` (s) after their beginning, without the time."""
+    """Return the pieces as they are ``t`` (s) after their beginning, without the time."""
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
     gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]
@@ -106,7 +105,6 @@ def moved(pieces: Floats, t: Floats, N: int) -> Floats:
 
 
 def replaced_at_s(record: EpisodeRecord) -> list[float]:
-    """Return the times of the decisions at which a shield replaced an action (s)."""
     shields = [(before.time_s, after.memories.get("shield")) for before, after in pairwise(record.states[1:])]
     return [float(time_s[0]) for time_s, memory in shields if memory is not None and memory.intervened.any()]
 

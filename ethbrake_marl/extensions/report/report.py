@@ -34,8 +34,6 @@ WORDS = {
 
 
 class Test(NamedTuple):
-    """Another test of the same agents."""
-
     about: str  # how it differs
     compared: Compared
 
@@ -56,7 +54,6 @@ class Report:
 
     @property
     def html(self) -> str:
-        """The whole page."""
         compared, rows = self.compared, self.compared.table
         focus = self.focus or [row.agent for row in rows if row.policies or row is rows[-1]][-1]
         kinds = shown_worlds(compared.result, focus)
@@ -84,19 +81,16 @@ class Report:
         return whole_page(self.title, lead, opening, [section for section in sections if section.body])
 
     def write(self, path: Path, *, force: bool = False) -> None:
-        """Write the page. Raises the errors of ``write_output``."""
         write_output(path, self.html.encode("utf-8"), force=force)
 
 
 def short_table(agents: SummaryTable) -> Markup:
-    """Return each agent's collision rate and harms."""
     sheet = agents.sheet()
     some = sheet.only(k for k, name in enumerate(sheet.names) if k == 0 or name in SHORT)
     return table(replace(some, title="Means with 95 % intervals, m²/s²"))
 
 
 def measured(agents: SummaryTable) -> list[Markup]:
-    """Return the conditions, and folded tables of all measures."""
     sheet, more = agents.sheet(), agents.measures()
     whole = replace(sheet.only(sheet.filled()), title="All measures with a column")
     tables = [table(each) for each in (whole, more) if each is not None]
@@ -128,7 +122,6 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
 
 
 def avoidable_section(compared: Compared) -> Section:
-    """Return how harm is distributed over the worlds and, if it is proven, what was avoidable."""
     result, known = compared.result, BestKnown.of(compared.result)
     if known is None:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
@@ -168,7 +161,6 @@ def _tested(test: Test) -> list[str]:
 
 
 def write_evaluation(path: Path, compared: Compared, command: str, *, force: bool = False) -> None:
-    """Write the page of ``ethbrake evaluate --report``. Raises the errors of ``write_output``."""
     scenario, agents = compared.scenario, [row.agent for row in compared.table]
     names = ", ".join(agents)
     scripts = ", ".join(f"{vehicle} by {role}" for vehicle, role in scenario.roles.items() if role != "learner")

@@ -78,7 +78,6 @@ class RunReport:
 
 
 def write_figures(experiment: Experiment) -> list[Markup]:
-    """Write three pictures into the run's folder, and return them as parts of a page."""
     compared, learned, trained = experiment.compared, experiment.learned, experiment.trained
     recipe, (_, game) = trained.training.recipe, open_game(compared.scenario)
     shown = telling_row(compared, learned)
@@ -127,7 +126,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
 
 
 def telling_row(compared: Compared, learned: str) -> int:
-    """Return the row of a typical world: the median of the harm that is saved, where full braking does harm."""
+    """Return the row of a typical world: the median of the saved harm, among worlds in which full braking does harm."""
     harm = COLUMN[compared.harm_count]
     before = compared.result[BASELINE][harm]
     rows = np.flatnonzero(before > 0.0)
@@ -140,7 +139,6 @@ def telling_row(compared: Compared, learned: str) -> int:
 def page_of(
     experiment: Experiment, others: Mapping[str, Compared], figures: Sequence[Markup], learners: Sequence[Sheet]
 ) -> Report:
-    """Return the page of a run; ``others``: name of another test -> results."""
     trained, compared, learned = experiment.trained, experiment.compared, experiment.learned
     training, recipe, name = trained.training, trained.training.recipe, compared.scenario.name
     steps = next(iter(trained.policies.values())).manifest.steps

@@ -27,7 +27,6 @@ PICTURE = 224  # height (pixels) of road and speeds, the upper part of a picture
 
 
 def write_worlds(path: Path, scenario: Scenario, episodes: int, *, seed: int, force: bool = False) -> None:
-    """Write the picture of ``ethbrake scenario sample``. Raises the errors of ``write_picture``."""
     write_picture(path, worlds_figure(scenario, scenario.draw(episodes, seed), seed=seed), force=force)
 
 
@@ -83,7 +82,7 @@ def _distribution(axes: Axes, rule: Rule, entries: dict[int, Floats]) -> None:
 
 
 def _pictures(scenario: Scenario, drawn: Drawn) -> Frame:
-    """Return pictures of some worlds at the alert, one below the other, with the same scale."""
+    """Pictures of some worlds at the alert, one below the other, with the same scale."""
     worlds = drawn.worlds
     ranked = np.argsort(worlds.gaps_m.sum(axis=1), kind="stable")
     rows = {name: int(ranked[round(rank * (worlds.n - 1))]) for name, rank in SHOWN.items()}

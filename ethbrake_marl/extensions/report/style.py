@@ -78,24 +78,20 @@ class ShownFigure(Figure):
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
-    """Return an empty figure with automatic layout. Width and height are in inches."""
     return ShownFigure(figsize=(width_in, height_in), layout="constrained")
 
 
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
-    """Return a figure with ``rows`` times ``columns`` panels, and the axes of the panels, row by row.
+    """Return a figure with ``rows`` times ``columns`` panels, and their axes, row by row.
 
-    ``size_in`` is width and height in inches. ``how`` are keyword arguments for matplotlib's ``subplots``.
+    ``size_in``: width and height in inches. ``how``: for matplotlib's ``subplots``.
     """
     figure = new_figure(*size_in)
     return figure, list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """Return the style of curve ``number`` (from 0), as keyword arguments of matplotlib's ``plot``.
-
-    The styles repeat: curve 7 has the style of curve 0.
-    """
+    """Return the style of curve ``number`` (from 0) for matplotlib's ``plot``; curve 7 has the style of curve 0."""
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
@@ -112,22 +108,17 @@ def label_text(text: str, most: int = 40) -> str:
 
 @cache
 def font_signs() -> frozenset[int]:
-    """Return the code points of all characters in the font of the figures."""
     return frozenset(get_font(findfont("DejaVu Sans")).get_charmap())
 
 
 def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Mapping[str, Any]) -> None:
-    """Fill the area between the curves ``low`` and ``high`` over ``x``, in the colour of ``style``."""
     axes.fill_between(x, low, high, color=str(style["color"]), alpha=0.18, linewidth=0.0)
 
 
 def finish(
     figure: Figure, caption: str, legend: Axes | None = None, *, columns: int = 6, fontsize: float = 9
 ) -> Figure:
-    """Add a caption and the legend of one panel (None: no legend) to a figure, and return the figure.
-
-    ``columns`` and ``fontsize`` are for the legend.
-    """
+    """Add a caption and, with ``columns`` and ``fontsize``, the legend of one panel."""
     if legend is not None:
         named = legend.get_legend_handles_labels()
         figure.legend(*named, loc="outside upper left", ncols=columns, frameon=False, fontsize=fontsize)
@@ -138,9 +129,9 @@ def finish(
 
 @in_our_style
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
-    """Return the bytes of a PNG, SVG or PDF file with the figure. The ending of ``path`` selects the format.
+    """Return a PNG, SVG or PDF file, by the ending of ``path``. The same figure always gives the same bytes.
 
-    The same figure always gives the same bytes. Raises ``InvalidInput`` if the ending is not .png, .svg or .pdf.
+    Raises ``InvalidInput`` for another ending.
     """
     ending = Path(path).suffix.lower()
     if ending not in _NO_DATES:
@@ -151,10 +142,10 @@ def picture_bytes(figure: Figure, path: str | Path) -> bytes:
 
 
 def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> None:
-    """Write ``figure`` to a PNG, SVG or PDF file. The ending of ``path`` selects the format.
+    """Write ``figure`` to a PNG, SVG or PDF file, by the ending of ``path``.
 
-    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` if the ending of ``path`` is not .png,
-    .svg or .pdf or if the file cannot be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
+    If writing fails, an existing file stays unchanged. Raises ``InvalidInput`` for another ending or if the file cannot
+    be written, and ``AlreadyExists`` if the file exists and ``force`` is false.
     """
     write_output(path, picture_bytes(figure, path), force=force)
 

@@ -79,7 +79,7 @@ def reproduce_command(
 
 
 def chosen_policies(text: str) -> dict[str, str]:
-    """Return the specs of PPO and SAC; ``text`` replaces some. Raises ``InvalidInput`` for what cannot drive here."""
+    """Return the specs of PPO and SAC; ``text`` replaces some. Raises ``InvalidInput`` if one cannot drive here."""
     from ethbrake_marl.extensions.reproduction.random_test import SHIPPED, WORLDS, drive_all
     from ethbrake_marl.extensions.reproduction.readings import STATED
     from ethbrake_marl.extensions.reproduction.search import NEAREST

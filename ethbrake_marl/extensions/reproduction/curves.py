@@ -46,14 +46,14 @@ def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> di
 
 
 def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[str, Floats]:
-    """Return the same in the paper's map, with the policies of its process, [seeds, n]; nothing without trainings."""
+    """The same in the paper's map, with the policies of its process, [seeds, n]; nothing without trainings."""
     found = of_the_process(reading, episodes, settings)
     trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in found.items()}
     return {**lines_of(reading._replace(step_s=MAP_STEP_S), episodes, {}), **trained} if found else {}
 
 
 def estimate(line: Floats, rows: Floats) -> Estimate:
-    """Return the mean harm in some worlds, with its interval; of several seeds over the seeds."""
+    """Return the mean harm in some worlds; its interval is over the worlds, or over the seeds if there are several."""
     return mean(line[rows]) if line.ndim == 1 else mean(line[:, rows].mean(axis=1))
 
 
@@ -64,7 +64,6 @@ def by_distance(reading: Reading, episodes: int, lines: Lines) -> Groups:
 
 
 def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
-    """Compare the harm of a strategy with that of another one, in the same worlds of every group."""
     return [
         Less.of_worlds(f"{smaller} minus {larger}, {group}", lines[smaller][rows], lines[larger][rows])
         for group, (lines, rows) in groups.items()
@@ -72,7 +71,7 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 
 
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequence[str], x_label: str) -> Made:
-    """Return a figure of mean harm, with a panel for each reading, and a table for each. ``shown``: in the figure."""
+    """A figure of mean harm, with a panel for each reading, and a table for each. ``shown``: in the figure."""
     estimates = {
         reading: {
             name: {group: estimate(lines[name], rows) for group, (lines, rows) in groups.items()} for name in names
@@ -99,12 +98,11 @@ def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequ
 
 
 def over_distance(stem: str, readings: Mapping[str, Groups], shown: Sequence[str]) -> Made:
-    """Return figure and tables of harm against the sum of both gaps."""
     return show_harm(stem, "Harm by total distance", readings, shown, "Total distance d1 + d2 at the alert")
 
 
 def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Groups]:
-    """Return the groups of the worlds of the figures against distance, as stated and in the nearest reading."""
+    """Groups as stated and in the nearest reading."""
     episodes, found = min(DISTANCE_WORLDS, settings.episodes), {}
     for name, reading in (("as stated", STATED), ("nearest reading", NEAREST)):
         there = reading._replace(base=DISTANCE)
@@ -113,7 +111,6 @@ def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Grou
 
 
 def reproduce_distance(settings: Settings) -> Made:
-    """Reproduce the figure of harm against the sum of both gaps."""
     readings = distances(settings, settings.policies)
     stated, nearest = (statements(groups, settings.policies) for groups in readings.values())
     there, episodes = STATED._replace(base=DISTANCE), min(DISTANCE_WORLDS, settings.episodes)
@@ -127,7 +124,6 @@ def reproduce_distance(settings: Settings) -> Made:
 
 
 def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]:
-    """Return what the paper says of its figure: statement -> the comparisons that it needs."""
     lines, shortest = next(iter(groups.values()))
     half = 0.5 * lines[NON_E][shortest]
     return {
@@ -143,7 +139,6 @@ def statements(groups: Groups, policies: Iterable[str]) -> dict[str, list[Less]]
 
 
 def growing(groups: Groups, name: str) -> list[Less]:
-    """Compare the harm of a strategy in each group with that in the next one."""
     each = {group: lines[name][rows] for group, (lines, rows) in groups.items()}
     return [Less.of_lists(f"{one} minus {other}", each[one], each[other]) for one, other in pairwise(each)]
 
@@ -153,7 +148,7 @@ ONE = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # the world 
 
 
 def reproduce_delays(settings: Settings) -> Made:
-    """Reproduce the figure of harm at three delays, in its single world. The delays are our choice."""
+    """Harm at three delays, in the single world of the paper's figure. The delays are our choice."""
     groups, trained, one = {}, {}, np.array([True])
     for delay in DELAYS:
         reading = STATED._replace(base=f"paper-delay-{delay}", others=ONE)
@@ -175,7 +170,6 @@ def reproduce_delays(settings: Settings) -> Made:
 
 
 def reproduce_illustration(settings: Settings) -> Made:
-    """Reproduce the illustration of the hybrid, which "consistently selects the strategy [of] lower harm"."""
     readings = distances(settings, {ALONE: unconverged(settings.folder)})
     hybrid = f"Hybrid {ALONE}"
     counts, shares, texts = [], [], []

@@ -107,10 +107,7 @@ QUICK = "Figures 2 and 3, the paper's own process and the search over the readin
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the items of these names in the order of the paper; all, if there are none.
-
-    Raises ``UnknownName``.
-    """
+    """Return the items of these names in the order of the paper; all, if there are none. Raises ``UnknownName``."""
     known = {item.name: item for item in ITEMS}
     for name in names:
         if name not in known:
@@ -119,13 +116,11 @@ def choose_items(names: Sequence[str]) -> list[Item]:
 
 
 def groups_of(settings: Settings, items: Sequence[Item]) -> list[str]:
-    """Return the groups of trainings that the items need."""
     every = [name for item in items for name in item.trained if settings.full or name == STOPPED]
     return list(dict.fromkeys(every))
 
 
 def cost(settings: Settings, items: Sequence[Item]) -> str:
-    """Return what is to do, and how long it takes."""
     training_s = seconds_left(settings.folder, groups_of(settings, items))
     more_s = {item.name: PROCESS_S for item in items if RANDOM in item.trained} | {"readings": SEARCH_S}
     seconds = sum(item.most_s + (more_s.get(item.name, 0.0) if settings.full else 0.0) for item in items)
@@ -156,7 +151,6 @@ def reproduce(
 
 
 def command(settings: Settings, items: Sequence[Item]) -> str:
-    """Return the command line that makes the same."""
     names = [item.name for item in items] if len(items) < len(ITEMS) else []
     fewer = ["--episodes", str(settings.episodes)] if settings.episodes < PAPER_EPISODES else []
     given = ",".join(f"{name.lower()}={spec}" for name, spec in settings.policies.items())
@@ -165,7 +159,6 @@ def command(settings: Settings, items: Sequence[Item]) -> str:
 
 
 def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[Drawn] = ()) -> None:
-    """Write figures as SVG and PDF, tables as CSV and LaTeX."""
     if figures or sheets:
         place.mkdir(parents=True, exist_ok=True)
     for drawn in figures:
@@ -178,7 +171,6 @@ def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[Drawn] = 
 
 
 def plain(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
-    """Return results as plain data."""
     return [
         {
             "name": item.name,
@@ -195,7 +187,6 @@ def plain(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
 
 
 def overview(results: Mapping[Item, Made]) -> Sheet:
-    """Return the one table: every claim of the paper, ours, and why."""
     return claims_sheet([claim for made in results.values() for claim in made.claims])
 
 

@@ -1,7 +1,7 @@
 """Trainings by the paper's own process, and its learning curves.
 
 The process is the recipes ``ppo-paper`` and ``sac-paper`` in the paper's map: five seeds in the random test, three at
-a high and a low delay (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``). A further PPO of ours is stopped
+a high and a low delay (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``). One more PPO of ours is stopped
 before it has converged.
 """
 
@@ -29,8 +29,6 @@ STATUS = "run.json"  # of a run
 
 
 class Plan(NamedTuple):
-    """Trainings by one recipe in one scenario, one for each seed."""
-
     scenario: str
     recipe: str
     seeds: int
@@ -52,12 +50,10 @@ GROUPS = {
 
 
 def runs_of(folder: Path, group: str, plan: Plan) -> list[Path]:
-    """Return the folders of the runs of a plan, one for each seed."""
     return [folder / "trainings" / group / f"{plan.recipe}-seed{seed}" for seed in range(plan.seeds)]
 
 
 def is_finished(run: Path) -> bool:
-    """Return whether a run has finished. Raises ``InvalidInput`` if its status is damaged."""
     status = run / STATUS
     return status.is_file() and read_object(status).get("status") == "finished"
 
@@ -69,13 +65,13 @@ def trained(folder: Path, group: str) -> dict[str, list[Path]]:
 
 
 def seconds_left(folder: Path, groups: Iterable[str]) -> float:
-    """Return about how long the runs take that have not finished, in processor seconds."""
+    """Return about how much processor time the unfinished runs take (s)."""
     plans = [(group, plan) for group in groups for plan in GROUPS[group]]
     return sum(plan.seconds for group, plan in plans for run in runs_of(folder, group, plan) if not is_finished(run))
 
 
 def train(settings: Settings, groups: Iterable[str]) -> bool:
-    """Do, or continue, the runs of some groups that have not finished. Return False if Ctrl-C stopped one.
+    """Do, or continue, the unfinished runs of some groups. Return False if Ctrl-C stopped one.
 
     Raises ``MissingExtra`` without torch, and the errors of ``eb.train`` and ``eb.resume``.
     """
@@ -102,13 +98,13 @@ def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
 
 
 def unconverged(folder: Path) -> str:
-    """Return the spec of the policy "obtained from training before convergence occurred", which has been trained."""
+    """Return the spec of the trained policy "obtained from training before convergence occurred"."""
     ((run,),) = trained(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"
 
 
 def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
-    """Return the policies of the paper's process, one for each seed: name -> specs; those that have been trained."""
+    """Return the trained policies of the paper's process, name -> one spec for each seed; nothing without ``full``."""
     runs = trained(settings.folder, group) if settings.full else {}
     return {
         name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
@@ -151,7 +147,7 @@ class Course(NamedTuple):
 
     @property
     def converged(self) -> Floats:
-        """Decisions after which nine tenths of the rise are behind, [seeds]; all of them without a rise."""
+        """Decisions until nine tenths of the rise, [seeds]; all decisions without a rise."""
         risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
         progress = np.where(self.rise > 0.0, np.array([*self.returns[0]])[risen.argmax(axis=1)], 100.0)
         return 0.01 * self.decisions * progress
@@ -174,7 +170,6 @@ def column(run: Path, name: str) -> dict[float, float]:
 
 
 def course_of(runs: Sequence[Path]) -> Course:
-    """Return the course of the runs of one recipe at one delay."""
     returns, harm = ([column(run, name) for run in runs] for name in (RETURN, HARM))
     last = max(harm[0])
     returns, harm = ([{100.0 * k / last: x for k, x in each.items()} for each in every] for every in (returns, harm))
@@ -182,7 +177,6 @@ def course_of(runs: Sequence[Path]) -> Course:
 
 
 def courses_of(settings: Settings, delay: str) -> dict[str, Course]:
-    """Return the trainings at a delay that have finished: PPO or SAC -> course; none without ``full``."""
     return {
         NAMES[recipe]: course_of(runs)
         for recipe, runs in (trained(settings.folder, delay) if settings.full else {}).items()
@@ -190,7 +184,6 @@ def courses_of(settings: Settings, delay: str) -> dict[str, Course]:
 
 
 def reproduce_curves(delay: str, settings: Settings) -> Made:
-    """Reproduce the learning curves at one delay from the trainings of ``--full``."""
     courses = {each: courses_of(settings, each) for each in (HIGH, LOW)}
     if not all(name in courses[each] for each in courses for name in NAMES.values()):
         why = "needs trainings at both delays; --full does them"
@@ -228,7 +221,6 @@ STATEMENTS = {
 
 
 def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Claim]:
-    """Return the paper's statements about the learning curves at a delay."""
     high, low = courses[HIGH], courses[LOW]
     if delay == HIGH:
         apart = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
@@ -249,7 +241,7 @@ def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Clai
 
 
 def faster(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
-    """Return whether SAC converges faster. The paper's axis is the progress of trainings whose lengths it keeps."""
+    """Does SAC converge faster? The paper's axis is the progress of trainings whose lengths it does not give."""
     ends = {name: (course.converged.mean(), course.decisions) for name, course in courses.items()}
     text = ", ".join(f"{name} after {at:,.0f} of {whole:,.0f} decisions" for name, (at, whole) in ends.items())
     why = f"in decisions or in % of the training? The lengths are ours: {text} is at nine tenths of its rise"

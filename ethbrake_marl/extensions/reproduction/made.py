@@ -1,4 +1,4 @@
-"""What an item of a reproduction needs, and what comes out of it. An item is a figure or a table of the paper."""
+"""Input and results of an item of a reproduction. An item is a figure or a table of the paper."""
 
 from __future__ import annotations
 
@@ -21,8 +21,6 @@ POLICIES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5
 
 @dataclass(frozen=True)
 class Settings:
-    """How a reproduction is made."""
-
     folder: Path  # of all results, and of the trainings
     full: bool = False  # train by the paper's own process, and search over the readings
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
@@ -31,15 +29,12 @@ class Settings:
 
     @property
     def who_drives(self) -> str:
-        """One line about the policies."""
         if self.policies == SHIPPED:
             return POLICIES
         return f"{', '.join(f'{name} is {spec}' for name, spec in self.policies.items())}."
 
 
 class Drawn(NamedTuple):
-    """A figure."""
-
     stem: str  # of the files' names
     title: str
     text: str  # description
@@ -47,8 +42,6 @@ class Drawn(NamedTuple):
 
 
 class Made(NamedTuple):
-    """What an item shows."""
-
     claims: Sequence[Claim] = ()  # of the paper
     sheets: Sequence[Sheet] = ()  # tables
     figures: Sequence[Drawn] = ()
@@ -56,8 +49,6 @@ class Made(NamedTuple):
 
 
 class Item(NamedTuple):
-    """A figure or a table of the paper."""
-
     name: str  # on the command line, and of the folder
     labels: tuple[str, ...]  # in the paper's source
     title: str

@@ -10,20 +10,20 @@ where f(n) is its speed after the impacts of sample n. Where the gap of a pair i
 0, its speeds change by eq. (13). The paper leaves open, and this map resolves:
 
 * Impacts follow each other from the rear pair to the front pair: in the paper f is f1 applied after f3. The harm of the
-  front impact is that of the speeds that f3 leaves; the paper's J_harm has those before both.
+  front impact has the speeds that f3 leaves; the paper's J_harm has those before both.
 * The paper's f1 and f3 would also pull vehicles together that overlap and separate. Its text below eq. (13) requires a
   positive closing speed, and so does this map. As in the exact physics, a touch does no harm.
 * Before the first decision worlds move exactly, and have no impact, as the paper assumes.
-* The command of a step is that in force at its first sample (zero-order hold).
+* The command of a step is the one in force at its first sample (zero-order hold).
 * ``0 <= v <= v_max`` is a constraint on u in the paper: commands are limited so that the speed keeps it at the next
   sample. An impact can leave a negative speed, which brakes bring back to 0 with the commanded deceleration, or one
   above v_max, at which engines do nothing; a coasting vehicle keeps both.
 * A sample is on a vehicle's latency if it is at most 1e-6 of a step before it, because times are rounded.
 
-The term ``collision`` of a reward is then the paper's r_collision, of the sample at which the step begins; the overlap
-at an episode's last sample does not count. The term ``risk`` is of the sample at which the step ends, and ``jerk`` has
-the commands before they are limited, as in the exact physics. Gaps are negative while vehicles overlap; nothing pushes
-them apart. Source: the paper, sections "Optimization Problem" and "MDP formulation".
+The term ``collision`` of a reward is then the paper's r_collision at the sample at which the step begins; the overlap
+at an episode's last sample does not count. The term ``risk`` is computed at the sample at which the step ends, and
+``jerk`` from the commands before they are limited, as in the exact physics. Gaps are negative while vehicles overlap;
+nothing pushes them apart. Source: the paper, sections "Optimization Problem" and "MDP formulation".
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def exchange(line: Floats, car: Floats) -> None:
 
 
 def sample(state: State, step_s: float) -> State:
-    """Return worlds at a sample one sample later: impacts, then a step with ``state.wanted`` [n, N + 1] m/s2."""
+    """Return the state one sample later: impacts, then a step with ``state.wanted`` [n, N + 1] m/s2."""
     line, clock = state.line.copy(), state.clock.copy()
     exchange(line, state.car)
     now, speed, limit = clock[:, TIME, np.newaxis], line[:, SPEED], state.car[:, LIMIT]
@@ -116,15 +116,13 @@ def collision(params: RewardParams, before: State, step: Step, after: State) -> 
 
 
 class MappedGame(Game):
-    """A game in which vehicles move by the paper's map."""
-
     __slots__ = ()
 
     def first_decision(self, alert: State) -> State:
         """Return the episodes at the first sample.
 
-        Raises ``InvalidInput`` for worlds with an impact before it, and for those of a scenario with exact impacts:
-        agents would plan with them.
+        Raises ``InvalidInput`` for worlds with an impact before it, and for worlds of a scenario with exact impacts,
+        with which agents would plan.
         """
         if PHYSICS not in alert.memories:
             raise InvalidInput(
@@ -141,7 +139,7 @@ class MappedGame(Game):
         return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """Return the state one sample later, and what the step did. The memory of ``state`` is not reused."""
+        """The memory of ``state`` is not reused."""
         before, rules = one_step.decided(self.rules, self.scripts, state, actions), self.rules
         after, over = sample(before, rules.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
@@ -164,7 +162,7 @@ class PaperMap:
     """``physics: paper-map``."""
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse what the paper's map has not: an obstacle, brakes that build up, messages."""
+        """Refuse an obstacle, brakes that build up, and messages."""
         right = "is not known to physics: paper-map; leave one of the two out"
         for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
             require(key not in scenario.sources, (key,), UNSHOWN, right)

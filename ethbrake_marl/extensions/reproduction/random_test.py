@@ -1,6 +1,6 @@
 """The paper's random test (``Table:Random``) under a reading: collision rate and mean harm of its four strategies.
 
-A row of the table depends on some fields of a reading alone: what readings have in common is simulated once.
+A row of the table depends only on some fields of a reading: what readings have in common is simulated once.
 """
 
 from __future__ import annotations
@@ -48,15 +48,13 @@ Outcome = Mapping[str, NDArray[Any]]  # collided [n]; first, total: harm [n] m2/
 
 
 def outcome_of(last: State) -> Outcome:
-    """Return what has happened in episodes."""
     return {"collided": last.collided, "first": last.harm("first"), "total": last.harm("total")}
 
 
 def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED) -> Table:
     """Return the table under a reading, in the first worlds of the random test, with 95 % intervals.
 
-    ``policies`` are the specs of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the
-    coupled H* in the paper's map.
+    ``policies`` are the specs of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the coupled H* in the paper's map.
     """
     specs = {HYBRID_SAC: policies["SAC"], HYBRID_PPO: policies["PPO"]}
     return {row: estimate(row, reading.only(*DEPENDS[row]), episodes, specs.get(row, "")) for row in DEPENDS}
@@ -64,7 +62,6 @@ def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIP
 
 @cache
 def estimate(row: str, reading: Reading, episodes: int, spec: str) -> tuple[Estimate, Estimate]:
-    """Return collision rate and mean harm of a row."""
     collided, harm = reported(row, reading, episodes, spec)
     return rate(collided), mean(harm)
 
@@ -93,16 +90,13 @@ def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple
 
 
 def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str = "first") -> Outcome:
-    """Return what the hybrid does: where the policy does more harm than H*, E-V2X-BM drives the whole episode.
-
-    ``bound`` is H*, [n] m2/s2.
-    """
+    """If the policy does more harm than ``bound`` (H*, [n] m2/s2), E-V2X-BM drives the whole episode."""
     follows = policy[counted] <= bound
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
 
 
 def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
-    """Return what is reported: what happens, or what was predicted at the alert."""
+    """Return what happens, or what was predicted at the alert."""
     if numbers == "predicted":
         return predicted > 0.0, predicted
     return collided, predicted if numbers == "predicted harm, realised collisions" else harm
@@ -110,7 +104,6 @@ def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tu
 
 @lru_cache(16)  # a search needs the worlds of one reading, and those for which E-V2X-BM plans
 def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
-    """Return scenario, game and worlds at the alert."""
     scenario, game = open_game(worlds.scenario(worlds.base))
     return scenario, game, scenario.sample(episodes, worlds.seed)
 
@@ -119,7 +112,7 @@ def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
 def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> Outcome:
     """Let all vehicles brake fully, or Vehicle 2 as E-V2X-BM plans.
 
-    After an impact vehicles brake on, or coast from the next decision on, or the episode ends there.
+    After an impact vehicles brake on, or coast from the next decision on, or the episode ends.
     """
     if after_impact != "brakes on" and worlds.step_s is None:
         worlds = worlds._replace(others=(*worlds.others, ("time_step_s", SHORT_STEP_S)))
@@ -163,7 +156,7 @@ def plan(plans: Reading, episodes: int) -> Choice:
 
 @cache
 def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> Outcome:
-    """Let an agent drive Vehicle 2. Where a policy drives that was trained elsewhere, the page says so."""
+    """Let an agent drive Vehicle 2, also a policy that was trained elsewhere: the page says so."""
     scenario, game, alert = opened(worlds, episodes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Unfamiliar)

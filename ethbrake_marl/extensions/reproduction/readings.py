@@ -30,7 +30,6 @@ WORDS = {  # field of a reading -> its default in words, and another value
 
 
 def say(field: str, value: Any) -> str:
-    """Return a value of a field of a reading in words."""
     default, other = WORDS[field]
     if value == Reading._field_defaults[field]:
         return default
@@ -57,7 +56,6 @@ class Reading(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What differs from the defaults, in words."""
         changed = (field for field, value in self._asdict().items() if value != self._field_defaults[field])
         return "; ".join(say(field, getattr(self, field)) for field in changed) or "as stated"
 
@@ -66,7 +64,6 @@ class Reading(NamedTuple):
         return Reading(**{field: getattr(self, field) for field in fields})
 
     def scenario(self, name: str) -> Scenario:
-        """Return a shipped scenario of three vehicles under this reading."""
         scenario = load_scenario(name)
         keys = dict(self.others)
         latency_s = [*scenario.model_dump()["latency_s"]]

@@ -27,12 +27,10 @@ class Gap(NamedTuple):
 
 
 def each(field: str, *values: Any) -> tuple[Reading, ...]:
-    """Return readings with other values of one field."""
     return tuple(STATED._replace(**{field: value}) for value in values)
 
 
 def key(name: str, *values: Any) -> tuple[Reading, ...]:
-    """Return readings with other values of one key of the scenario."""
     return tuple(STATED._replace(others=((name, value),)) for value in values)
 
 
@@ -90,7 +88,6 @@ COMBINED = Gap("several at once", "", "", (
 
 
 def reproduce_gaps(settings: Settings) -> Made:
-    """Measure every alternative of the register."""
     episodes = min(WORLDS, settings.episodes)
     asked = [(DEFAULTS, STATED), *((gap, each) for gap in (*GAPS, COMBINED) for each in gap.alternatives)]
     rows = []

@@ -5,7 +5,7 @@ The eight independent numbers are collision rate and average harm of four strate
 By the plain mean another reading is as near as the nearest, and which of both is nearer depends on the list of worlds.
 
 The nearest reading is a hypothesis: among so many readings some come near by chance. To judge this, the search also
-looks for tables that nobody has printed. Each of their numbers is from a reading drawn at random, one draw for each.
+looks for tables that nobody has printed, each number of which comes from a reading drawn at random.
 """
 
 from __future__ import annotations
@@ -94,24 +94,24 @@ def search(
 
 
 def numbers_of(table: Table) -> Floats:
-    """Return collision rate and mean harm (m2/s2) of the four rows, [4, 2]."""
+    """Collision rate and mean harm (m2/s2) of the four rows, [4, 2]."""
     return np.array([[each.value for each in row] for row in table.values()])
 
 
 def differences(numbers: Floats, printed: Floats = PRINTED) -> Floats:
-    """Return the differences of numbers [..., 4, 2] from a printed table [4, 2], as [..., 8]."""
+    """Numbers [..., 4, 2], printed [4, 2] -> differences [..., 8]."""
     return np.abs(numbers / printed - 1.0).reshape(*numbers.shape[:-2], -1)
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> Any:
-    """Return the distance of numbers [..., 4, 2] from a printed table, [...]."""
+    """Numbers [..., 4, 2] -> distance [...]."""
     return np.sqrt(np.square(differences(numbers, printed)).mean(axis=-1))
 
 
 def by_chance(numbers: Floats) -> Floats:
     """Return the distance of the nearest reading from each of some tables that nobody has printed, [FAKES].
 
-    ``numbers`` [R, 4, 2] are those of all readings.
+    ``numbers`` [R, 4, 2]: all readings.
     """
     drawn = np.random.default_rng(0).integers(len(numbers), size=(FAKES, *PRINTED.shape))
     fakes = np.take_along_axis(numbers, drawn, axis=0)
@@ -119,7 +119,6 @@ def by_chance(numbers: Floats) -> Floats:
 
 
 def reproduce_search(settings: Settings) -> Made:
-    """Search for the nearest reading, with ``full``; measure the nearest ones again in more worlds."""
     if not settings.full:
         return Made(notes=["The search needs `--full`."])
     episodes, again = min(WORLDS, settings.episodes), min(WORLDS_AGAIN, settings.episodes)

@@ -31,10 +31,9 @@ MAP_STEP_S = 0.1
 
 
 def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Outcome]:
-    """Return what each strategy does; where impacts are exact, also E-V2X-BM (coupled) and its hybrids.
+    """Return what each strategy does; if impacts are exact, also E-V2X-BM (coupled) and its hybrids.
 
-    ``policies``: name -> spec. Hybrids decide by first-impact harm, as Algorithm 1: a policy whose harm is above H*
-    leaves the whole episode to E-V2X-BM.
+    ``policies``: name -> spec. Hybrids decide by first-impact harm.
     """
     worlds, plans = reading.only(*WORLDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
@@ -62,6 +61,6 @@ def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[
 
 
 def least_harm(reading: Reading, episodes: int) -> Floats:
-    """Return a lower bound that is proven for every strategy under exact impacts, [n] m2/s2."""
+    """Return a proven lower bound for every strategy under exact impacts, [n] m2/s2."""
     scenario, _, alert = opened(reading.only(*WORLDS), episodes)
     return lower_bound(alert, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm

@@ -57,7 +57,6 @@ Reported = Mapping[str, tuple[Bools, Floats]]  # row of the paper -> collided, h
 
 
 def estimate(quantity: str, row: tuple[Bools, Floats], braking: tuple[Bools, Floats]) -> Estimate:
-    """Return our number for one that the paper prints."""
     if quantity == RATE:
         return rate(row[0])
     saved = decrease(row[1], braking[1]) if quantity == DECREASE else None
@@ -109,7 +108,7 @@ def number_claims(
 
 
 def outcomes_sheet(title: str, found: Mapping[str, Outcome], least: Floats) -> Sheet:
-    """Return a table of what strategies do; ``least`` [n] m2/s2 is a proven lower bound for all of them."""
+    """``least`` [n] m2/s2 is a proven lower bound for all strategies."""
     rows = [
         (
             *(name, rate(each["collided"]), mean(each["first"]), mean(each["total"])),
@@ -125,7 +124,7 @@ COLUMNS = PERCENT, *map(Column, ("First-impact harm", "Total harm", "Predicted h
 
 
 def process_sheet(settings: Settings, reading: Reading, episodes: int) -> list[Sheet]:
-    """Return a table of the paper's process in its map, means over seeds with t intervals; none without trainings."""
+    """The paper's process in its map, means over seeds with t intervals; nothing without trainings."""
     found = of_the_process(reading, episodes, settings)
     if not found:
         return []
@@ -150,7 +149,7 @@ def compared(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[L
 
 
 def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less]:
-    """Compare the collision rate of a strategy (%) with those of others, in the same worlds."""
+    """Compare the collision rate (%) of a strategy with those of others, in the same worlds."""
     percent = {name: 100.0 * each["collided"] for name, each in found.items()}
     return [
         Less.of_worlds(f"{smaller} minus {other}, % of worlds", percent[smaller], percent[other]) for other in larger
@@ -158,7 +157,7 @@ def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less
 
 
 def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: str, larger: str) -> list[Less]:
-    """Compare both harms of two strategies of the paper's process, ``{}`` for the policy, over its seeds."""
+    """Compare two strategies of the paper's process, ``{}`` for the policy, over its seeds."""
     parts = []
     for name, seeds in process.items():
         one, other = smaller.format(name), larger.format(name)
@@ -192,7 +191,6 @@ def conclusions(found: Mapping[str, Outcome], policies: Iterable[str]) -> dict[s
 
 
 def reproduce_random_table(settings: Settings) -> Made:
-    """Reproduce the table of the random test, and judge the paper's two contributions."""
     episodes, policies = settings.episodes, settings.policies
     least = least_harm(STATED, episodes)
     rows = {E_V2X_BM: "", NON_E: "", **{f"Hybrid {name}": spec for name, spec in policies.items()}}
@@ -219,7 +217,7 @@ def reproduce_random_table(settings: Settings) -> Made:
 
 
 def reproduce_hybrid_table(settings: Settings) -> Made:
-    """Reproduce the table of 5,000 worlds, with the speeds of the random test."""
+    """The table of 5,000 worlds, with the speeds of the random test."""
     episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged(settings.folder)
     least = least_harm(STATED, episodes)
 

@@ -29,7 +29,6 @@ Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the 
 
 @cache
 def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Records:
-    """Return the recorded episodes; ``policies`` are pairs of a name and a spec."""
     records = {}
     for number in SCENARIOS:
         scenario, game = open_game(reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}"))
@@ -61,7 +60,7 @@ def road_figure(records: Records, caption: str) -> Figure:
 
 @in_our_style
 def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
-    """Draw the command of Vehicle 2 over time, a panel for each policy and scenario: label of a curve -> episodes."""
+    """Draw the command of Vehicle 2 over time, a panel for each policy and scenario; ``curves``: label -> episodes."""
     figure, every = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
     for axes, key in zip(every, next(iter(curves.values())), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
@@ -76,7 +75,7 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 
 
 def all_records(settings: Settings) -> dict[str, Records]:
-    """Return the episodes as stated, in the nearest reading, and of the first seed of the paper's process."""
+    """As stated, in the nearest reading, and of the first seed of the paper's process."""
     policies = tuple(settings.policies.items())
     found = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
     trained = tuple((name, specs[0]) for name, specs in process(settings).items())
@@ -84,7 +83,6 @@ def all_records(settings: Settings) -> dict[str, Records]:
 
 
 def reproduce_trajectories(settings: Settings) -> Made:
-    """Reproduce the trajectories."""
     every, parts = all_records(settings), []
     figures = []
     for number, (name, records) in enumerate(every.items(), 1):
@@ -126,7 +124,6 @@ def reproduce_trajectories(settings: Settings) -> Made:
 
 
 def reproduce_accelerations(settings: Settings) -> Made:
-    """Reproduce the commands of Vehicle 2."""
     every, parts = all_records(settings), []
     text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
     figure = Drawn("accelerations", "Acceleration profiles", text, profiles_figure(every, text))
@@ -168,7 +165,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
 def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
     """Return a recorded quantity under PPO, and under SAC at the same times; an episode that has ended stays as it is.
 
-    ``number`` is that of the scenario, ``what`` an attribute of ``EpisodeRecord``, ``column`` a vehicle or pair from 0.
+    ``what`` is an attribute of ``EpisodeRecord``, ``column`` a vehicle or pair from 0.
     """
     pair = [records[name, number] for name in ("PPO", "SAC")]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
@@ -176,7 +173,7 @@ def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
 
 
 def apart(records: Records, number: int, what: str) -> float:
-    """Return the root mean square over time of the difference between PPO and SAC, of Vehicle 2."""
+    """Return the root mean square over time of the difference between PPO and SAC, for Vehicle 2."""
     one, other = both(records, number, what, VEHICLE_2)
     return float(np.sqrt(np.mean((one - other) * (one - other))))
 
@@ -196,7 +193,7 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
 
 
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return the first command of Vehicle 2 and the sum of its changes (m/s2), and how long it brakes while it moves.
+    """Return the first command of Vehicle 2 and the sum of its changes (m/s2), and how long it brakes.
 
     The last is a share of the time in which it moves after its latency.
     """

@@ -2,7 +2,6 @@
 
 The *chance difference* is the largest difference between means of two random lists of worlds that is due to chance
 alone (95 %): sqrt(2) times half of the interval. A printed number
-
 - *agrees* if ours is within 2 % of it;
 - is *undecided* if ours is within the chance difference of it: too few worlds;
 - *cannot be* if a lower bound that is proven for every strategy is above it by more than the chance difference;
@@ -42,20 +41,17 @@ class Claim(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Outcome and reason."""
         link = " because " if self.outcome in ("differs", "cannot be") else ": "
         return f"{self.outcome}{link}{self.why}" if self.why else self.outcome
 
 
 def claims_sheet(claims: Sequence[Claim]) -> Sheet:
-    """Return the table."""
     rows = [(each.where, each.paper, each.ours, each.nearest, each.verdict) for each in claims]
     headings = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
     return Sheet("", [Column(heading, text=True) for heading in headings], rows)
 
 
 def chance(ours: Estimate) -> float:
-    """Return the chance difference."""
     low, high = ours.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
 
@@ -70,8 +66,6 @@ def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) 
 
 
 class Less(NamedTuple):
-    """One of the comparisons that a statement needs, such as one for each group of worlds."""
-
     where: str
     difference: Estimate  # what should be smaller, minus the other
     both_are_0: bool = False  # in every world: nothing can be smaller
@@ -88,7 +82,6 @@ class Less(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Whether the interval of the difference is below 0."""
         return self.difference.ends[1] < 0.0
 
 
@@ -111,7 +104,7 @@ def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, O
 def judge(
     where: str, paper: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, why: str = "", show: Column = APART
 ) -> Claim:
-    """Return a statement as a claim; ``why``: the reason if it differs."""
+    """``why``: the reason if the statement differs."""
     ours, outcome, numbers = judge_statement(stated, show)
     other = judge_statement(nearest, show)[0] if nearest else ""
     text = f"{why} ({numbers})" if why and outcome == "differs" else numbers

@@ -31,8 +31,6 @@ ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as
 
 
 class Memory(NamedTuple):
-    """What the agent decided at the alert."""
-
     commands_mps2: Floats  # [n, T] at every decision
     start_s: Floats  # [n] time of the first decision
     predicted_harm: Floats  # [n] m2/s2
@@ -41,7 +39,7 @@ class Memory(NamedTuple):
 class Planner:
     """Drives commands that it chose at the alert; it assumes that other learners brake fully.
 
-    If they do, its ``predicted_harm`` is to the last bit the harm that happens.
+    If they do, ``predicted_harm`` is to the last bit the harm that happens.
     """
 
     knows = MODEL
@@ -50,28 +48,27 @@ class Planner:
         self.name, self.scenario, self.count = name, scenario, count
 
     def begin(self, alert: State, body: int) -> Memory:
-        """Choose. Raises ``InvalidInput`` where another vehicle's commands are not known at the alert."""
+        """Choose. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
         game, alert = alone(self.scenario, alert, body)
         problem = problem_of(game, alert, count=self.count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
         return Memory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Return commands at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
+        """Return commands at every decision, [n, T] m/s2, and their cost, [n] m2/s2."""
         raise NotImplementedError
 
     def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
-        """Return the command of the latest decision of the plan, [n] m/s2, and the memory as it was."""
         step = np.floor((state.time_s - memory.start_s) / self.scenario.time_step_s + ROUNDING).astype(np.int64)
         at = np.clip(step, 0, memory.commands_mps2.shape[1] - 1)
         return memory.commands_mps2[np.arange(state.n), at], memory
 
 
 class BestHarm(Planner):
-    """Drives the best profile that is known: of a shipped table, or of a search.
+    """Drives the best known profile: from a shipped table, or from a search.
 
     A search begins with E-V2X-BM. If this vehicle is the only learner, the better of its result and of a shipped
-    policy's episode is improved once more; so it does never more harm than either.
+    policy's episode is improved once more, so the agent never does more harm than either.
     """
 
     def __init__(self, scenario: Scenario, count: str = "first", budget: int = BUDGET, name: str = "best_harm") -> None:
@@ -79,13 +76,13 @@ class BestHarm(Planner):
         self.budget = budget
 
     def check(self, game: Game, body: int) -> None:
-        """Warn (``Unfamiliar``) where the scenario's table is for other physics, so that every world is searched."""
+        """Warn (``Unfamiliar``) if the scenario's table is for other physics, so that every world is searched."""
         outdated = outdated_tables()
         if game.name in outdated:
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Look the worlds up; search those that are in no table, or all for another objective than the line's harm."""
+        """Search the worlds that are in no table, and all of them if the objective is not the line's harm."""
         known, profiles = best_known(problem, self.count)
         commands = profiles.stepwise(int(problem.last_step.max()))[:, :, 0]
         harm = problem.value(problem.follow(profiles))
@@ -97,7 +94,6 @@ class BestHarm(Planner):
         return commands, harm
 
     def search(self, game: Game, alert: State, problem: Problem, body: int, steps: int) -> tuple[Floats, Floats]:
-        """Search these worlds."""
         profiles, values = search_profiles(problem, e_v2x_bm_profiles(problem, alert), budget=self.budget)
         best = profiles.stepwise(steps)[:, :, 0]
         if self.scenario.learners != (body,):
@@ -113,8 +109,9 @@ class BestHarm(Planner):
 
 
 class Searched(Planner):
-    """Improves another agent's commands by a search at the alert. It is never worse than that agent, if others keep
-    their commands.
+    """Improves another agent's commands by a search at the alert.
+
+    It is never worse than that agent, if other vehicles keep their commands.
     """
 
     def __init__(self, inner: Agent, scenario: Scenario, count: str = "first", candidates: int = CANDIDATES) -> None:
@@ -123,12 +120,10 @@ class Searched(Planner):
         self.inner, self.candidates = inner, candidates
 
     def check(self, game: Game, body: int) -> None:
-        """Ask the inner agent whether it should drive here."""
         if hasattr(self.inner, "check"):
             self.inner.check(game, body)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Let the inner agent drive, and search around its commands."""
         start = commands_of(problem, game, alert, Team(self.inner.name, {body: self.inner}))[:, :, 0]
         return refine(problem, start, budget=self.candidates)
 
@@ -136,7 +131,7 @@ class Searched(Planner):
 def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
     """Return the game in which one vehicle learns and the other learners brake fully, and its worlds.
 
-    Raises ``InvalidInput`` where an agent drives another vehicle, so that its commands are not known at the alert.
+    Raises ``InvalidInput`` if an agent drives another vehicle, because its commands are not known at the alert.
     """
     for other, role in enumerate(scenario.roles.values(), 1):
         if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
@@ -150,7 +145,6 @@ def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:
-    """Return the agent ``best_harm[:CANDIDATES]``. Raises ``InvalidInput`` for an argument that is no number."""
     budget = BUDGET if argument is None else int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
     if not 1 <= budget <= MOST_CANDIDATES:
         raise InvalidInput(
@@ -161,7 +155,6 @@ def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:
 
 
 def make_searched(team: Team, argument: str | None, settings: Any) -> Team:
-    """Return the team whose agents search around their commands. Raises ``InvalidInput`` if it has a shield."""
     if team.shield is not None:
         raise InvalidInput(
             f"agent {settings.spec!r}: a search around a shield; write +search first: AGENT+search+SHIELD"

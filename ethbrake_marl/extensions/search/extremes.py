@@ -28,8 +28,8 @@ WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # steps by which the second cha
 def extreme_profiles(problem: Problem) -> Profiles:
     """Return the best extreme profiles of one controlled vehicle, [n * KEPT]: first those of world 0, and so on.
 
-    Where it meets its neighbours is computed as if they braked fully. A world in which a vehicle moves backward, or
-    where there is no neighbour, has profiles of coasting in place of some.
+    The meetings are computed as if the neighbours braked fully. Profiles of coasting fill up a world in which a vehicle
+    moves backward, or without neighbours.
     """
     (body,), n, last = problem.bodies.tolist(), problem.n, problem.last_step
     at, random = rows_of(problem.state, body), seeded(problem.identity, 0)
@@ -83,7 +83,6 @@ def write_extreme(kind, change, meeting, early, share, step, last, low, high, en
 
 @large
 def write_extremes(at, kind, changes, step, last, low, high, ends, commands):
-    """Write the extreme profiles that change at these times (s), in all ways, [TIMES * WAYS]."""
     row = 0
     for change in changes:
         meeting = meeting_of(at, kind, change)
@@ -93,7 +92,6 @@ def write_extremes(at, kind, changes, step, last, low, high, ends, commands):
 
 
 def extremes(problem: Problem, k: int, at: Floats, kind: int, changes: Floats) -> Profiles:
-    """Return the extreme profiles of world k that change at these times (s), [TIMES * WAYS]."""
     size = len(changes) * len(WAYS)
     ends, commands = np.empty((size, EXTREME_PHASES), np.int64), np.empty((size, EXTREME_PHASES, 1))
     (low, high), last = problem.bounds[k, 0].tolist(), int(problem.last_step[k])

@@ -1,8 +1,8 @@
 """Compiled random search for the best commands in one world: follow a profile, gather good ones, improve one.
 
 A profile has ``ends`` [K], the decisions at which its phases end, and ``commands`` [K, B] (m/s2). Every world has a
-random stream of its own, so its result does not depend on other worlds. The same functions search profiles of a few
-phases, and plans with one phase for each decision. They use no functions of NumPy, so they also compile for a GPU.
+random stream of its own, so its result does not depend on other worlds. Plans are profiles with one phase for each
+decision. No function of NumPy is used, so the kernels also compile for a GPU.
 """
 
 from __future__ import annotations
@@ -75,14 +75,13 @@ class Field(NamedTuple):
 
 @kernel
 def value_of(world, line):
-    """Return what is minimised (m2/s2): with a little of the other count of harm."""
+    """Return what is minimised (m2/s2), plus a little of the other count of harm."""
     aim = world.numbers[AIM]
     return worth(line, world.shares, world.weights[0], aim) + OTHER_WEIGHT * amount_so_far(line, world.weights[1])
 
 
 @kernel
 def move_line(line, into):
-    """Copy all rows of a line."""
     for row in range(line.shape[0]):
         for i in range(line.shape[1]):
             into[row, i] = line[row, i]
@@ -92,9 +91,9 @@ def move_line(line, into):
 def follow(world, lines, ends, commands, phase, most):
     """Simulate a profile from ``phase`` on; return its value (m2/s2), and the number of phases until the end.
 
-    It begins with ``lines[phase]`` and writes the state after phase p to ``lines[p + 1]``. It ends when all vehicles
-    are at rest, or the value reaches ``most`` (m2/s2). The number of phases is -1 if a check of the physics fails. Step
-    by step it has the bits of the episode; phase by phase it is several times faster and rounds differently.
+    Begins with ``lines[phase]`` and writes the state after phase p to ``lines[p + 1]``. Ends when all vehicles are at
+    rest, or the value reaches ``most`` (m2/s2). The number of phases is -1 if a check of the physics fails. Step by
+    step it has the bits of the episode; phase by phase it is several times faster and rounds differently.
     """
     numbers, clock = world.numbers, world.clock
     value = value_of(world, lines[phase])
@@ -122,7 +121,7 @@ def follow(world, lines, ends, commands, phase, most):
 
 @large
 def draw(random):
-    """Return the next random number, uniform in [0, 1), of a splitmix64 generator."""
+    """Return the next random number in [0, 1) of a splitmix64 generator."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -133,13 +132,11 @@ def draw(random):
 
 @large
 def draw_below(random, n):
-    """Return a random whole number from 0 to n - 1."""
     return min(int(draw(random) * n), n - 1)
 
 
 @large
 def draw_sign(random):
-    """Return 1 or -1."""
     return 1.0 if draw(random) < 0.5 else -1.0
 
 
@@ -195,7 +192,7 @@ def draw_profile(world, drawing, ends, commands):
 
 @large
 def draw_change(world, active, drawing, change):
-    """Draw a change of a profile whose first ``active`` phases matter. The sizes of amounts are log-uniform."""
+    """Draw a change within the first ``active`` phases. The sizes of amounts are log-uniform."""
     random, bounds = world.random, world.bounds
     if drawing[KIND] == PLAN:
         low, high = bounds[0, 0], bounds[0, 1]
@@ -224,7 +221,7 @@ def draw_change(world, active, drawing, change):
 
 @large
 def apply_change(change, bounds, ends, commands):
-    """Change a profile in place; return whether it has become another."""
+    """Change a profile in place; return whether it is now different."""
     what, b, p, amount = int(change[WHAT]), int(change[VEHICLE]), int(change[PHASE]), change[AMOUNT]
     low, high, phases = bounds[b, 0], bounds[b, 1], ends.shape[0]
     begin, changed = ends[p - 1] if p > 0 else 0, False
@@ -252,7 +249,6 @@ def apply_change(change, bounds, ends, commands):
 
 @large
 def copy_profile(ends, commands, to_ends, to_commands):
-    """Copy the phases of a profile over the first phases of another."""
     for p in range(ends.shape[0]):
         to_ends[p] = ends[p]
         for b in range(commands.shape[1]):
@@ -261,7 +257,7 @@ def copy_profile(ends, commands, to_ends, to_commands):
 
 @kernel
 def largest(values):
-    """Return the place of the largest value, the first of equal ones."""
+    """Return the index of the largest value, the first of equal ones."""
     place = 0
     for m in range(1, values.shape[0]):
         if values[m] > values[place]:
@@ -301,10 +297,10 @@ def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
 
 @large
 def improve(world, room, ends, commands, budget, drawing, least):
-    """Improve a profile in place by random changes, at most ``budget`` of them, until its value is at most ``least``.
+    """Improve a profile in place by at most ``budget`` random changes, until its value is at most ``least``.
 
     Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its episode ends. An
-    amount that helps is doubled and tried again. A change of a profile that leaves it as it was costs nothing.
+    amount that helps is doubled and tried again. Outside of plans, a change without effect costs nothing.
     """
     change, lines, tried = room.change, room.lines, room.tried
     value, active, spent, phase, again = math.inf, 0, -1, 0, False

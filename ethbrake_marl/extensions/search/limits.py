@@ -1,7 +1,4 @@
-"""The measures ``limits``: the least harm and honest cost known in each world, and how far an agent is from them.
-
-They are asked for by name.
-"""
+"""The measures ``limits``: the least harm and honest cost known in each world, and how far an agent is from them."""
 
 from __future__ import annotations
 

@@ -52,17 +52,15 @@ LARGEST = 2.0  # largest weighted harm of a vehicle
 
 
 class Profiles(NamedTuple):
-    """One profile in each of n worlds. In phase j the commands ``commands_mps2[k, j]`` hold in world k.
+    """One profile in each of n worlds: ``commands_mps2[k, j]`` holds in world k until decision ``ends[k, j]``.
 
-    A phase lasts until decision ``ends[k, j]``. Phases that a profile does not need are empty: they begin and end at
-    the last step.
+    Phases that a profile does not need are empty: they begin and end at the last step.
     """
 
     ends: Ints  # [n, K] number of the decision at which each phase ends
     commands_mps2: Floats  # [n, K, B] commands in each phase; negative brakes
 
     def take(self, rows: Any) -> Profiles:
-        """Return the profiles of the worlds ``rows``."""
         return Profiles(self.ends[rows], self.commands_mps2[rows])
 
     def stepwise(self, decisions: int) -> Floats:
@@ -80,13 +78,13 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def of_steps(commands_mps2: Floats, last_step: Ints) -> Profiles:
-        """Return profiles with one phase for each decision. ``commands_mps2`` is [n, T, B], ``last_step`` [n]."""
+        """Return profiles with one phase for each decision, from commands [n, T, B] and ``last_step`` [n]."""
         ends = np.minimum(np.arange(1, commands_mps2.shape[1] + 1), last_step[:, np.newaxis])
         return Profiles(ends, np.ascontiguousarray(commands_mps2))
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int = 1) -> list[Profiles]:
-        """Return the profiles of all parts with the same number of phases, at least ``least``, by empty phases."""
+        """Give all parts the same number of phases, at least ``least``, by empty phases."""
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
             Profiles(
@@ -98,7 +96,6 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def join(parts: Sequence[Profiles]) -> Profiles:
-        """Return the profiles of all parts, one part after the other."""
         return Profiles(*(np.concatenate(arrays) for arrays in zip(*Profiles.padded(parts), strict=True)))
 
 
@@ -133,7 +130,6 @@ class Problem(NamedTuple):
 
     @property
     def n(self) -> int:
-        """Number of worlds."""
         return self.state.n
 
     @property
@@ -148,11 +144,9 @@ class Problem(NamedTuple):
         return np.ascontiguousarray(np.stack([-car[:, BRAKING], car[:, DRIVING]], axis=2))
 
     def take(self, rows: Any) -> Problem:
-        """Return the problem in the worlds ``rows``."""
         return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
 
     def counting(self, count: str) -> Problem:
-        """Return the problem that minimises another count of harm."""
         return self._replace(harm_count=count)
 
     def even_grid(self, number: int) -> Floats:
@@ -173,14 +167,13 @@ class Problem(NamedTuple):
         return Profiles(np.repeat(ends, Q, axis=0), commands)
 
     def coasting(self) -> Profiles:
-        """Return the profiles of coasting, [n]."""
         return Profiles(self.last_step[:, np.newaxis].copy(), np.zeros((self.n, 1, len(self.bodies))))
 
     def follow(self, profiles: Profiles) -> State:
         """Return the last states of the episodes in which the controlled vehicles follow their profiles.
 
-        To the last bit these are the episodes in which agents do. Raises ``InvalidInput`` for profiles that do not fit
-        or exceed a capacity, and ``PhysicsError`` if a check of the physics fails.
+        To the last bit these are the episodes in which agents do. Raises ``InvalidInput`` as ``check`` does, and
+        ``PhysicsError`` if a check of the physics fails.
         """
         self.check(profiles)
         line, car, clock, know, wanted, memories = self.state
@@ -196,7 +189,7 @@ class Problem(NamedTuple):
         return State(line, car, clock, know, wanted, memories)
 
     def value(self, last: State, count: str | None = None) -> Floats:
-        """Return what the search minimises, [n] m2/s2, of episodes with these last states. ``count`` None: its own."""
+        """Return what the search minimises in episodes with these last states, [n] m2/s2. ``count`` None: its own."""
         value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
         worths(last.line, self.shares, weights, self.aim, value)
         return value
@@ -246,21 +239,16 @@ def problem_of(
     objective: Declared = "total",
     deciders: Sequence[int] | None = None,
 ) -> Problem:
-    """Return the problem of choosing commands of some vehicles in worlds at the alert, or of the learners.
+    """Return the problem of choosing commands of some vehicles in worlds at the alert.
 
     Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles.
 
-    Args:
-        game: rules of the episodes.
-        alert: worlds at the alert.
-        bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
-        count: what is minimised (``episode.counts``).
-        objective: what the controlled vehicles minimise, as under a scenario's key ``objective``.
-        deciders: the first decision is at their shortest latency; None: ``bodies``.
+    ``bodies``: controlled vehicles (1: Vehicle 1); None: the learners. ``count``: what is minimised
+    (``episode.counts``). ``objective``: as a scenario's key. ``deciders``: the first decision is at their shortest
+    latency; None: ``bodies``.
 
     Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is no weighted harm, and
     a script that looks at the state, whose commands are not known at the alert.
-
     """
     check_exact(alert, "a search for the best braking")
     check_count("count", count)
@@ -289,7 +277,7 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
     """Return a hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
     These are the world, the commands of all other vehicles, who is controlled, and ``times`` [n, 4]: first decision,
-    time step, number of steps, horizon. Tables of best known harm look worlds up by it.
+    time step, number of steps, horizon.
     """
     line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)
     controlled = np.zeros(alert.wanted.shape)
@@ -312,8 +300,7 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
 def aimed(problem: Problem, objective: Declared) -> Problem:
     """Return the problem that minimises the objective of the controlled vehicles.
 
-    Raises ``InvalidInput`` if it is neither a weighted sum of the vehicles' harm nor ``maximin``, or if the controlled
-    vehicles have different ones.
+    Raises ``InvalidInput`` if it is neither a weighted sum of harm nor ``maximin``, or differs among them.
     """
     car, chosen = problem.state.car, [body - 1 for body in problem.bodies.tolist()]
     objectives = objectives_of(objective, problem.state.vehicles)
@@ -333,7 +320,7 @@ def aimed(problem: Problem, objective: Declared) -> Problem:
 
 @kernel
 def worth(line, shares, weights, aim):
-    """Return what a search minimises (m2/s2) of one world; it never falls in an episode."""
+    """Return what a search minimises (m2/s2) in one world; it never falls in an episode."""
     if aim == WHOLE:
         return amount_so_far(line, weights)
     value, from_ahead = 0.0, 0.0
@@ -350,14 +337,13 @@ def worth(line, shares, weights, aim):
 
 @large
 def worths(line, shares, weights, aim, out):
-    """Write what a search minimises to ``out`` [n]."""
     for k in range(len(out)):
         out[k] = worth(line[k], shares[k], weights, aim)
 
 
 @large
 def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, horizon_s, scratch, failed):
-    """Follow every profile, decision by decision, in place; set ``failed`` [n] where a check of the physics fails."""
+    """Follow every profile in place, decision by decision; set ``failed`` [n] where a check of the physics fails."""
     for k in range(len(failed)):
         phase = 0
         while clock[k, ENDED] == 0.0:

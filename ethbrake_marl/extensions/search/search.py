@@ -37,17 +37,11 @@ def search_profiles(
 ) -> tuple[Profiles, dict[str, Floats]]:
     """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
 
-    It has at most ``MOST_PHASES`` phases and is at least as good as every given one.
-
-    Args:
-        problem: n worlds, and what is minimised in them.
-        given: profiles with which the search starts, [n * Q]: first the Q profiles of world 0, and so on.
-        budget: number of profiles that are simulated in each world, about.
-        seed: of the random search.
-        threads: number of threads; the result is the same for any.
+    It has at most ``MOST_PHASES`` phases and is at least as good as each of the profiles ``given``, [n * Q]: first the
+    Q profiles of world 0, and so on. ``budget`` is about the number of profiles that are simulated in each world. The
+    result is the same for any number of threads.
 
     Raises ``InvalidInput`` for a bad number, and ``PhysicsError`` for worlds in which no profile can be simulated.
-
     """
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
@@ -107,7 +101,6 @@ def search_world(world: World, room: Room, given: Profiles, last: int, budget: i
 
 
 def sort(field: Field, left: int) -> None:
-    """Sort the first ``left`` profiles of a field, the best first."""
     order = np.argsort(field.values[:left], kind="stable")
     for array in field:
         array[:left] = array[order]
@@ -135,7 +128,7 @@ def divide(field: Field, attention: int) -> None:
 
 
 def select(world: World, room: Room, given: Profiles, field: Field) -> None:
-    """Simulate step by step from now on; the best one of the field's first and of the given profiles becomes first."""
+    """Simulate step by step from now on; the best of the field's first and of the given profiles becomes the first."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
@@ -145,11 +138,11 @@ def select(world: World, room: Room, given: Profiles, field: Field) -> None:
 
 
 def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
-    """Improve one vehicle's commands of every decision; return the best, [n, T] m/s2, and their values, [n] m2/s2.
+    """Improve one vehicle's commands at every decision; return the best, [n, T] m/s2, and their values, [n] m2/s2.
 
-    They are at least as good as the given commands ``commands_mps2`` [n, T]. Beside these, the best of some random
-    templates is improved, because small changes may miss the best commands. A template is one command, another for a
-    while, then full braking.
+    They are at least as good as the given commands ``commands_mps2`` [n, T]. The best of some random templates is
+    improved as well, because small changes may miss the best commands. A template is one command, another for a while,
+    then full braking.
 
     Raises ``InvalidInput`` for several controlled vehicles, commands that do not fit, or a budget below 1, and
     ``PhysicsError`` for worlds in which the given commands cannot be simulated.
@@ -193,14 +186,12 @@ def seeded(identity: UInt64s, seed: int) -> UInt64s:
 
 
 def field_for(profiles: int, phases: int, controlled: int) -> Field:
-    """Return an empty field for so many profiles."""
     commands = np.zeros((profiles, phases, controlled))
     ends, used = np.zeros((profiles, phases), np.int64), np.zeros(profiles, np.int64)
     return Field(ends, commands, used, np.full(profiles, np.inf))
 
 
 def prepared(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
-    """Return world k of a problem, and working memory for profiles of so many phases."""
     state = problem.state
     numbers = np.array([problem.time_step_s, problem.horizon_s, problem.aim, stepwise])
     count = problem.harm_count

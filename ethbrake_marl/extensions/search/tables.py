@@ -1,4 +1,4 @@
-"""Tables of best known harm: for each world, found by a hash, the least harm that is known, and its profile."""
+"""Tables of best known harm: for each world, looked up by a hash, the least harm that is known, and its profile."""
 
 from __future__ import annotations
 
@@ -33,8 +33,6 @@ OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # a
 
 @dataclass(frozen=True, slots=True)
 class BestHarmTable:
-    """The least harm known in n worlds, in one or more counts."""
-
     identity: UInt64s  # [n] hash of each world (``pricing.identities``)
     harm: Mapping[str, Floats]  # count -> [n] m2/s2, or what else the search has minimised
     profiles: Mapping[str, Profiles]  # count -> profiles with this harm
@@ -42,10 +40,7 @@ class BestHarmTable:
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
-        """Read a table. Raises ``InvalidInput`` if there is no such file, ``CorruptBundle`` if it is not a table.
-
-        The size is checked before the file is unpacked, and no pickle is read.
-        """
+        """Read a table, without pickles. Raises ``InvalidInput`` without a file, ``CorruptBundle`` for a bad one."""
         if not path.exists():
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
@@ -64,11 +59,10 @@ class BestHarmTable:
         return cls(arrays["identity"], harm, profiles, header)
 
     def save(self, path: Path) -> None:
-        """Write the table: a compressed .npz without pickles. If writing fails, an old file stays as it was."""
+        """Write a compressed .npz without pickles. If writing fails, an old file stays as it was."""
         write_file(path, self.content())
 
     def content(self) -> bytes:
-        """Return the content of the file."""
         header = np.frombuffer(json.dumps({"format": FORMAT, **self.header}).encode(), np.uint8)
         arrays: dict[str, NDArray[Any]] = {"header": header, "identity": self.identity}
         for count, (ends, commands) in self.profiles.items():
@@ -85,7 +79,7 @@ class BestHarmTable:
         return np.where(self.identity[rows] == identity, rows, -1)
 
     def stored(self, problem: Problem, count: str) -> tuple[Floats, Profiles]:
-        """Return the least harm known of the problem's worlds, [n] m2/s2, and its profiles.
+        """Return the least known harm of the problem's worlds, [n] m2/s2, and its profiles.
 
         A world that is not in the table has infinite harm and the profile of coasting.
         """
@@ -99,7 +93,6 @@ class BestHarmTable:
         return np.where(known, self.harm[count][rows], np.inf), profiles
 
     def check_holds_any(self, identity: UInt64s) -> None:
-        """Raise ``InvalidInput`` if the table holds none of these worlds."""
         if not (self.rows(identity) >= 0).any():
             contents = ", ".join(f"{key} {self.header[key]}" for key in ABOUT if key in self.header)
             raise InvalidInput(
@@ -114,7 +107,7 @@ def _shipped() -> tuple[BestHarmTable, ...]:
 
 
 def shipped_tables() -> tuple[BestHarmTable, ...]:
-    """Return the shipped tables that are for this installation's physics, in the order of their files' names."""
+    """Return the shipped tables for this installation's physics, in the order of their files' names."""
     return tuple(table for table in _shipped() if table.header.get("physics") == physics_digest())
 
 
@@ -131,14 +124,14 @@ def outdated_tables() -> dict[str, str]:
 
 
 def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
-    """Return the least harm of each world in the shipped tables, [n] m2/s2, and its profiles, as ``stored`` does."""
+    """``stored`` in all shipped tables."""
     found = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()
     return best_of([each for each in found if np.isfinite(each[0]).any()] or [nothing])
 
 
 def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a .npz file. Raises ``ValueError`` for a damaged or too large one."""
+    """Raises ``ValueError`` for a damaged or too large file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())
@@ -151,7 +144,6 @@ def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _check(arrays: Mapping[str, NDArray[Any]], counts: list[str]) -> None:
-    """Check names, types and shapes: n worlds, K phases and B controlled vehicles in each count. Check all numbers."""
     wanted = ARRAYS | {f"{count}_{name}": kind for count in counts for name, kind in OF_COUNT.items()}
     for name in sorted(wanted.keys() ^ arrays.keys()):
         raise ValueError(f"array {name!r}: {'is missing' if name in wanted else 'must not be in this file'}")

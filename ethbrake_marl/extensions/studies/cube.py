@@ -19,8 +19,6 @@ Place = tuple[tuple[int, ...], int]  # stream of random numbers (``worlds.counte
 
 
 class Cube(NamedTuple):
-    """The coordinates of a scenario's worlds."""
-
     scenario: Scenario
     places: tuple[Place, ...]
 

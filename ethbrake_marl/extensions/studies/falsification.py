@@ -28,16 +28,8 @@ def search(
     The points are tried in rounds. Half of a round is spread evenly over the cube (scrambled Sobol points). Each other
     point is one step away from a *parent*, one of the best points so far that are not close to each other: a normally
     distributed step in some coordinates, or half the difference between two random parents (differential evolution). In
-    the first round, and later while no score is above the median score, all points are spread evenly. The same seed
-    gives the same points.
-
-    Args:
-        score: function from points [n, d] to scores [n].
-        dimensions: number of coordinates, d.
-        budget: number of points to try.
-        seed: seed of the random numbers.
-        on_round: called after each round with the number of points tried so far.
-
+    the first round, and later while no score is above the median score, all points are spread evenly. ``on_round`` gets
+    the number of points tried so far. The same seed gives the same points.
     """
     rng, spread = np.random.default_rng([seed, dimensions]), _spread(dimensions, seed)
     points, scores = np.empty((0, dimensions)), np.empty(0)
@@ -63,9 +55,9 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(points: Floats, scores: Floats, count: int) -> Ints:
-    """Choose at most ``count`` points with high finite scores, any two of which differ by 0.1 in some coordinate.
+    """Return at most ``count`` rows of points with high finite scores, the highest first.
 
-    Return their row numbers, highest score first.
+    Any two of them differ by at least ``APART`` in some coordinate.
     """
     order = np.argsort(-scores, kind="stable")
     order = order[np.isfinite(scores[order])]

@@ -1,7 +1,4 @@
-"""The folder of a study, for instance of an ablation.
-
-Only one process at a time may work in the folder, and all processes must use the same settings.
-"""
+"""The folder of a study, for instance of an ablation: one process at a time, and always the same settings."""
 
 from __future__ import annotations
 
@@ -27,14 +24,13 @@ def work_in(
 
     Args:
         folder: created if necessary.
-        kind: words for the content of the folder in messages, such as ``an ablation``.
+        kind: words for its content in messages, such as ``an ablation``.
         settings: all settings and software versions on which the results depend, as plain data.
         record: name of the file that stores them.
         advice: last words of an error message, which say what the user can do.
         writes: names of the files that the study will overwrite.
 
-    Raises ``InvalidInput`` if the path is not a folder, if it or a file in ``writes`` is not writable, if the folder
-    stores other settings, and if another process works in it.
+    Raises ``InvalidInput`` if the folder is not writable or stores other settings, and if another process works in it.
 
     """
     check_folder(folder, writes, force=True)

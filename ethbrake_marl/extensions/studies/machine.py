@@ -11,7 +11,6 @@ from ethbrake_marl import __version__
 
 
 def this_machine() -> str:
-    """Return what this machine is now, in one line for captions."""
     information, cores = Path("/proc/cpuinfo"), os.cpu_count() or 1
     lines = information.read_text("utf-8").splitlines() if information.is_file() else []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

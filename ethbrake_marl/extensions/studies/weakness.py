@@ -23,8 +23,6 @@ HINDSIGHT = "best_harm"  # with what regret compares by default
 
 
 class Measured(NamedTuple):
-    """What an agent does in n worlds, m2/s2."""
-
     score: Floats  # [n] value of the measure, the larger the worse for the agent
     harm: Floats  # [n] harm of the agent
     reference: Floats | None  # [n] harm of the other agent, or bound of the agent's shield; None for ``harm``
@@ -32,7 +30,6 @@ class Measured(NamedTuple):
 
 class Measure(NamedTuple):
     """``harm``: the agent's harm. ``regret``: its harm minus that of another agent, by default the best known harm.
-
     ``bound``: its harm minus the bound of its shield at the alert; above 0 the bound is broken.
     """
 
@@ -44,7 +41,7 @@ class Measure(NamedTuple):
 
     @classmethod
     def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> Measure:
-        """Return a measure of an agent; ``against`` is the other one (None: none, or the best known commands).
+        """``against`` is the other agent; None: none, or the best known commands.
 
         Both are names or agents, as ``eb.evaluate`` takes them. Raises ``InvalidInput`` if another agent is not
         compared, or a name means several, and the errors of ``teams_of``.
@@ -62,7 +59,7 @@ class Measure(NamedTuple):
         return cls(name, loaded, game, sum(teams, ()), harm_count)
 
     def __call__(self, worlds: State) -> Measured:
-        """Return what the agent does in each world. Raises ``InvalidInput`` for ``bound`` without a shield."""
+        """Raises ``InvalidInput`` for ``bound`` without a shield."""
         last, *other = (drive(self.game, worlds, team) for team in self.teams)
         harm = last.harm(self.harm_count)
         if self.name == "harm":
@@ -83,15 +80,9 @@ class Measure(NamedTuple):
 
         Returns the worst worlds at the alert, worst first, what the agent does in them, and the scores of all tried
         worlds [budget] (m2/s2; minus infinity: the scenario rejects the world). For every measure but ``bound``, only
-        worlds with a score above 0 are returned, perhaps none. Raises the errors of ``cube_of``, and ``InvalidInput``
-        if the scenario rejects every tried world.
+        worlds with a score above 0 are returned, perhaps none. Any two of the at most ``most`` worlds differ clearly.
 
-        Args:
-            budget: number of worlds to try.
-            seed: of the search.
-            most: largest number of worlds in the result; any two of them differ clearly.
-            on_round: called with the number of worlds tried so far.
-
+        Raises the errors of ``cube_of``, and ``InvalidInput`` if the scenario rejects every tried world.
         """
         cube = cube_of(self.scenario)
 

@@ -1,8 +1,7 @@
 """Whole episodes in numba's simulator of a GPU, which runs the threads in Python and does not clear their memory.
 
 ``NUMBA_ENABLE_CUDASIM=1 NUMBA_DISABLE_JIT=1 python -m tests.extensions.cuda.simulated 2`` drives two worlds of each
-scenario, compares all bits, and prints the decisions. Then it searches one world, and compares with the same search
-without threads.
+scenario and searches one world, and compares the bits with the same code without threads.
 """
 
 from __future__ import annotations

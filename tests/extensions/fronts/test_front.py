@@ -1,4 +1,4 @@
-"""The front of a list: no constant, agent or point of other weights is better; one answer for any batch."""
+"""The front of a list: no constant, agent or point of other weights is better, and a batch changes nothing."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What a message contains (``v2x: tells``): who believes what, by hand."""
+"""What a message contains (``v2x: tells``), and therefore what each vehicle believes; numbers by hand."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A game with messages: infos, scripts, plans, interfaces; and a game without them, which pays nothing."""
+"""A game with messages (infos, scripts, plans, interfaces), and that a game without messages pays nothing."""
 
 from typing import Any
 

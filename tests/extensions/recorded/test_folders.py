@@ -1,4 +1,4 @@
-"""Folders as they are downloaded: searched below, other files skipped, bad ones refused and listed; hostile ones."""
+"""Folders as they are downloaded: subfolders are searched, other files skipped, bad and hostile ones refused."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""``best_harm`` and ``+search``: as predicted, never worse than what they begin with; and the measures ``limits``."""
+"""``best_harm`` and ``+search`` do what they predict, never worse than their start; and the measures ``limits``."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""What profiles cost: by hand, as agents that drive them, in every count and objective; and hashes of worlds."""
+"""What profiles cost, by hand and as agents drive them, in every count and objective; and hashes of worlds."""
 
 from collections.abc import Callable
 from typing import Any
