@@ -22,12 +22,12 @@ WORLDS = SCENARIO.sample(8, seed=11)
 PROBLEM = problem_of(GAME, WORLDS)
 
 MEANS = {  # harm of docs/results/best-harm.md, m2/s2: first-impact, total
-    "cooperation-2-blocked": (16.610, 16.722), "cooperation-2-five": (11.555, 11.641),
-    "paper-delay-high": (21.935, 22.093), "paper-delay-low": (0.160, 0.163), "paper-delay-middle": (1.916, 1.938),
-    "paper-distance": (1.046, 1.065), "paper-random": (6.436, 6.489), "paper-random-brake-only": (7.906, 7.972),
-    "paper-random-early": (3.095, 3.154), "paper-random-obstacle": (22.900, 36.290),
-    "realistic-mixed": (11.333, 11.480),
-    "realistic-motorway": (6.388, 6.426), "stress-wide": (50.670, 54.423),
+    "cooperation-2-blocked": (16.609, 16.718), "cooperation-2-five": (11.554, 11.640),
+    "paper-delay-high": (21.930, 22.089), "paper-delay-low": (0.160, 0.162), "paper-delay-middle": (1.915, 1.938),
+    "paper-distance": (1.044, 1.063), "paper-random": (6.427, 6.482), "paper-random-brake-only": (7.891, 7.960),
+    "paper-random-early": (3.091, 3.150), "paper-random-obstacle": (22.438, 32.370),
+    "realistic-mixed": (11.331, 11.477),
+    "realistic-motorway": (6.388, 6.426), "stress-wide": (50.652, 54.413),
 }  # fmt: skip
 
 
