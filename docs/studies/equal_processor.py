@@ -1,4 +1,4 @@
-"""Algorithms at equal processor time on the three tests, for docs/extensions/learners.md and docs/results.
+"""Algorithms at equal processor time on the three tests, for docs/results/learning.md.
 
     .venv/bin/python docs/studies/equal_processor.py SECONDS FOLDER docs/figures/learning-curves-equal.png
 
