@@ -8,8 +8,12 @@ finds the largest smallest gap ``m``:
     0 <= v[k] <= limit          x_i[k] - x_i+1[k] >= m    for every pair (i, i+1) that holds a controlled vehicle
 
 ``o[k]`` is the part of the step after the vehicle's latency. All other vehicles brake fully from theirs. A controlled
-vehicle with another one in front must stand at the horizon. docs/internals/proofs/avoidable-contact.md derives
-the tolerance.
+vehicle with another one in front must stand at the horizon.
+
+The tolerance is ``h^2 max(a + a_u)``. Each change of the command within a step moves a position by at most
+``(a + a_u) h^2 / 8``, so with at most six changes m is at least the true margin minus 3/4 of the tolerance. Within a
+step a gap can be smaller than at its ends by at most a quarter of the tolerance. One controlled vehicle needs four
+changes. For several the number is not known, so the programme is only an approximation there.
 """
 
 import math
