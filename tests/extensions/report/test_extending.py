@@ -23,7 +23,7 @@ def test_page__its_code_runs_from_the_top_down(
     names: dict[str, Any] = {"__name__": "my_file"}
     exec(compile(code, "extend.md", "exec"), names)
     assert names["status"] == 0
-    assert "6.31\n" in capsys.readouterr().out
+    assert "\n-2.60\n" in capsys.readouterr().out
     assert run_command(["scenario", "parts"]) == 0
     told = capsys.readouterr().out
     assert all(name in told for name in ("comfort", "time_gap", "rural", "front-first", "patient", "absorbed"))
