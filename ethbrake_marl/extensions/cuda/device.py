@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -42,15 +43,34 @@ def device_named(name: str) -> torch.device:
         raise InvalidInput(f"device = {name!r}: must be 'cuda', or 'cpu', where the same code runs slowly")
     if device.type == "cuda":
         _check_gpu(device.index or 0)
-        device = torch.device("cuda", device.index or 0)
-    return device
+        return torch.device("cuda", device.index or 0)
+    return torch.device("cpu")  # without a number, as tensors have it
+
+
+class TooLittleMemory(InvalidInput):
+    """What was asked for needs more memory than the device has."""
+
+
+@contextmanager
+def enough_memory(what: str) -> Iterator[None]:
+    """Context manager: too little memory raises ``TooLittleMemory``, whose message begins with ``what``.
+
+    Of several such managers the outermost decides, since its names are the caller's.
+    """
+    try:
+        yield
+    except (TooLittleMemory, MemoryError, RuntimeError) as error:
+        of_torch = isinstance(error, RuntimeError) and not isinstance(error, torch.OutOfMemoryError)
+        if of_torch and "can't allocate memory" not in str(error):  # which torch says of a processor
+            raise
+        raise TooLittleMemory(f"{what}: need more memory than the device has; choose smaller numbers") from None
 
 
 def _check_gpu(index: int) -> None:
     if torch.version.cuda is None:
         raise InvalidInput(
             f"device = 'cuda': the installed torch {torch.__version__} is not built for NVIDIA's GPUs; install a build"
-            " that is (pip install torch, on Linux), or use device 'cpu'"
+            " that is (on Linux: pip install --force-reinstall torch), or use device 'cpu'"
         )
     if not torch.cuda.is_available():
         raise InvalidInput(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ethbrake_marl.episode.counts import other_count, weights_of
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
-from ethbrake_marl.extensions.cuda.device import Kernel, device_named
+from ethbrake_marl.extensions.cuda.device import Kernel, device_named, enough_memory
 from ethbrake_marl.extensions.cuda.search_kernels import Own, Plans, Searched, search_each, shapes_of
 from ethbrake_marl.extensions.proofs.line import rows_of
 from ethbrake_marl.extensions.search.kernels import STEPWISE
@@ -52,30 +52,34 @@ def search(
         seed: of the random numbers.
         device: as for ``Worlds``.
 
-    Raises ``InvalidInput`` for a bad number or device, and ``PhysicsError`` for worlds in which no profile can be
-    simulated.
+    Raises ``InvalidInput`` for a bad number or device, and for more worlds than it has memory for, and
+    ``PhysicsError`` for worlds in which no profile can be simulated.
 
     """
     for name, value, least in (("rounds", rounds, 1), ("drawn", drawn, 1), ("changes", changes, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
-    if restarts not in (1 << k for k in range(11)):
+    check_whole_number("restarts", restarts, 1, 1024)
+    if restarts & (restarts - 1):
         raise InvalidInput(f"restarts = {restarts!r}: must be a power of two, from 1 to 1024")
-    if not (seconds is None or seconds >= 0.0):
-        raise InvalidInput(f"seconds = {seconds!r}: must be None, or 0 or more")
+    if not (seconds is None or 0.0 <= seconds < np.inf):
+        raise InvalidInput(f"seconds = {seconds!r}: must be None, or a number of 0 or more")
+    if not problem.n:
+        raise InvalidInput("problem: has no world; must have one or more")
     on, n, begun = device_named(device), problem.n, time.monotonic()
-    searched, kernel = searched_worlds(problem, on)
-    plans = started(problem, given, restarts, seed, on)
-    drawing = torch.from_numpy(PROFILES.copy()).to(on)
-    for number in range(rounds if seconds is None else 1 << 20):
-        asked = (searched, plans, drawing, drawn if number == 0 else 0, changes)
-        kernel.launch(on, n * restarts, *asked)
-        plans = met(plans, n, restarts, number)
-        if seconds is not None:
-            plans.values[0].item()  # waits for the device
-            if time.monotonic() - begun >= seconds:
-                break
-    searched.numbers[STEPWISE] = 1.0
-    kernel.launch(on, n * restarts, searched, plans, drawing, 0, changes)
+    with enough_memory(f"n = {n} worlds, restarts = {restarts} threads in each, on device {str(on)!r}"):
+        searched, kernel = searched_worlds(problem, on)
+        plans = started(problem, given, restarts, seed, on)
+        drawing = torch.from_numpy(PROFILES.copy()).to(on)
+        for number in range(rounds if seconds is None else 1 << 20):
+            asked = (searched, plans, drawing, drawn if number == 0 else 0, changes)
+            kernel.launch(on, n * restarts, *asked)
+            plans = met(plans, n, restarts, number)
+            if seconds is not None:
+                plans.values[0].item()  # waits for the device
+                if time.monotonic() - begun >= seconds:
+                    break
+        searched.numbers[STEPWISE] = 1.0
+        kernel.launch(on, n * restarts, searched, plans, drawing, 0, changes)
     values, best = plans.values.reshape(restarts, n).min(dim=0)
     failed = torch.isinf(values).nonzero()[:, 0].tolist()
     if failed:
