@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -15,10 +16,11 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.cuda.device import Kernel, device_named, enough_memory
 from ethbrake_marl.extensions.cuda.search_kernels import Own, Plans, Searched, search_each, shapes_of
 from ethbrake_marl.extensions.proofs.line import rows_of
+from ethbrake_marl.extensions.search.best_harm import joined
 from ethbrake_marl.extensions.search.kernels import STEPWISE
-from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
+from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, best_of
 from ethbrake_marl.extensions.search.search import PROFILES, seeded
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import BRAKING, Floats
 
 WHOLE_NUMBERS = ("ends", "best_ends", "kind")  # in a thread's own memory
 
@@ -38,13 +40,15 @@ def search(
     """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
 
     Of ``restarts`` threads in each world every one draws random profiles and improves the best. After each round the
-    threads meet in pairs, and both go on from the better profile. The last round goes decision by decision.
+    threads meet in pairs, and both go on from the better profile. The last round goes decision by decision. Several
+    controlled vehicles are first searched one by one, while the others brake fully; the result is at least as good.
 
     Args:
         problem: n worlds, and what is minimised in them (``problem_of``). For a front repeat its worlds, each time with
             other weights: ``problem.take(rows).minimising(weights)``.
         given: profiles with which threads begin, [n * Q]: first the Q profiles of world 0, and so on.
-        seconds: begin no further round later; the result then depends on the speed. None: ``rounds`` of them.
+        seconds: begin no further round later; the result then depends on the speed. None: ``rounds`` of them. Of
+            several controlled vehicles each one by itself has an equal part of this time.
         rounds: of random changes.
         restarts: threads in each world, a power of two.
         drawn: random profiles that each thread tries in the first round, beside some of full driving and braking.
@@ -66,6 +70,11 @@ def search(
     if not problem.n:
         raise InvalidInput("problem: has no world; must have one or more")
     on, n, begun = device_named(device), problem.n, time.monotonic()
+    if len(problem.bodies) > 1:
+        part = None if seconds is None else seconds / (1 + len(problem.bodies))
+        effort: Any = {"rounds": rounds, "restarts": restarts, "drawn": drawn, "changes": changes, "seed": seed}
+        alone = best_alone(problem, partial(search, seconds=part, device=device, **effort))
+        given = alone if given is None else joined([given, alone], n)
     with enough_memory(f"n = {n} worlds, restarts = {restarts} threads in each, on device {str(on)!r}"):
         searched, kernel = searched_worlds(problem, on)
         plans = started(problem, given, restarts, seed, on)
@@ -88,6 +97,21 @@ def search(
     ends, commands = plans.ends[:, rows].cpu().numpy(), plans.commands[..., rows].cpu().numpy()
     found = Profiles(ends.T.copy(), np.moveaxis(commands, -1, 0).copy())
     return found, problem.values(found)
+
+
+def best_alone(problem: Problem, search: Callable[..., Any]) -> Profiles:
+    """Return the best profiles of one controlled vehicle, [n], while the other controlled ones brake fully."""
+    results, braking = [], -problem.state.car[:, BRAKING][:, problem.bodies]
+    for c, body in enumerate(problem.bodies.tolist()):
+        wanted = problem.state.wanted.copy()
+        wanted[:, problem.bodies] = braking
+        wanted[:, body] = 0.0
+        best, _ = search(problem._replace(bodies=problem.bodies[[c]], state=problem.state._replace(wanted=wanted)))
+        commands = np.repeat(braking[:, np.newaxis], best.ends.shape[1], axis=1)
+        commands[:, :, c] = best.commands_mps2[:, :, 0]
+        both = Profiles(best.ends, commands)
+        results.append((problem.value(problem.follow(both)), both))
+    return best_of(results)[1]
 
 
 def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kernel]:
@@ -132,7 +156,10 @@ def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, 
         if len(short.ends) != n * Q or not Q:
             raise InvalidInput(f"given: has {len(short.ends)} profiles; must have some for each of the {n} worlds")
         if not restarts >= Q:
-            raise InvalidInput(f"given: has {Q} profiles for each world, but {restarts} threads search it (restarts)")
+            what = "with one for several vehicles, " if C > 1 else ""
+            raise InvalidInput(
+                f"given: has {Q} profiles for each world, {what}but {restarts} threads search it (restarts)"
+            )
         problem.take(np.repeat(np.arange(n), Q)).check(short)
         ends[:Q] = np.moveaxis(short.ends.reshape(n, Q, -1), 1, 0)
         commands[:Q] = np.moveaxis(short.commands_mps2.reshape(n, Q, MOST_PHASES, C), 1, 0)

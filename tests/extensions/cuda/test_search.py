@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.cuda.profiles import met, search
+from ethbrake_marl.extensions.cuda.profiles import best_alone, met, search
 from ethbrake_marl.extensions.cuda.search_kernels import Plans
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
 from tests.refused import refused
@@ -62,6 +63,22 @@ def test_several_controlled_vehicles(scenario: str, bodies: list[int] | None) ->
     braking = asked.values(asked.constant(asked.bounds[:, np.newaxis, :, 0]))
     assert values["first"].mean() < 0.9 * braking["first"].mean()
     asked.check(best)
+
+
+def test_several_vehicles__do_no_more_harm_than_one_of_them_while_the_others_brake() -> None:
+    loaded, game = eb.open_game("cooperation-3-pair")
+    worlds, effort = loaded.sample(10, seed=7), {**SMALL, "drawn": 60, "changes": 200}
+    asked = problem_of(game, worlds)
+    _, values = search(asked, **effort)
+    alone = asked.values(best_alone(asked, partial(search, **effort)))["first"]
+    assert (values["first"] <= alone + 1e-9).all()
+    for body in (2, 3):
+        _, own = search(problem_of(game, worlds, [body], deciders=[2, 3]), **effort)
+        assert alone.mean() < own["first"].mean() + 0.1
+    start = Profiles(np.full((10, 1), 75), np.zeros((10, 1, 2)))
+    search(problem_of(game, worlds), start, **effort)  # which may be given beside it
+    with refused("given: has 2 profiles for each world, with one for several vehicles, but 1 threads search it"):
+        search(problem_of(game, worlds), start, **effort | {"restarts": 1})
 
 
 def test_weights__give_a_front() -> None:
