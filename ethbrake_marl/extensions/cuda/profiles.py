@@ -136,13 +136,7 @@ def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kerne
         np.uint64 if name == "random" else np.int64 if name in WHOLE_NUMBERS else np.float64 for name in Own._fields
     ]
     memory = Own(*(np.zeros(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)))
-    return searched, Kernel("search-" + "-".join(map(str, size)), partial(_thread, shapes), search_each, memory)
-
-
-def _thread(shapes: Own) -> Any:
-    from ethbrake_marl.extensions.cuda.threads import search_thread  # numba.cuda is slow to import
-
-    return search_thread(shapes)
+    return searched, Kernel("search", size, shapes, search_each, memory)
 
 
 def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, on: torch.device) -> Plans:

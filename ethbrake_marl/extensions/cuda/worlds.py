@@ -262,10 +262,4 @@ def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Lo
     size = bodies, len(rules.learners), plan.scaling.shape[1], len(plan.offsets)
     shapes = shapes_of(*size)
     memory = Mine(*(np.zeros(shape, np.float32 if shape is shapes.seen else np.float64) for shape in shapes))
-    return ruling, looking, Kernel("play-" + "-".join(map(str, size)), partial(_thread, shapes), play_each, memory)
-
-
-def _thread(shapes: Mine) -> Any:
-    from ethbrake_marl.extensions.cuda.threads import play_thread  # numba.cuda is slow to import
-
-    return play_thread(shapes)
+    return ruling, looking, Kernel("play", size, shapes, play_each, memory)
