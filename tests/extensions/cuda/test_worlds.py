@@ -160,9 +160,10 @@ def test_another_error__is_not_taken_for_too_little_memory() -> None:
         raise RuntimeError("another")
 
 
-def test_actions__in_any_layout_of_memory() -> None:
-    worlds, other = (Worlds("paper-random", 3, 8, "cpu") for _ in range(2))
-    actions = torch.tensor([[-1.0], [0.5], [1.0]])
+@pytest.mark.parametrize("n", [1, 3])
+def test_actions__in_any_layout_of_memory(n: int) -> None:
+    worlds, other = (Worlds("paper-random", n, 8, "cpu") for _ in range(2))
+    actions = torch.tensor([[-1.0], [0.5], [1.0]])[:n]
     turned = torch.complex(actions, -actions).conj().imag  # torch keeps the sign beside the numbers
     for given in (turned, turned.clone().requires_grad_(), turned.repeat(1, 2).t()[:1].t()):
         step, expected = worlds.step(given), other.step(actions)
