@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -24,6 +23,8 @@ from torch import Tensor, nn
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, check_whole_number
+from ethbrake_marl.extensions.cuda.device import enough_memory
+from ethbrake_marl.extensions.cuda.graphs import Graphed
 from ethbrake_marl.files.store import new_folder
 from ethbrake_marl.training.own_team import save_team
 
@@ -117,6 +118,7 @@ class Ppo:
         # actions before clipping, the logarithms of their densities, advantages, and what the critic should return
         self.actions, self.before, self.gains, self.targets = self.stored
         self.rows = torch.zeros(self.actions.numel() // settings.minibatches, dtype=torch.int64, device=device)
+        self.graphs = Graphed(self.collect, device), Graphed(self.update, device)  # on a processor they are no graphs
 
     @torch.no_grad()
     def collect(self) -> None:
@@ -149,42 +151,18 @@ class Ppo:
             nn.utils.clip_grad_norm_(network.parameters(), 0.5)
         self.optimiser.step()
 
-    def learn(self, collect: Callable[[], None], update: Callable[[], None]) -> None:
+    def learn(self) -> None:
         """Collect a rollout and learn from it. Raises the errors of `Worlds.check`."""
+        collect, update = self.graphs
+        torch.set_float32_matmul_precision("high" if self.rate.is_cuda else "highest")  # high: TF32
         collect()
         for _ in range(self.settings.epochs):
             order = torch.randperm(self.actions.numel(), device=self.rows.device)
             for rows in order.split(len(self.rows))[: self.settings.minibatches]:
                 self.rows.copy_(rows)
                 update()
+        torch.set_float32_matmul_precision("highest")  # evaluations are exact to float32
         self.worlds.check()
-
-    def recorded(self) -> tuple[Callable[[], None], Callable[[], None]]:
-        """Return `collect` and `update` as CUDA graphs. What recording them has learned is forgotten again."""
-        torch.cuda.set_device(self.rate.device)
-        before = deepcopy(self.networks.state_dict())
-        torch.set_float32_matmul_precision("high")  # of what is recorded (TF32); evaluations are exact to float32
-        collect, update = graph_of(self.collect), graph_of(self.update)
-        torch.set_float32_matmul_precision("highest")
-        self.networks.load_state_dict(before)
-        for moments in self.optimiser.state.values():
-            for moment in moments.values():
-                moment.zero_()
-        return collect, update
-
-
-def graph_of(call: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that replays the kernels which `call` starts on the GPU, without Python between them."""
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(3):  # until everything is compiled and has its memory
-            call()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        call()
-    return graph.replay
 
 
 # 5. Evaluate the means of the actions, keep the best policy, and save it.
@@ -215,13 +193,12 @@ def train(settings: Settings, folder: Path) -> dict[str, float]:
     listed = eb.cuda.Worlds(scenario, settings.worlds, scenario.sample(settings.worlds, seed=1007), **where)
     env = eb.parallel_env(scenario, agents="learners", reward=reward)  # not driven: says what `save_team` records
     ppo = Ppo(copies, settings)
-    collect, update = ppo.recorded() if ppo.rate.is_cuda else (ppo.collect, ppo.update)
     ppo.seen[-1].copy_(copies.reset())
     updates = -(-settings.steps // ppo.actions.numel())
     best, actor, start = evaluate(ppo.actor, listed), deepcopy(ppo.actor), time.perf_counter()
     for k in range(1, updates + 1):
         ppo.rate.fill_(settings.learning_rate * 0.5 * (1.0 + math.cos(math.pi * (k - 1) / updates)))
-        ppo.learn(collect, update)
+        ppo.learn()
         if k % settings.every == 0 or k == updates:
             spent, decisions, means = time.perf_counter() - start, k * ppo.actions.numel(), evaluate(ppo.actor, listed)
             if means[settings.harm_count] <= best[settings.harm_count]:
@@ -242,7 +219,8 @@ if __name__ == "__main__":
             check_whole_number(name, getattr(settings, name), 1)
         if settings.minibatches > (most := settings.n * settings.rollout):
             raise InvalidInput(f"minibatches = {settings.minibatches}: must be at most n * rollout = {most}")
-        with new_folder(settings.output) as folder:
+        sizes = f"n = {settings.n}, pool = {settings.pool}, rollout = {settings.rollout}"
+        with new_folder(settings.output) as folder, enough_memory(sizes):
             print(f"saved the best policy: {in_words(train(settings, folder))}")
     except (EthBrakeError, OSError) as error:
         parser.exit(2, f"{parser.prog}: error: {error}\n")

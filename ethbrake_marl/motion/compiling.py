@@ -94,7 +94,7 @@ def _has_copied(home: Path | None, folder: Path) -> bool:
     """Copy the machine code for a temporary ``folder``; return False if there is none that may be read and trusted."""
     try:
         kept = None if home is None or not can_be_trusted(home) else home / folder.name
-        if kept is None or not any(kept.rglob("*.nbi")):
+        if kept is None or not any(kept.rglob("*.*")):
             return False
         shutil.copytree(kept, folder, dirs_exist_ok=True)
     except OSError:

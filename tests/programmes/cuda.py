@@ -17,7 +17,7 @@ import torch
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.cuda.device import like
 from ethbrake_marl.extensions.cuda.machine_code import ptx_of
-from ethbrake_marl.extensions.cuda.search import search, searched_worlds, started
+from ethbrake_marl.extensions.cuda.profiles import search, searched_worlds, started
 from ethbrake_marl.extensions.cuda.worlds import Worlds
 from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.search import PROFILES

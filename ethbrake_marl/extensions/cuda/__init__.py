@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
-    from ethbrake_marl.extensions.cuda.search import search as search
+    from ethbrake_marl.extensions.cuda.profiles import search as search
     from ethbrake_marl.extensions.cuda.worlds import Worlds as Worlds
 
 __getattr__ = front_door(__name__, __file__)

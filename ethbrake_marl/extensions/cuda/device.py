@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, NamedTuple
 
 import torch
+from torch import Tensor
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.cuda.machine_code import ptx_of
@@ -19,10 +21,23 @@ BLOCK = 128  # threads that a GPU starts together
 class Kernel(NamedTuple):
     """Something to do in n worlds, in two forms."""
 
-    name: str  # of all that decides its code beside the sources
-    thread: Callable[[], Callable[..., None]]  # returns the kernel of a GPU (``threads``)
+    work: str  # ``play`` or ``search``
+    size: tuple[int, ...]  # which decides ``shapes``
+    shapes: Any  # of a thread's own memory
     each: Callable[..., None]  # does the work of all threads on a processor, with memory ``mine``
     mine: Any  # of one thread, arrays
+
+    @property
+    def name(self) -> str:
+        """Name of all that decides the code beside the sources."""
+        return "-".join([self.work, *map(str, self.size)])
+
+    def thread(self) -> Callable[..., None]:
+        """Return the kernel of a GPU."""
+        from ethbrake_marl.extensions.cuda import threads  # numba.cuda is slow to import
+
+        made: Callable[..., None] = getattr(threads, f"{self.work}_thread")(self.shapes)
+        return made
 
     def launch(self, device: torch.device, n: int, *given: Any) -> None:
         """Do the work of n threads. ``given`` are tensors on this device, numbers, and tuples of both."""
@@ -42,15 +57,34 @@ def device_named(name: str) -> torch.device:
         raise InvalidInput(f"device = {name!r}: must be 'cuda', or 'cpu', where the same code runs slowly")
     if device.type == "cuda":
         _check_gpu(device.index or 0)
-        device = torch.device("cuda", device.index or 0)
-    return device
+        return torch.device("cuda", device.index or 0)
+    return torch.device("cpu")  # without a number, as tensors have it
+
+
+class TooLittleMemory(InvalidInput):
+    """What was asked for needs more memory than the device has."""
+
+
+@contextmanager
+def enough_memory(what: str) -> Iterator[None]:
+    """Context manager: too little memory raises ``TooLittleMemory``, whose message begins with ``what``.
+
+    Of several such managers the outermost decides, since its names are the caller's.
+    """
+    try:
+        yield
+    except (TooLittleMemory, MemoryError, RuntimeError) as error:
+        of_torch = isinstance(error, RuntimeError) and not isinstance(error, torch.OutOfMemoryError)
+        if of_torch and "can't allocate memory" not in str(error):  # which torch says of a processor
+            raise
+        raise TooLittleMemory(f"{what}: need more memory than the device has; choose smaller numbers") from None
 
 
 def _check_gpu(index: int) -> None:
     if torch.version.cuda is None:
         raise InvalidInput(
             f"device = 'cuda': the installed torch {torch.__version__} is not built for NVIDIA's GPUs; install a build"
-            " that is (pip install torch, on Linux), or use device 'cpu'"
+            " that is (on Linux: pip install --force-reinstall torch), or use device 'cpu'"
         )
     if not torch.cuda.is_available():
         raise InvalidInput(
@@ -72,20 +106,19 @@ def _check_gpu(index: int) -> None:
 
 def as_arrays(given: Any) -> Any:
     """Return arguments with arrays of numpy, in the same memory, in place of tensors."""
-    if isinstance(given, torch.Tensor):
-        return given.numpy()
-    if isinstance(given, tuple):
-        parts = [as_arrays(each) for each in given]
-        return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)
-    return given
+    return _with(given, Tensor.numpy)
 
 
 def like(given: Any) -> Any:
     """Return arguments of the same types on the processor: with empty arrays in place of tensors."""
-    if isinstance(given, torch.Tensor):
-        return torch.empty((0,) * given.dim(), dtype=given.dtype).numpy()
+    return _with(given, lambda tensor: torch.empty((0,) * tensor.dim(), dtype=tensor.dtype).numpy())
+
+
+def _with(given: Any, array_of: Callable[[Tensor], Any]) -> Any:
+    if isinstance(given, Tensor):
+        return array_of(given)
     if isinstance(given, tuple):
-        parts = [like(each) for each in given]
+        parts = [_with(each, array_of) for each in given]
         return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)
     return given
 
@@ -99,7 +132,7 @@ def cells_of(given: Any) -> Iterator[Any]:
     if isinstance(given, tuple):
         for each in given:
             yield from cells_of(each)
-    elif isinstance(given, torch.Tensor):
+    elif isinstance(given, Tensor):
         assert given.is_contiguous()
         size = given.element_size()
         shape, strides = given.shape, [size * step for step in given.stride()]

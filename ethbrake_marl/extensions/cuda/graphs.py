@@ -1,8 +1,9 @@
-"""``Graphed``: a function of tensors that a GPU repeats as one CUDA graph, not operation by operation."""
+"""``Graphed``: a function of tensors which a GPU repeats as one CUDA graph, not operation by operation."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,10 +17,10 @@ class Graphed:
     On a GPU the next call overwrites the result. On a processor the function is called as it is.
     """
 
-    def __init__(self, function: Callable[..., Tensor], device: torch.device) -> None:
+    def __init__(self, function: Callable[..., Any], device: torch.device) -> None:
         self.function, self.device, self.calls = function, device, 0
 
-    def __call__(self, *given: Tensor) -> Tensor:
+    def __call__(self, *given: Tensor) -> Any:
         """Return the function's result."""
         if self.device.type != "cuda":
             return self.function(*given)
@@ -34,7 +35,7 @@ class Graphed:
             self.graph.replay()
         return self.result
 
-    def _beside(self, *given: Tensor) -> Tensor:
+    def _beside(self, *given: Tensor) -> Any:
         """Call the function on a stream of its own, as a graph is recorded later."""
         main, beside = torch.cuda.current_stream(), new_stream()
         beside.wait_stream(main)

@@ -29,7 +29,7 @@ def ptx_of(
     if the code has not been made before, and numba-cuda is not installed.
     """
     capability = min(capability, NEWEST)
-    file = folder_of(str(Path(__file__).with_name("kernels.py"))) / f"{name}-{capability[0]}{capability[1]}.ptx"
+    file = folder_of(str(Path(__file__).with_name("threads.py"))) / f"{name}-{capability[0]}{capability[1]}.ptx"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
         write_file(file, made(kernel(), given, capability).encode())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ethbrake_marl.episode.state import ENDED
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.cuda.device import enough_memory
 from ethbrake_marl.extensions.cuda.graphs import Graphed
 from ethbrake_marl.extensions.cuda.kernels import Stored
 from ethbrake_marl.extensions.cuda.worlds import POOL, Worlds
@@ -33,7 +34,7 @@ class CudaVine(Vine):
         """
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
-        where = f"recipe {recipe.name!r} on device {recipe.device!r}"
+        where = place_of(recipe)
         if recipe.experts is not None:
             raise InvalidInput(
                 f"{where}: experts: a mixture of experts trains on a processor only; leave out experts, or train on the"
@@ -41,17 +42,21 @@ class CudaVine(Vine):
             )
         if recipe.tried % recipe.batch_size:
             raise InvalidInput(f"{where}: batch_size = {recipe.batch_size}: must divide tried = {recipe.tried} there")
-        try:
+        with enough_memory(sizes(recipe)):
             return CudaVineModel(training, environment, self.device_of(recipe))
-        except torch.OutOfMemoryError:
-            raise InvalidInput(
-                f"{where}: n_envs = {recipe.n_envs}, tried = {recipe.tried}: need more memory than the device has;"
-                " choose smaller ones"
-            ) from None
 
     def device_of(self, recipe: VineRecipe) -> str:
         """Return the name of the device that trains."""
         return recipe.device
+
+
+def place_of(recipe: VineRecipe) -> str:
+    return f"recipe {recipe.name!r} on device {recipe.device!r}"
+
+
+def sizes(recipe: VineRecipe) -> str:
+    """Return the settings that decide how much memory is needed, for a message."""
+    return f"{place_of(recipe)}: n_envs = {recipe.n_envs}, n_steps = {recipe.n_steps}, tried = {recipe.tried}"
 
 
 class CudaVineModel(VineModel):
@@ -94,6 +99,11 @@ class CudaVineModel(VineModel):
         super()._update_learning_rate(optimizers)
         if isinstance(rate, Tensor):
             group["lr"] = rate.fill_(group["lr"])
+
+    def learn(self, *given: Any, **more: Any) -> Self:
+        """Train as on a processor. Raises ``InvalidInput`` if the device has too little memory."""
+        with enough_memory(sizes(self.recipe)):
+            return super().learn(*given, **more)
 
     def act(self, seen: Tensor) -> Tensor:
         """Return the learners' actions, [n, L], where they observe ``seen`` [n, L, F]."""
@@ -145,4 +155,5 @@ class CudaVineModel(VineModel):
 
     def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
         """Make one step of the optimiser with some decisions; return the loss."""
-        return self.descended(seen, target, weight).clone()
+        loss: Tensor = self.descended(seen, target, weight)
+        return loss.clone()

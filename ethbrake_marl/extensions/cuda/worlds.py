@@ -13,7 +13,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import LAST, State
 from ethbrake_marl.episode.step import HARM, OUT_ROWS, TERMINATED, TOTAL_HARM, TRUNCATED, failure
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.extensions.cuda.device import Kernel, device_named
+from ethbrake_marl.extensions.cuda.device import Kernel, device_named, enough_memory
 from ethbrake_marl.extensions.cuda.kernels import (
     BEGIN,
     LOOK,
@@ -33,6 +33,7 @@ from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
 
 POOL = 100_000  # worlds that are drawn by default
+WHOSE = {"harm": "harm of single vehicles"}  # otherwise the compiled step computes it
 
 
 class Stepped(NamedTuple):
@@ -86,8 +87,9 @@ class Worlds:
             seed: of the training worlds.
 
         Raises ``InvalidInput`` for what no kernel computes: scripts that look at the state, messages, another physics,
-        features and terms of the reward with functions of Python, learners with different views; and for a device
-        that cannot run kernels. Raises ``MissingExtra`` if the kernels must be compiled and numba-cuda is missing.
+        features and terms of the reward with functions of Python, learners with different views; for a device that
+        cannot run kernels; and for more worlds than it has memory for. Raises ``MissingExtra`` if the kernels must be
+        compiled and numba-cuda is missing.
 
         """
         check_whole_number("n", n, 1)
@@ -107,19 +109,20 @@ class Worlds:
             worlds = self.game.draw(pool, seed, 0)
         first = self.game.reset(worlds)
         self.longest = int(first.clock[:, LAST].max())  # decisions of the longest episode
-        self.pool = self.stored(first)
         self.view = self.game.views[int(self.game.rules.learners[0])]
         self.rules, self.looking, self.kernel = kernel_of(self.game, first.vehicles + 1, self.device)
-        self.now = Stored(*(self._zeros(*each.shape[:-1], n) for each in self.pool))
-        self.following = torch.arange(n, device=self.device) % first.n
         L, F = len(self.game.rules.learners), len(self.view.names)
-        self.results = Results(
-            self._zeros(OUT_ROWS, n),
-            self._zeros(n),
-            self._zeros(n, L, F, kind=torch.float32),
-            self._zeros(n, kind=torch.int64),
-        )
-        self._no_actions = self._zeros(n, L, kind=torch.float32)
+        with enough_memory(f"n = {n} worlds, and a pool of {first.n}, on device {str(self.device)!r}"):
+            self.pool = self.stored(first)
+            self.now = Stored(*(self._zeros(*each.shape[:-1], n) for each in self.pool))
+            self.following = self._zeros(n, kind=torch.int64)
+            self.results = Results(
+                self._zeros(OUT_ROWS, n),
+                self._zeros(n),
+                self._zeros(n, L, F, kind=torch.float32),
+                self._zeros(n, kind=torch.int64),
+            )
+            self._no_actions = self._zeros(n, L, kind=torch.float32)
         self.reset()
 
     def _zeros(self, *shape: int, kind: torch.dtype = torch.float64) -> Tensor:
@@ -151,26 +154,30 @@ class Worlds:
         is, and its reward and harm are 0. What goes wrong in a world is kept for ``check``, so that no step waits for
         the device. Raises ``InvalidInput`` for a tensor of another shape, type or device.
         """
-        shape = self._no_actions.shape
-        if not (isinstance(actions, Tensor) and actions.shape == shape and actions.dtype == torch.float32):
+        shape, right = self._no_actions.shape, (torch.float32, torch.strided)
+        if not (isinstance(actions, Tensor) and actions.shape == shape and (actions.dtype, actions.layout) == right):
             what = f"{actions.dtype} of shape {tuple(actions.shape)}" if isinstance(actions, Tensor) else repr(actions)
-            raise InvalidInput(f"actions = {what:.80}: must be a torch tensor, float32, of shape {tuple(shape)}")
+            raise InvalidInput(f"actions = {what:.80}: must be a dense torch tensor, float32, of shape {tuple(shape)}")
         if actions.device != self.device:
             raise InvalidInput(f"actions: are on the device {actions.device}, the worlds on {self.device}")
-        self._launch(actions.detach().contiguous(), RENEW if renew else STEP)
+        self._launch(actions.detach().resolve_neg().contiguous(), RENEW if renew else STEP)
         out, reward, observations, _ = self.results
         ends = out[TERMINATED] == 1.0, out[TRUNCATED] == 1.0
         return Stepped(observations, reward, *ends, out[HARM], out[TOTAL_HARM])
 
     def put(self, stored: Stored, rows: Tensor) -> Tensor:
-        """Continue the episodes ``rows`` [n] of another ``Stored``; return what the learners observe, [n, L, F].
+        """Continue the episodes ``rows`` [n] of any ``Stored``; return what the learners observe, [n, L, F].
 
-        Raises ``InvalidInput`` for another number of rows.
+        Raises ``InvalidInput`` for another number of rows, and for episodes of other lines of vehicles.
         """
-        if rows.shape != (self.n,):
-            raise InvalidInput(f"rows: have the shape {tuple(rows.shape)}; must be ({self.n},), one for each episode")
+        if not (rows.shape == (self.n,) and rows.dtype == torch.int64):
+            what = f"{rows.dtype} of shape {tuple(rows.shape)}"
+            raise InvalidInput(f"rows = {what}: must be int64 of shape ({self.n},), one for each episode")
+        if stored.know.shape[:-1] != self.now.know.shape[:-1]:
+            bodies = len(stored.know), len(self.now.know)
+            raise InvalidInput(f"stored: has {bodies[0]} bodies in each world; must have {bodies[1]}")
         for mine, other in zip(self.now, stored, strict=True):
-            torch.index_select(other, -1, rows, out=mine)
+            mine.copy_(other.index_select(-1, rows))
         self._launch(self._no_actions, LOOK)
         return self.observations
 
@@ -204,7 +211,7 @@ class Worlds:
 
 def check_runs(game: Game) -> None:
     """Raise ``InvalidInput`` for what kernels of a GPU do not compute; the message says what they do."""
-    what = f"scenario {game.name!r} on a GPU"
+    what = f"scenario {game.name!r} in kernels for a GPU"
     for body, script in game.scripts.items():
         name = getattr(script, "name", type(script).__name__)
         raise InvalidInput(
@@ -221,7 +228,8 @@ def check_runs(game: Game) -> None:
     if not len(game.rules.learners):
         raise InvalidInput(f"{what}: has no learner; make a vehicle one: learners=['vehicle_2']")
     if not game.rewarding.is_compiled:
-        parts = [name for name, *_ in game.rewarding.terms] + ["shaping"] * (game.rewarding.shaping is not None)
+        parts = [WHOSE.get(name, name) for name, *_ in game.rewarding.terms]
+        parts += ["shaping"] * (game.rewarding.shaping is not None)
         raise InvalidInput(
             f"{what}: the reward has {', '.join(parts) or 'components'}; the terms harm (of the whole line, in any"
             " count) and terminal run there"
@@ -254,10 +262,4 @@ def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Lo
     size = bodies, len(rules.learners), plan.scaling.shape[1], len(plan.offsets)
     shapes = shapes_of(*size)
     memory = Mine(*(np.zeros(shape, np.float32 if shape is shapes.seen else np.float64) for shape in shapes))
-    return ruling, looking, Kernel("play-" + "-".join(map(str, size)), partial(_thread, shapes), play_each, memory)
-
-
-def _thread(shapes: Mine) -> Any:
-    from ethbrake_marl.extensions.cuda.threads import play_thread  # numba.cuda is slow to import
-
-    return play_thread(shapes)
+    return ruling, looking, Kernel("play", size, shapes, play_each, memory)

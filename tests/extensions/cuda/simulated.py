@@ -14,7 +14,7 @@ import torch
 from numba import cuda
 
 from ethbrake_marl.extensions.cuda.device import Kernel, as_arrays
-from ethbrake_marl.extensions.cuda.search import search
+from ethbrake_marl.extensions.cuda.profiles import search
 from tests.extensions.cuda.test_search import problem
 from tests.extensions.cuda.test_worlds import SIX, whole_episodes
 

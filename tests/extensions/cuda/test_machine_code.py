@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -15,9 +16,10 @@ import pytest
 import torch
 
 from ethbrake_marl.errors import InvalidInput, MissingExtra
-from ethbrake_marl.extensions.cuda import device
+from ethbrake_marl.extensions.cuda import device, machine_code
 from ethbrake_marl.extensions.cuda.machine_code import PTX_VERSION, made, ptx_of
 from ethbrake_marl.extensions.cuda.worlds import Worlds
+from ethbrake_marl.motion import compiling
 from tests.extensions.cuda.test_worlds import SIX
 from tests.refused import refused
 
@@ -91,3 +93,30 @@ def test_a_device_that_cannot__says_why(
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda _: "GTX 1080")
     with refused(reason, InvalidInput):
         device.device_named("cuda:3")
+
+
+def test_code__is_made_anew_when_the_threads_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their machine code is told apart from that of other sources by its folder."""
+    copied = shutil.copytree(Path(machine_code.__file__).parent, tmp_path / "cuda")
+    monkeypatch.setattr(machine_code, "__file__", str(copied / "machine_code.py"))
+    monkeypatch.setattr(compiling, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(machine_code, "folder_of", compiling.folder_of.__wrapped__)
+    monkeypatch.setattr(machine_code, "made", lambda kernel, *_: kernel)
+    assert ptx_of("play", lambda: "old", (), (9, 0)) == "old"
+    assert ptx_of("play", lambda: "new", (), (9, 0)) == "old"
+    with (copied / "threads.py").open("a") as file:
+        file.write("# changed\n")
+    assert ptx_of("play", lambda: "new", (), (9, 0)) == "new"
+
+
+def test_code__is_taken_from_a_folder_that_can_only_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds no kernels of a processor: those of ``threads`` are none."""
+    home, temporary = tmp_path / "home", tmp_path / "ethbrake_marl-temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(compiling, "home_folder", lambda: home)
+    monkeypatch.setattr(machine_code, "folder_of", compiling.folder_of.__wrapped__)
+    monkeypatch.setattr(machine_code, "made", lambda kernel, *_: kernel)
+    monkeypatch.setattr(compiling, "cache_folder", lambda: home)
+    ptx_of("play", lambda: "made", (), (9, 0))
+    monkeypatch.setattr(compiling, "cache_folder", lambda: temporary)
+    assert ptx_of("play", pytest.fail, (), (9, 0)) == "made"

@@ -153,29 +153,9 @@ def test_actions_that_are_no_numbers__are_refused(program: ModuleType) -> None:
     ppo = program.Ppo(worlds, program.Settings(n=8, rollout=8, minibatches=4))
     torch.nn.init.constant_(ppo.actor.mean[-1].bias, float("nan"))
     with refused("an action of row 0 is no number"):
-        ppo.learn(ppo.collect, ppo.update)
+        ppo.learn()
     with refused("an action of row 0 is no number"):
         program.evaluate(ppo.actor, worlds)
-
-
-def test_recording__leaves_networks_and_optimiser_as_they_were(
-    program: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Before a CUDA graph is recorded its calls run a few times; here they run without a GPU."""
-    monkeypatch.setattr(program, "graph_of", lambda call: (call(), call)[1])
-    monkeypatch.setattr("torch.cuda.set_device", lambda device: None)
-    learned = []
-    for records in (False, True):
-        torch.manual_seed(0)
-        worlds = eb.cuda.Worlds("paper-random", 8, 16, "cpu")
-        ppo = program.Ppo(worlds, program.Settings(n=8, rollout=8, minibatches=4))
-        calls = ppo.recorded() if records else (ppo.collect, ppo.update)
-        ppo.seen[-1].copy_(worlds.reset())
-        torch.manual_seed(1)
-        ppo.learn(*calls)
-        learned.append(ppo.networks.state_dict())
-    assert all(torch.equal(one, other) for one, other in zip(*(each.values() for each in learned), strict=True))
-    assert torch.get_float32_matmul_precision() == "highest"
 
 
 class NoReading(TorchDispatchMode):
@@ -211,10 +191,10 @@ def test_the_learning_rate__is_the_tensor_that_the_optimiser_reads(program: Modu
     ppo = program.Ppo(eb.cuda.Worlds("paper-random", 8, 16, "cpu"), program.Settings(n=8, rollout=8, minibatches=4))
     before = ppo.actor.log_std.item()
     ppo.rate.fill_(0.0)
-    ppo.learn(ppo.collect, ppo.update)
+    ppo.learn()
     assert ppo.actor.log_std.item() == before
     ppo.rate.fill_(0.1)
-    ppo.learn(ppo.collect, ppo.update)
+    ppo.learn()
     assert ppo.actor.log_std.item() != before
 
 
@@ -250,3 +230,18 @@ def test_program__refuses_what_cannot_be_before_it_trains(
     printed = capsys.readouterr().err
     assert ended.value.code == 2 and message in printed and printed.count("\n") == 1
     assert list(empty_folder.rglob("*")) == [empty_folder / "there"]
+
+
+def test_program__says_in_one_line_that_memory_is_too_little(
+    empty_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*given: Any, **more: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")
+
+    monkeypatch.setattr(eb.cuda.Worlds, "stored", full)
+    monkeypatch.setattr(sys, "argv", ["ppo_gpu.py", "--output", "mine", "--device", "cpu", "--pool", "50"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(PROGRAM), run_name="__main__")
+    printed = capsys.readouterr().err
+    right = "error: n = 1024, pool = 50, rollout = 32: need more memory than the device has; choose smaller numbers\n"
+    assert ended.value.code == 2 and printed.endswith(right) and not [*empty_folder.iterdir()]

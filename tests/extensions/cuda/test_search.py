@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.cuda.search import met, search
+from ethbrake_marl.extensions.cuda.profiles import best_alone, met, search
 from ethbrake_marl.extensions.cuda.search_kernels import Plans
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
 from tests.refused import refused
@@ -64,6 +65,22 @@ def test_several_controlled_vehicles(scenario: str, bodies: list[int] | None) ->
     asked.check(best)
 
 
+def test_several_vehicles__do_no_more_harm_than_one_of_them_while_the_others_brake() -> None:
+    loaded, game = eb.open_game("cooperation-3-pair")
+    worlds, effort = loaded.sample(10, seed=7), {**SMALL, "drawn": 60, "changes": 200}
+    asked = problem_of(game, worlds)
+    _, values = search(asked, **effort)
+    alone = asked.values(best_alone(asked, partial(search, **effort)))["first"]
+    assert (values["first"] <= alone + 1e-9).all()
+    for body in (2, 3):
+        _, own = search(problem_of(game, worlds, [body], deciders=[2, 3]), **effort)
+        assert alone.mean() < own["first"].mean() + 0.1
+    start = Profiles(np.full((10, 1), 75), np.zeros((10, 1, 2)))
+    search(problem_of(game, worlds), start, **effort)  # which may be given beside it
+    with refused("given: has 2 profiles for each world, with one for several vehicles, but 1 threads search it"):
+        search(problem_of(game, worlds), start, **effort | {"restarts": 1})
+
+
 def test_weights__give_a_front() -> None:
     asked = problem(10).take(np.tile(np.arange(10), 2))
     weights = np.repeat([[1.0, 1.0, 0.0], [0.0, 1.0, 1.0]], 10, axis=0)
@@ -91,16 +108,37 @@ def test_threads__meet_in_pairs_and_go_on_from_the_better_profile() -> None:
     assert met(plans, 8, 1, 0) is plans
 
 
+def test_search__is_a_function_however_often_it_is_named() -> None:
+    assert eb.cuda.search is search and eb.cuda.search is search
+
+
+def test_no_world__is_refused() -> None:
+    with refused("problem: has no world"):
+        search(problem(2).take([]), **SMALL)
+
+
+def test_too_little_memory__is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*given: Any, **more: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")
+
+    monkeypatch.setattr("ethbrake_marl.extensions.cuda.profiles.started", full)
+    with refused("n = 2 worlds, restarts = 2 threads in each, on device 'cpu': need more memory than the device has"):
+        search(problem(2), **SMALL)
+
+
 @pytest.mark.parametrize(
     "changes, reason",
     [
         ({"rounds": 0}, "rounds = 0"),
         ({"restarts": 3}, "restarts = 3: must be a power of two, from 1 to 1024"),
         ({"restarts": 2048}, "restarts = 2048: must be"),
+        ({"restarts": True}, "restarts = True: must be"),
+        ({"restarts": 2.0}, "restarts = 2.0: must be"),
         ({"drawn": 0}, "drawn = 0"),
         ({"changes": 0}, "changes = 0"),
         ({"seed": -1}, "seed = -1"),
-        ({"seconds": float("nan")}, "seconds = nan: must be None, or 0 or more"),
+        ({"seconds": float("nan")}, "seconds = nan: must be None, or a number of 0 or more"),
+        ({"seconds": float("inf")}, "seconds = inf: must be None"),
         ({"device": "gpu"}, "device = 'gpu'"),
         ({"given": 3}, "given: has 3 profiles; must have some for each of the 2 worlds"),
         ({"given": 8}, "given: has 4 profiles for each world, but 2 threads search it"),

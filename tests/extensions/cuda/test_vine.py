@@ -206,8 +206,28 @@ def test_too_many_worlds__are_refused_in_one_line(empty_folder: Path, monkeypatc
         raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")
 
     monkeypatch.setattr("ethbrake_marl.extensions.cuda.vine.Worlds", full)
-    with refused("n_envs = 8, tried = 16: need more memory than the device has; choose smaller ones"):
+    with refused("n_envs = 8, n_steps = 4, tried = 16: need more memory than the device has; choose smaller"):
         start(VINE)()
+
+
+def test_too_little_memory_in_a_training__is_one_line(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*given: Any, **more: Any) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")
+
+    monkeypatch.setattr("ethbrake_marl.extensions.cuda.vine.CudaVineModel.measure", full)
+    with refused("on device 'twin': n_envs = 32, n_steps = 6, tried = 96: need more memory than the device has"):
+        start(SMALL.replace(total_steps=32 * 6))()
+
+
+def test_start__gives_the_weights_of_the_named_policy_as_on_the_processor(tmp_path: Path) -> None:
+    begin(tmp_path / "first")
+    cpu, twin = both(SMALL.replace(start=f"vine@{tmp_path / 'first'}"), PAPER)
+    other = new_model(SMALL)
+    named = eb.load_policy(tmp_path / "first").tensors["policy.output.weight"]
+    for model in (cpu, twin):
+        assert np.array_equal(model.policy.average[-1].weight.detach(), named)
+        assert np.array_equal(model.policy.learning[-1].weight.detach(), named)
+    assert not np.array_equal(other.policy.average[-1].weight.detach(), named)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without a GPU")

@@ -10,6 +10,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.extensions.cuda.device import enough_memory
 from ethbrake_marl.extensions.cuda.worlds import Worlds
 from tests.refused import refused
 
@@ -110,10 +111,63 @@ def test_put__goes_on_with_any_episodes() -> None:
     assert same(other.step(actions[[3, 3, 0, 0, 1, 2]]).reward.numpy(), after.reward[[3, 3, 0, 0, 1, 2]].numpy())
 
 
-def test_put__of_another_number_of_rows_is_refused() -> None:
+def test_put__takes_own_episodes_in_another_order() -> None:
+    worlds = Worlds("paper-random", 3, 8, "cpu")
+    before = worlds.state()
+    worlds.put(worlds.now, torch.tensor([2, 0, 1]))
+    assert same_state(worlds.state(), before.take([2, 0, 1]))
+
+
+@pytest.mark.parametrize("rows", [torch.tensor([0, 1]), torch.zeros(4), torch.zeros(4, dtype=torch.bool)])
+def test_put__of_other_rows_is_refused(rows: torch.Tensor) -> None:
     worlds = Worlds("paper-random", 4, 8, "cpu")
-    with refused("rows: have the shape (2,); must be (4,)"):
-        worlds.put(worlds.now, torch.tensor([0, 1]))
+    with refused(f"rows = {rows.dtype} of shape {tuple(rows.shape)}: must be int64 of shape (4,)"):
+        worlds.put(worlds.now, rows)
+
+
+def test_put__of_longer_lines_is_refused_and_changes_nothing() -> None:
+    worlds, other = Worlds("paper-random", 2, 8, "cpu"), Worlds("cooperation-4-five", 2, 8, "cpu")
+    before = worlds.state()
+    with refused("stored: has 6 bodies in each world; must have 4"):
+        worlds.put(other.now, torch.tensor([0, 1]))
+    assert same_state(worlds.state(), before)
+
+
+def test_device__with_a_number_is_that_of_the_tensors() -> None:
+    assert Worlds("paper-random", 2, 8, "cpu:0").step(torch.zeros(2, 1)).reward.shape == (2,)
+
+
+@pytest.mark.parametrize(
+    "what, raised",
+    [
+        ("torch's own error", torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")),
+        ("numpy's", MemoryError()),
+        ("torch's of a processor", RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried")),
+    ],
+)
+def test_too_little_memory__is_one_line(what: str, raised: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*given: Any, **more: Any) -> None:
+        raise raised
+
+    monkeypatch.setattr(torch, "zeros", full)
+    right = "n = 3 worlds, and a pool of 8, on device 'cpu': need more memory than the device has; choose smaller"
+    with refused(right):
+        Worlds("paper-random", 3, 8, "cpu")
+
+
+def test_another_error__is_not_taken_for_too_little_memory() -> None:
+    with pytest.raises(RuntimeError, match="another"), enough_memory("n"):
+        raise RuntimeError("another")
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_actions__in_any_layout_of_memory(n: int) -> None:
+    worlds, other = (Worlds("paper-random", n, 8, "cpu") for _ in range(2))
+    actions = torch.tensor([[-1.0], [0.5], [1.0]])[:n]
+    turned = torch.complex(actions, -actions).conj().imag  # torch keeps the sign beside the numbers
+    for given in (turned, turned.clone().requires_grad_(), turned.repeat(1, 2).t()[:1].t()):
+        step, expected = worlds.step(given), other.step(actions)
+        assert same(step.reward.numpy(), expected.reward.numpy()) and same_state(worlds.state(), other.state())
 
 
 def test_new_worlds__have_begun() -> None:
@@ -167,7 +221,7 @@ def test_reward__has_the_weights_of_the_game() -> None:
         ({"pool": eb.load_scenario("paper-random").sample(3, seed=7).take([])}, "pool: has 0 worlds of 3 vehicles"),
         ({"reward": "paper"}, "the reward has collision, risk, jerk"),
         ({"reward": {"harm": 1.0, "shaping": 1.0}}, "the reward has shaping"),
-        ({"reward": {"harm": 1.0, "objective": "own"}}, "the reward has harm"),
+        ({"reward": {"harm": 1.0, "objective": "own"}}, "the reward has harm of single vehicles;"),
         ({"observation": ["own", "contact"]}, "the observation has contact."),
         ({"learners": []}, "no learner"),
         ({"scenario": "paper-random-map"}, "another physics run on a processor only"),
@@ -185,9 +239,10 @@ def test_what_does_not_run__is_refused_by_name(changes: dict[str, Any], reason: 
 @pytest.mark.parametrize(
     "actions, reason",
     [
-        (np.zeros((4, 1), np.float32), "must be a torch tensor"),
+        (np.zeros((4, 1), np.float32), "must be a dense torch tensor"),
         (torch.zeros(4), "of shape (4, 1)"),
-        (torch.zeros(4, 1, dtype=torch.float64), "must be a torch tensor, float32"),
+        (torch.zeros(4, 1, dtype=torch.float64), "must be a dense torch tensor, float32"),
+        (torch.zeros(4, 1).to_sparse(), "must be a dense torch tensor"),
         (torch.zeros(4, 1, device="meta"), "are on the device meta"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -12,13 +13,14 @@ from torch import Tensor
 
 from ethbrake_marl.episode.counts import other_count, weights_of
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
-from ethbrake_marl.extensions.cuda.device import Kernel, device_named
+from ethbrake_marl.extensions.cuda.device import Kernel, device_named, enough_memory
 from ethbrake_marl.extensions.cuda.search_kernels import Own, Plans, Searched, search_each, shapes_of
 from ethbrake_marl.extensions.proofs.line import rows_of
+from ethbrake_marl.extensions.search.best_harm import joined
 from ethbrake_marl.extensions.search.kernels import STEPWISE
-from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
+from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, best_of
 from ethbrake_marl.extensions.search.search import PROFILES, seeded
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import BRAKING, Floats
 
 WHOLE_NUMBERS = ("ends", "best_ends", "kind")  # in a thread's own memory
 
@@ -38,13 +40,15 @@ def search(
     """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
 
     Of ``restarts`` threads in each world every one draws random profiles and improves the best. After each round the
-    threads meet in pairs, and both go on from the better profile. The last round goes decision by decision.
+    threads meet in pairs, and both go on from the better profile. The last round goes decision by decision. Several
+    controlled vehicles are first searched one by one, while the others brake fully; the result is at least as good.
 
     Args:
         problem: n worlds, and what is minimised in them (``problem_of``). For a front repeat its worlds, each time with
             other weights: ``problem.take(rows).minimising(weights)``.
         given: profiles with which threads begin, [n * Q]: first the Q profiles of world 0, and so on.
-        seconds: begin no further round later; the result then depends on the speed. None: ``rounds`` of them.
+        seconds: begin no further round later; the result then depends on the speed. None: ``rounds`` of them. Of
+            several controlled vehicles each one by itself has an equal part of this time.
         rounds: of random changes.
         restarts: threads in each world, a power of two.
         drawn: random profiles that each thread tries in the first round, beside some of full driving and braking.
@@ -52,30 +56,39 @@ def search(
         seed: of the random numbers.
         device: as for ``Worlds``.
 
-    Raises ``InvalidInput`` for a bad number or device, and ``PhysicsError`` for worlds in which no profile can be
-    simulated.
+    Raises ``InvalidInput`` for a bad number or device, and for more worlds than it has memory for, and
+    ``PhysicsError`` for worlds in which no profile can be simulated.
 
     """
     for name, value, least in (("rounds", rounds, 1), ("drawn", drawn, 1), ("changes", changes, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
-    if restarts not in (1 << k for k in range(11)):
+    check_whole_number("restarts", restarts, 1, 1024)
+    if restarts & (restarts - 1):
         raise InvalidInput(f"restarts = {restarts!r}: must be a power of two, from 1 to 1024")
-    if not (seconds is None or seconds >= 0.0):
-        raise InvalidInput(f"seconds = {seconds!r}: must be None, or 0 or more")
+    if not (seconds is None or 0.0 <= seconds < np.inf):
+        raise InvalidInput(f"seconds = {seconds!r}: must be None, or a number of 0 or more")
+    if not problem.n:
+        raise InvalidInput("problem: has no world; must have one or more")
     on, n, begun = device_named(device), problem.n, time.monotonic()
-    searched, kernel = searched_worlds(problem, on)
-    plans = started(problem, given, restarts, seed, on)
-    drawing = torch.from_numpy(PROFILES.copy()).to(on)
-    for number in range(rounds if seconds is None else 1 << 20):
-        asked = (searched, plans, drawing, drawn if number == 0 else 0, changes)
-        kernel.launch(on, n * restarts, *asked)
-        plans = met(plans, n, restarts, number)
-        if seconds is not None:
-            plans.values[0].item()  # waits for the device
-            if time.monotonic() - begun >= seconds:
-                break
-    searched.numbers[STEPWISE] = 1.0
-    kernel.launch(on, n * restarts, searched, plans, drawing, 0, changes)
+    if len(problem.bodies) > 1:
+        part = None if seconds is None else seconds / (1 + len(problem.bodies))
+        effort: Any = {"rounds": rounds, "restarts": restarts, "drawn": drawn, "changes": changes, "seed": seed}
+        alone = best_alone(problem, partial(search, seconds=part, device=device, **effort))
+        given = alone if given is None else joined([given, alone], n)
+    with enough_memory(f"n = {n} worlds, restarts = {restarts} threads in each, on device {str(on)!r}"):
+        searched, kernel = searched_worlds(problem, on)
+        plans = started(problem, given, restarts, seed, on)
+        drawing = torch.from_numpy(PROFILES.copy()).to(on)
+        for number in range(rounds if seconds is None else 1 << 20):
+            asked = (searched, plans, drawing, drawn if number == 0 else 0, changes)
+            kernel.launch(on, n * restarts, *asked)
+            plans = met(plans, n, restarts, number)
+            if seconds is not None:
+                plans.values[0].item()  # waits for the device
+                if time.monotonic() - begun >= seconds:
+                    break
+        searched.numbers[STEPWISE] = 1.0
+        kernel.launch(on, n * restarts, searched, plans, drawing, 0, changes)
     values, best = plans.values.reshape(restarts, n).min(dim=0)
     failed = torch.isinf(values).nonzero()[:, 0].tolist()
     if failed:
@@ -84,6 +97,21 @@ def search(
     ends, commands = plans.ends[:, rows].cpu().numpy(), plans.commands[..., rows].cpu().numpy()
     found = Profiles(ends.T.copy(), np.moveaxis(commands, -1, 0).copy())
     return found, problem.values(found)
+
+
+def best_alone(problem: Problem, search: Callable[..., Any]) -> Profiles:
+    """Return the best profiles of one controlled vehicle, [n], while the other controlled ones brake fully."""
+    results, braking = [], -problem.state.car[:, BRAKING][:, problem.bodies]
+    for c, body in enumerate(problem.bodies.tolist()):
+        wanted = problem.state.wanted.copy()
+        wanted[:, problem.bodies] = braking
+        wanted[:, body] = 0.0
+        best, _ = search(problem._replace(bodies=problem.bodies[[c]], state=problem.state._replace(wanted=wanted)))
+        commands = np.repeat(braking[:, np.newaxis], best.ends.shape[1], axis=1)
+        commands[:, :, c] = best.commands_mps2[:, :, 0]
+        both = Profiles(best.ends, commands)
+        results.append((problem.value(problem.follow(both)), both))
+    return best_of(results)[1]
 
 
 def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kernel]:
@@ -108,13 +136,7 @@ def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kerne
         np.uint64 if name == "random" else np.int64 if name in WHOLE_NUMBERS else np.float64 for name in Own._fields
     ]
     memory = Own(*(np.zeros(shape, kind) for shape, kind in zip(shapes, kinds, strict=True)))
-    return searched, Kernel("search-" + "-".join(map(str, size)), partial(_thread, shapes), search_each, memory)
-
-
-def _thread(shapes: Own) -> Any:
-    from ethbrake_marl.extensions.cuda.threads import search_thread  # numba.cuda is slow to import
-
-    return search_thread(shapes)
+    return searched, Kernel("search", size, shapes, search_each, memory)
 
 
 def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, on: torch.device) -> Plans:
@@ -128,7 +150,10 @@ def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, 
         if len(short.ends) != n * Q or not Q:
             raise InvalidInput(f"given: has {len(short.ends)} profiles; must have some for each of the {n} worlds")
         if not restarts >= Q:
-            raise InvalidInput(f"given: has {Q} profiles for each world, but {restarts} threads search it (restarts)")
+            what = "with one for several vehicles, " if C > 1 else ""
+            raise InvalidInput(
+                f"given: has {Q} profiles for each world, {what}but {restarts} threads search it (restarts)"
+            )
         problem.take(np.repeat(np.arange(n), Q)).check(short)
         ends[:Q] = np.moveaxis(short.ends.reshape(n, Q, -1), 1, 0)
         commands[:Q] = np.moveaxis(short.commands_mps2.reshape(n, Q, MOST_PHASES, C), 1, 0)
