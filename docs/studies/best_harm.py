@@ -68,7 +68,7 @@ def main(words: list[str]) -> None:
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
         print(shipped_bounds(shipped_tables()).markdown())
         return
-    names = [Path(word).name if word.endswith(".npz") else word for word in words]  # whose folders they were, nobody asks
+    names = [Path(word).name if word.endswith(".npz") else word for word in words]  # without folders
     table = search(given, shlex.join(["docs/studies/best_harm.py", *names]))
     for key, value in table.header.items():
         print(f"{key:28} {value}")
