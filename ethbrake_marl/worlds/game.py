@@ -95,7 +95,7 @@ def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
 
 @cache
 def _warn_once(message: str) -> None:
-    """Warn once a process: a training opens its game several times, and Python forgets what it has shown."""
+    """Warn once of each message: a training opens its game several times, and Python forgets what it has shown."""
     warnings.warn(message, FreeImpacts, stacklevel=2)
 
 

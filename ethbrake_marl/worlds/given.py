@@ -80,7 +80,7 @@ def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
 
 
 def given_keys(scenario: Scenario) -> tuple[str, ...]:
-    """Quantities that a world of this scenario needs: ``gaps_m`` and so on."""
+    """Quantities of the worlds of this scenario: ``gaps_m`` and so on."""
     there = {"obstacle_gap_m": scenario.has_obstacle}
     return USUAL + tuple(key for key in OPTIONAL if there.get(key, key in scenario.sources))
 
