@@ -1,4 +1,4 @@
-"""Entry point of ``python -m ethbrake_marl``, which runs the same command line as the script ``ethbrake``."""
+"""Run the command line: ``python -m ethbrake_marl``."""
 
 from ethbrake_marl.cli.app import main
 

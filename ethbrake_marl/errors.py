@@ -19,11 +19,9 @@ _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
+    """Text with unprintable characters written as Python escapes, except the space and those in ``keep``.
 
-    Control characters, separators and characters that set the direction of text are escaped, except the space and the
-    characters in ``keep``. Without these escapes, names and paths from files could move the cursor or print a line
-    backwards.
+    Otherwise names and paths from files could move the cursor of a terminal or print a line backwards.
     """
     if text.isprintable():
         return text
@@ -31,7 +29,7 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str) -> str:
-    """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
+    """One line of ``plain_text``, shortened in the middle to ``LINE_LIMIT``.
 
     The beginning (what is wrong, and where) and the end (what would be right) are kept.
     """
@@ -43,15 +41,15 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Return a number and its noun (``thing``, in the singular) as text, such as ``1 world`` or ``10,000 worlds``."""
+    """Number and noun, such as ``1 world`` or ``10,000 worlds``."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
-    """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
+    """Exception from the user's code in a few words, with the number of the line of code that raised it.
 
-    The last line of the user's file ``path`` in the traceback is reported; if ``path`` is None, the innermost line. If
-    the exception is an error of this package, the description is only its message.
+    It is the last line of the user's file ``path`` in the traceback; if ``path`` is None, the innermost line. An error
+    of this package is described by its message only.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -69,7 +67,7 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
 
 
 class EthBrakeError(Exception):
-    """Base class of every error that this package raises on purpose; its message is always one line.
+    """Base class of every error that this package raises on purpose; its message is one line.
 
     >>> import ethbrake_marl as eb
     >>> try:
@@ -77,28 +75,26 @@ class EthBrakeError(Exception):
     ... except eb.EthBrakeError as error:
     ...     print(error)
     unknown scenario 'paper-randon'; did you mean 'paper-random'?
-
     """
 
     def __str__(self) -> str:
-        """Return the message, shortened by ``one_line``."""
         return one_line(super().__str__())
 
 
 class InvalidInput(EthBrakeError, ValueError):
-    """A value from the user cannot be used; the message names the argument, its value and what would be right."""
+    """A value from the user cannot be used."""
 
 
 class UnknownName(InvalidInput):
-    """A name (scenario, agent, key, run) is unknown; the message suggests a similar name or lists the known ones."""
+    """A name (scenario, agent, key, run) is unknown."""
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
-    """A file or a registered name exists already. With ``force`` (``--force``) an existing file is overwritten."""
+    """A file or a registered name exists already. With ``force`` (``--force``) a file is overwritten."""
 
 
 class CorruptBundle(EthBrakeError, ValueError):
-    """A policy bundle is damaged, or the file is not a policy bundle; nothing was loaded from it."""
+    """A policy bundle is damaged, or is none; nothing was loaded from it."""
 
 
 _EXTRA_OF = {
@@ -120,16 +116,12 @@ class MissingExtra(EthBrakeError, ImportError):
     >>> import ethbrake_marl as eb
     >>> issubclass(eb.MissingExtra, ImportError)
     True
-
     """
 
 
 @contextmanager
 def naming_extras() -> Iterator[None]:
-    """Context manager: raise ``MissingExtra`` if an import in the block fails because an optional extra is missing.
-
-    Any other import error is raised unchanged.
-    """
+    """Raise ``MissingExtra`` if an import in the block fails because an optional extra is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -140,7 +132,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed; do not import it."""
+    """Raise ``MissingExtra`` if ``package`` is not installed; do not import it."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -168,7 +160,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 
 
 class AgentFailed(InvalidInput):
-    """An agent of the user raised an exception or returned no valid actions; the message names agent, world and step.
+    """An agent of the user raised an exception or returned no valid actions.
 
     ``row`` is the row of the world in the batch; None if it is unknown. ``reason`` says what the agent did wrong, and
     at which step.
@@ -185,7 +177,7 @@ class AgentFailed(InvalidInput):
     @staticmethod
     @contextmanager
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
-        """Context manager: if the block raises ``AgentFailed``, replace the agent's name in the error by ``name``.
+        """If the block raises ``AgentFailed``, replace the agent's name in the error by ``name``.
 
         ``others`` are the names of the other vehicles' agents, which stay in their errors.
         """
@@ -198,18 +190,18 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """Warning: a trained policy or a table of best known harm is from other worlds or other physics."""
+    """A trained policy or a table of best known harm is from other worlds or other physics."""
 
 
 class FreeImpacts(UserWarning):
-    """Warning: an objective gives an impact no weight, so that to cause the impact costs nothing."""
+    """An objective gives an impact no weight, so that to cause the impact costs nothing."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name; its message shows a similar name, or all known names.
+    """Error for an unknown name, which shows a similar name, or all known names.
 
-    ``kind`` says what the name should denote, for example ``scenario``. ``may_be_own`` means that users can register
-    names of this kind; the message then says that such a name must first be registered or installed.
+    ``kind`` says what the name should denote, for example ``scenario``. ``may_be_own``: users can register names of
+    this kind.
     """
     names = sorted({*known})
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
@@ -219,10 +211,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
-
-    The error message begins with ``what``, the name of the value.
-    """
+    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit)."""
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
@@ -230,7 +219,7 @@ def check_whole_number(what: str, value: object, least: int, most: int | None = 
 
 
 def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
-    """Raise ``InvalidInput``, whose message ends with ``advice``, unless the scenario has exactly one learner."""
+    """Raise ``InvalidInput``, which ends with ``advice``, unless there is exactly one learner."""
     if len(learners) != 1:
         raise InvalidInput(
             f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"

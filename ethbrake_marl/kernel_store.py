@@ -16,7 +16,7 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 
 def home_folder() -> Path | None:
-    """Return the folder under ``$NUMBA_CACHE_DIR`` or the user's cache; None for a user without a home folder."""
+    """Folder under ``$NUMBA_CACHE_DIR`` or the user's cache; None for a user without a home folder."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
@@ -26,7 +26,7 @@ def home_folder() -> Path | None:
 
 @cache
 def cache_folder() -> Path:
-    """Return the folder of the compiled kernels: ``home_folder``, or a temporary folder.
+    """Folder of the compiled kernels: ``home_folder``, or a temporary folder.
 
     It is temporary if the folder cannot be written, its disk is full, or it belongs to somebody else.
     """
@@ -45,24 +45,21 @@ def cache_folder() -> Path:
 
 
 def can_be_trusted(folder: Path) -> bool:
-    """Return whether this user or root owns a folder: its machine code will be run."""
+    """Whether this user or root owns a folder: its machine code will be run."""
     return not hasattr(os, "getuid") or folder.stat().st_uid in (0, os.getuid())
 
 
 def is_temporary(folder: Path) -> bool:
-    """Return whether ``folder``, a result of ``cache_folder``, is deleted when this process ends."""
+    """Whether ``folder``, a result of ``cache_folder``, is deleted when this process ends."""
     return folder.name.startswith(_TEMPORARY)
 
 
 def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
-    """Call ``tell(folder, is_empty)`` once, just before this process compiles its first kernel.
-
-    ``folder`` is the cache folder, and ``is_empty`` whether no compiled kernel is stored in it.
-    """
+    """Call ``tell(folder, is_empty)`` once, just before this process compiles its first kernel."""
     _tellers.append(tell)
 
 
 def tell_compilation() -> None:
-    """Call each callback of ``on_first_compilation`` once, before a kernel is compiled."""
+    """Call the callbacks of ``on_first_compilation``, each once."""
     while _tellers:
         _tellers.pop()(cache_folder(), not any(cache_folder().rglob("*.nbi")))

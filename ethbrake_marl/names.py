@@ -57,7 +57,7 @@ class AgentSettings:
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
-        """Return the scenario. Raises ``InvalidInput`` if it is not known."""
+        """Scenario. Raises ``InvalidInput`` if it is not known."""
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario, for instance make_agent({self.spec!r},"
@@ -130,7 +130,7 @@ WRAPPERS: Registry[Entry] = Registry("shield or search", "shields", register_shi
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
-    """Return the agent, or the team of a training run or shield, that a name stands for (this module's first lines).
+    """Agent, or team of a training run or shield, of a name (this module's first lines).
 
     ``scenario`` is needed by teams, wrappers and agents that look ahead. A Python file that is named runs with all your
     rights. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for a bad argument.
@@ -138,7 +138,6 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("constant:3.5").name
     'constant:3.5'
-
     """
     check_count("harm_count", harm_count)
     loaded = None if scenario is None else load_scenario(scenario)
@@ -152,21 +151,21 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
 
 
 def wrapped(team: Team, wrapper: str, settings: AgentSettings) -> Team:
-    """Return a team with the shield or search ``wrapper`` around it, such as ``episode:pairwise``."""
+    """Team with the shield or search ``wrapper`` around it, such as ``episode:pairwise``."""
     entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
     around: Team = _called(settings.spec, entry.make, team, argument, settings)
     return around._replace(name=settings.spec)
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
-    """Return a team for all learners of a scenario. A single agent drives each of them, with memories of their own."""
+    """Team for all learners of a scenario. A single agent drives each of them, with memories of their own."""
     if isinstance(driver, Team):
         return driver
     return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Return the teams that names stand for, spec -> team. A text may list several, with commas; groups are resolved.
+    """Teams of names, spec -> team. A text may list several, with commas; groups are resolved.
 
     Raises the errors of ``make_agent``, and ``InvalidInput`` for a spec that is listed twice.
     """
@@ -180,7 +179,7 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
 
 
 def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Return name -> team of whatever stands for agents: names, or a mapping of names to agents.
+    """Teams by name, of names or a mapping.
 
     ``agents`` is a text or list as in ``make_teams``; or a mapping from names of your own to specs, agents, teams, or
     mappings from vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises
@@ -214,7 +213,7 @@ def _driver(given: Any, scenario: Scenario, harm_count: str) -> Any:
 
 
 def group(name: str) -> list[str]:
-    """Return the specs of a group: of the entry ``NAME``, then of all ``NAME.MORE``; nothing for another name."""
+    """Specs of a group: of the entry ``NAME``, then of all ``NAME.MORE``; nothing for another name."""
     if name not in AGENTS or callable(AGENTS[name].make):
         return []
     listed: list[Any] = [AGENTS[each].make for each in AGENTS if each == name or each.startswith(f"{name}.")]
@@ -222,7 +221,7 @@ def group(name: str) -> list[str]:
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a list of specs at its commas, except those in the path of something that exists."""
+    """Split at commas, except those in the path of something that exists."""
     parts, specs = text.split(","), []
     while parts:
         joined = (k for k in range(len(parts), 1, -1) if _path_exists(",".join(parts[:k])))
@@ -233,7 +232,6 @@ def split_specs(text: str) -> list[str]:
 
 
 def _path_exists(text: str) -> bool:
-    """Return whether a spec ends with a path that exists."""
     core = text
     while core.rpartition("+")[2].partition(":")[0] in WRAPPERS:
         core = core.rpartition("+")[0]
@@ -244,10 +242,7 @@ def _path_exists(text: str) -> bool:
 
 
 def _split(spec: object) -> tuple[str, list[str]]:
-    """Return the agent and its wrappers, from the inside. A ``+`` in the path of something that exists is the path's.
-
-    Raises ``UnknownName`` for a wrapper that is not known.
-    """
+    """Agent and its wrappers, from the inside. A ``+`` in the path of something that exists is the path's."""
     if not isinstance(spec, str) or not spec:
         raise InvalidInput(f"agent {spec!r:.80}: must be a name, for instance full_brake, policy@runs/mine or ppo+step")
     core, wrappers = spec, list[str]()
@@ -289,7 +284,7 @@ def _make(core: str, settings: AgentSettings) -> Driver:
 
 
 def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | None = None) -> tuple[Entry, str | None]:
-    """Return the entry of a name and the argument that is left for it."""
+    """Entry of a name and the argument that is left for it."""
     rest, _, last = argument.rpartition(":")
     if argument and f"{name}.{last}" in table:
         return table[f"{name}.{last}"], rest or None
@@ -306,7 +301,6 @@ def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | Non
 
 
 def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any]:
-    """Return the function of a Python file that makes an agent."""
     function = load_from_file(match["file"], match["name"], reads=settings.policy)
     if not callable(function):
         raise InvalidInput(
@@ -340,7 +334,7 @@ def open_game(
     observation: Any = None,
     reward_vector: Any = None,
 ) -> tuple[Scenario, Game]:
-    """Return a scenario and its game, in which roles that name agents are played by these.
+    """Scenario and game; agents play the roles that name them.
 
     Args:
         scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
@@ -357,7 +351,7 @@ def open_game(
 
 
 def check_learners(scenario: Scenario) -> None:
-    """Raise ``InvalidInput`` if no vehicle learns, so that agents could drive nobody."""
+    """Raise ``InvalidInput`` if no vehicle learns."""
     if not scenario.learners:
         raise InvalidInput(
             f"scenario {scenario.name!r} has no learner that the agents could drive; choose the scenario that the"
@@ -367,7 +361,7 @@ def check_learners(scenario: Scenario) -> None:
 
 
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
-    """Return the scripts of a scenario that look at the state, body -> agent."""
+    """Scripts of a scenario that look at the state, body -> agent."""
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
         if role.partition(":")[0] not in (LEARNER, *HELD):
@@ -388,12 +382,12 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[Entry]:
-    """Return the entries of all agents and wrappers that can be loaded, without groups; a wrapper's form has its +."""
+    """Entries of all agents and wrappers that can be loaded, without groups; a wrapper's form has its +."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 
 
 def why_not_listed() -> list[str]:
-    """Return why the other agents and wrappers cannot be loaded."""
+    """Why the other agents and wrappers cannot be loaded."""
     reasons = (table.why_not(name) for table in (AGENTS, WRAPPERS) for name in table)
     return [reason for reason in reasons if reason is not None]

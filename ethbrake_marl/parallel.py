@@ -29,7 +29,7 @@ class WorkerLost(EthBrakeError):
 def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     """Run function calls in parallel and yield their results in the order of the calls.
 
-    Inside ``joblib.parallel_config(backend=...)`` the calls run where this says, for instance on a cluster of Ray.
+    Inside ``joblib.parallel_config(backend=...)`` the calls run there, for instance on a cluster of Ray.
 
     Args:
         calls: tuples (function, argument, ...) with module-level functions. From a generator, each tuple is taken
@@ -81,7 +81,7 @@ def _pickled(call: Call) -> bytes:
 
 
 def _answer(call: bytes) -> Any:
-    """Run a pickled call in a worker and return its result; printed text goes to stderr."""
+    """Run a pickled call in a worker; printed text goes to stderr."""
     _end_with_parent()
     with redirect_stdout(sys.stderr):
         function, *arguments = pickle.loads(call)

@@ -38,7 +38,7 @@ class Progress:
 
     @property
     def harm(self) -> str:
-        """Harm in the last evaluation as text, such as ``total harm 24.19``; empty if there was no evaluation yet."""
+        """Harm in the last evaluation as text, such as ``total harm 24.19``; empty without one."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm", "honest_cost": "honest cost"}
@@ -47,10 +47,7 @@ class Progress:
 
     @staticmethod
     def listener(told: Told) -> OnProgress | None:
-        """Return the function to call with each ``Progress``, or None if progress is not reported.
-
-        ``told`` is this function, ``"show"`` to print progress on stderr, or None. Without stderr nothing is printed.
-        """
+        """Function to call with each ``Progress``: ``told``, or a printer on stderr for ``"show"``, or None."""
         if told == "show":
             return None if sys.stderr is None else ShownProgress()
         return told
@@ -74,7 +71,6 @@ class ShownProgress:
         self._open = ""  # name of the task in the terminal's last line; empty if this line has ended
 
     def __call__(self, progress: Progress) -> None:
-        """Print the progress if it is time."""
         now, task = time.monotonic(), progress.name.partition(": ")[0]
         if self._open not in ("", task) or progress.note:
             self.end()
@@ -99,7 +95,7 @@ class ShownProgress:
             self._told_s = now
 
     def end(self) -> None:
-        """End the line that is updated in place: what follows is printed below it."""
+        """End the line that is updated in place."""
         if self._open:
             self._print("\n")
             self._open = ""

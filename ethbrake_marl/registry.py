@@ -1,13 +1,13 @@
 """Registries of agents, shields, measures, features, objectives, algorithms and commands, by name.
 
-Each registry contains all objects of one kind. A running program adds an object with a ``register_...`` function. An
-installed package adds an object with an entry point in its ``pyproject.toml``, as this package does for its extensions:
+A running program adds an object with a ``register_...`` function; an installed package with an entry point in its
+``pyproject.toml``, as this package does for its extensions:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
 When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function. An
-object that is installed but not used is never imported, so it cannot break anything.
+object that is not used is never imported, so it cannot break anything.
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ T = TypeVar("T")
 class Part:
     """Value of an entry point: all arguments of a ``register_...`` function except the name.
 
-    The ``register_...`` function registers the object under the name of the entry point. For example, an entry point in
-    the group ``ethbrake_marl.measures`` with the value ``part`` below has the same effect as
+    In the group ``ethbrake_marl.measures``, ``part`` below has the same effect as
     ``register_measure(name, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
@@ -55,10 +54,9 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Return the entry points of a group by name; several packages may define an entry point with the same name.
+    """Entry points of a group by name, this package's first; several packages may define the same name.
 
-    Names defined by this package come first. ``group`` is written without the prefix ``ethbrake_marl.``, for example
-    ``agents``.
+    ``group`` is written without the prefix ``ethbrake_marl.``, for example ``agents``.
     """
     by_name: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
@@ -68,24 +66,20 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def giver(point: EntryPoint) -> str:
-    """Return the name of the installed package that defines an entry point; ``?`` if the package is unknown."""
+    """Installed package that defines an entry point; ``?`` if it is unknown."""
     return "?" if point.dist is None else point.dist.name
 
 
 def versions_used() -> dict[str, str]:
-    """Return name -> version of the other packages that have added agents or other objects to this process.
-
-    A package is listed only if at least one of its entry points has been loaded.
-    """
+    """Name -> version of the other packages of which this process has loaded an entry point."""
     return dict(sorted(_VERSIONS.items()))
 
 
 class Registry(Mapping[str, T]):
     """Mapping name -> object for all objects of one kind. An object is loaded when its name is first looked up.
 
-    Neither the test whether a name exists nor an iteration over the names loads an object. Looking up a name raises
-    ``UnknownName`` if the registry has no object of this name, ``InvalidInput`` if the object cannot be loaded or if
-    two installed packages define it, and ``MissingExtra`` if a package of an extra is missing.
+    Looking up a name raises ``UnknownName`` if the registry has no object of this name, ``InvalidInput`` if the object
+    cannot be loaded or if two installed packages define it, and ``MissingExtra`` if a package of an extra is missing.
 
     Args:
         kind: noun for one object of the registry in messages, for example ``agent``.
@@ -108,7 +102,7 @@ class Registry(Mapping[str, T]):
         return name in self.loaded or name in points(self.group)
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names: first built-in objects, then entry points, then objects that this process registered."""
+        """Built-in objects, then entry points, then objects that this process registered."""
         built_in = (name for name in self.loaded if name in self._built_in)
         return iter(dict.fromkeys([*built_in, *points(self.group), *self.loaded]))
 
@@ -126,8 +120,7 @@ class Registry(Mapping[str, T]):
     def load(self, name: str) -> list[str]:
         """Load the object called ``name`` if needed; return all names that its entry point defines.
 
-        An entry point defines several objects if its value is a dictionary, and otherwise one object. Raises the same
-        errors as looking up the name.
+        An entry point defines several objects if its value is a dictionary. Raises the errors of looking up the name.
         """
         candidates = points(self.group).get(name, [])
         if (name in self._built_in) + len(candidates) > 1:
@@ -171,8 +164,7 @@ class Registry(Mapping[str, T]):
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
         """Add ``part`` under ``name``; raise ``AlreadyExists`` if another object has the name.
 
-        ``is_same`` is called with the object that is registered under ``name``, and returns whether it equals ``part``;
-        an equal object is not added again.
+        ``is_same`` returns whether the object under ``name`` equals ``part``, which is then not added again.
         """
         names_others = False  # whether an entry point of this name defines parts with other names
         if name not in self.loaded and name in self and name not in self._loading:
@@ -185,11 +177,11 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all objects; return those that could be loaded: name -> object."""
+        """All objects that can be loaded: name -> object."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Load the object called ``name``; return the error message if this fails, otherwise None."""
+        """Why the object called ``name`` cannot be loaded; None if it can."""
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:
@@ -197,7 +189,7 @@ class Registry(Mapping[str, T]):
         return None
 
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
-        """Return the error for a ``name`` that is not in this registry.
+        """Error for a ``name`` that is not in this registry.
 
         ``known`` has the names to suggest or list; None: all names of this registry.
         """

@@ -1,4 +1,4 @@
-"""The loop in which a team of agents drives worlds to the end. Whatever lets agents drive calls it."""
+"""The loop in which a team of agents drives worlds to the end."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Agent(Script, Protocol):
 
     @property
     def knows(self) -> str:
-        """What it has to know, for tables: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
+        """What it has to know: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
 
 
 class Team(NamedTuple):
@@ -69,7 +69,7 @@ class Team(NamedTuple):
 
     @staticmethod
     def of(drivers: Mapping[str, Agent], name: str, shield: Shield | None = None) -> Team:
-        """Return the team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for what is no vehicle or no agent."""
+        """Team of ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for what is no vehicle or no agent."""
         bodies = {}
         for vehicle, agent in drivers.items():
             if not isinstance(vehicle, str) or re.fullmatch("vehicle_[1-9][0-9]?", vehicle) is None:
@@ -79,7 +79,7 @@ class Team(NamedTuple):
         return Team(name, dict(sorted(bodies.items())), shield)
 
     def game(self, game: Game) -> Game:
-        """Return ``game`` with this team's shield. Raises ``InvalidInput`` unless the team drives all its learners."""
+        """The game with this team's shield. Raises ``InvalidInput`` unless the team drives all its learners."""
         driven, wanted = sorted(self.drivers), sorted(game.rules.learners.tolist())
         if driven != wanted:
             theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
@@ -93,7 +93,6 @@ class Team(NamedTuple):
 
 
 def check_agent(agent: Any, where: str) -> None:
-    """Raise ``InvalidInput``, which begins with ``where``, unless this is an agent."""
     missing = [each for each in ("name", "knows", "begin", "act") if not hasattr(agent, each)]
     if missing:
         raise InvalidInput(
@@ -104,7 +103,6 @@ def check_agent(agent: Any, where: str) -> None:
 
 
 def check_knows(knows: Any, where: str) -> None:
-    """Raise ``InvalidInput``, which begins with ``where``, unless this says what an agent has to know."""
     if not isinstance(knows, str) or knows not in (*KNOWLEDGE, UNSTATED):
         right = ", ".join(repr(each) for each in KNOWLEDGE)
         raise InvalidInput(f"{where}: knows = {knows!r:.60}: must be one of {right}, or {UNSTATED!r}")
@@ -113,9 +111,9 @@ def check_knows(knows: Any, where: str) -> None:
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:
     """Let a team drive these worlds from the alert to the end: yield every state, and the step that led to it.
 
-    The first pair is ``None`` and the state at the first decision. Agents are asked there for the first time; their
-    commands are applied as they are, without a detour by actions. Under a shield the shield asks them. ``donate``: a
-    state is worthless once the next one is asked for.
+    The first pair is ``None`` and the state at the first decision, when agents are first asked. Commands are applied as
+    they are, without a detour by actions. Under a shield the shield asks the agents. ``donate``: a state is worthless
+    once the next one is asked for.
     """
     game = team.game(game)
     if game.shield is None:
@@ -133,14 +131,14 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
 
 
 def drive(game: Game, alert: State, team: Team) -> State:
-    """Let a team drive these worlds from the alert to the end; return the last state, the result of the episodes."""
+    """Last state after a team has driven these worlds from the alert to the end."""
     for _, state in play(game, alert, team, donate=True):
         last = state
     return last
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Return the actions that agents propose, [n, L] in the order of ``drivers``, and their new memories."""
+    """Proposed actions, [n, L] in the order of ``drivers``, and new memories."""
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
         commands, after[body] = asked(agent, state, memories[body], body)

@@ -1,7 +1,4 @@
-"""Models of other libraries: how each kind is asked, and what it brings that is applied or refused.
-
-Nothing here imports torch or Stable-Baselines3; onnxruntime is imported to open a file.
-"""
+"""Models of other libraries: how each kind is called, and what it brings that is applied or refused."""
 
 from __future__ import annotations
 
@@ -39,7 +36,7 @@ INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """Return how a policy without a memory is asked.
+    """How a policy without a memory is called.
 
     Raises ``InvalidInput``, which begins with ``who``, for another kind, and for a model that would not act alike in
     every batch.
@@ -62,15 +59,11 @@ def ask_of(policy: Any, who: str) -> Ask:
 
 
 def ask_function(function: Any, seen: Observations) -> Any:
-    """Return what a function answers."""
     return function(seen)
 
 
 def ask_model(model: Any, seen: Observations) -> Any:
-    """Return the deterministic actions of an object with ``predict``, under its ``VecNormalize``.
-
-    Raises ``InvalidInput`` if it also returns a state.
-    """
+    """Deterministic actions of an object with ``predict``, under its ``VecNormalize``; a recurrent one is refused."""
     statistics = statistics_of(model)
     answer = model.predict(seen if statistics is None else statistics.normalize_obs(seen), deterministic=True)
     if not isinstance(answer, tuple):
@@ -85,7 +78,6 @@ def ask_model(model: Any, seen: Observations) -> Any:
 
 
 def ask_torch(module: Any, seen: Observations) -> Any:
-    """Return what a torch module answers, without gradients."""
     torch = sys.modules["torch"]
     parameter = next(iter(module.parameters()), None)
     with torch.no_grad():
@@ -93,14 +85,14 @@ def ask_torch(module: Any, seen: Observations) -> Any:
 
 
 def ask_onnx(session: Any, seen: Observations) -> Any:
-    """Return the output ``action`` of an ONNX model, or its first one."""
+    """Output ``action`` of an ONNX model, or its first one."""
     session = session_of(session)
     names = [output.name for output in session.get_outputs()]
     return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: seen})[0]
 
 
 def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
-    """Return the content of an ``.onnx`` file, which is an ONNX model that can be pickled."""
+    """Content of an ``.onnx`` file: an ONNX model that can be pickled."""
     file = Path(path).expanduser()
     if file.suffix != ".onnx":
         raise InvalidInput(
@@ -111,7 +103,6 @@ def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
 
 
 def session_of(given: Any) -> Any:
-    """Return the session of the content of an ONNX file, or the one that is given."""
     return _opened(given) if isinstance(given, bytes) else given
 
 
@@ -126,7 +117,7 @@ def _opened(content: bytes) -> Any:
 
 
 def _refuse_training_mode(module: Any, who: str) -> None:
-    """Raise ``InvalidInput`` for a layer whose results are random, or depend on the other worlds of a batch."""
+    """Refuse a layer whose results are random, or depend on the other worlds of a batch."""
     for layer in module.modules():
         shares = [getattr(layer, name, None) for name in ("p", "dropout")]
         random = any(isinstance(share, float | int) and share > 0.0 for share in shares)
@@ -138,7 +129,7 @@ def _refuse_training_mode(module: Any, who: str) -> None:
 
 
 def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
-    """Return the names of the features that a model was trained on, where it brings them; None: it does not."""
+    """Names of the features that a model was trained on; None if it does not bring them."""
     if ask is ask_onnx:
         listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(listed.split(",")) if listed else None
@@ -146,7 +137,7 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
 
 
 def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
-    """Return the number of discrete actions of a policy; None: it returns numbers in [-1, 1].
+    """Number of discrete actions of a policy; None: it returns numbers in [-1, 1].
 
     Raises ``InvalidInput`` if its action space is neither a box from -1 to 1 nor as ``given``.
     """
@@ -168,15 +159,14 @@ def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
 
 
 def statistics_of(model: Any) -> Any:
-    """Return the ``VecNormalize`` of a model of Stable-Baselines3; None: it has none."""
+    """``VecNormalize`` of a model of Stable-Baselines3; None: it has none."""
     return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
 def check_wrappers(policy: Any, who: str) -> None:
     """Raise ``InvalidInput`` if a model was trained under a wrapper that may change what it sees or does.
 
-    The wrapper of its environment is named. A model from a file may show that it has lost the statistics of its
-    ``VecNormalize``.
+    A model from a file may show that it has lost the statistics of its ``VecNormalize``.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else layers_of(env):
@@ -197,7 +187,6 @@ def check_wrappers(policy: Any, who: str) -> None:
 
 
 def layers_of(env: Any) -> Iterator[Any]:
-    """Yield an environment and everything inside it, from the outside in."""
     yield env
     for name in INSIDE:
         inside = getattr(env, "__dict__", {}).get(name, ())  # its own: wrappers forward attributes
@@ -207,9 +196,9 @@ def layers_of(env: Any) -> Iterator[Any]:
 
 
 def _was_normalised(model: Any) -> bool:
-    """Return whether the last observation that a model has stored was normalised.
+    """Whether the last observation that a model has stored was normalised.
 
-    It is then stored as it was before, too, which off-policy algorithms always do, or it lies outside its space.
+    Then it is also stored as it was before, as off-policy algorithms always do, or it lies outside its space.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

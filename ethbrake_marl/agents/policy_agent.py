@@ -54,7 +54,6 @@ class LearnedAgent:
     observation: View | None = None  # None: that of the policy
 
     def __post_init__(self) -> None:
-        """Raise ``InvalidInput`` for something else than a policy of one action."""
         if not isinstance(self.policy, Policy):
             raise InvalidInput(
                 f"agent {self.name!r}: policy = {self.policy!r:.80}: must be a policy with one action, such as that of"
@@ -81,10 +80,10 @@ class LearnedAgent:
             )
 
     def begin(self, alert: State, body: int) -> None:
-        """Return no memory."""
+        """No memory."""
 
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
-        """Return the commands of vehicle ``body``, [n] m/s2."""
+        """Commands of vehicle ``body``, [n] m/s2."""
         policy = self.policy
         view = self.observation or policy.observation
         seen = view.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
@@ -116,11 +115,11 @@ class PolicyAgent:
             )
 
     def begin(self, alert: State, body: int) -> Any:
-        """Return the policy's memory for new episodes."""
+        """Policy's memory for new episodes."""
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Return the commands of vehicle ``body``, [n] m/s2, and the policy's new memory.
+        """Commands of vehicle ``body``, [n] m/s2, and the policy's new memory.
 
         Raises ``AgentFailed`` for actions of a wrong shape, or one that is not in its range.
         """
@@ -136,8 +135,6 @@ class PolicyAgent:
         return to_command(state, body, self._actions(answer, state, body)), memory
 
     def _own(self, memory: Any, n: int) -> Any:
-        """Return a memory in arrays of its own."""
-
         def copied(part: Any) -> NDArray[Any]:
             array = np.array(to_array(part))
             if array.shape[:1] != (n,) or array.dtype.hasobject:
@@ -148,7 +145,7 @@ class PolicyAgent:
         return mapped(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
-        """Return the actions [n] in [-1, 1] for what the policy has answered."""
+        """Actions [n] in [-1, 1] for the policy's answer."""
         given, n, last = to_array(answer), state.n, (self.actions or 0) - 1
         kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
         if self.actions is not None:
@@ -170,7 +167,6 @@ class PolicyAgent:
 
 
 def to_array(value: Any) -> NDArray[Any]:
-    """Return an array, tensor or sequence as an array."""
     try:
         return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
     except ValueError:  # lists of different lengths, or a tuple of arrays
@@ -188,7 +184,7 @@ def policy_agent(
     actions: int | None = None,
     ignore_wrappers: bool = False,
 ) -> PolicyAgent:
-    """Return an agent that drives with a policy of any library.
+    """Agent that drives with a policy of any library.
 
     The policy maps observations, [n, F] float32, to actions, [n, 1] or [n]: numbers in [-1, 1], or indices. A policy
     with a memory is a function ``(observations, state) -> (actions, state)``.
@@ -243,7 +239,7 @@ def policy_agent(
 
 
 def _view(given: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
-    """Return what a policy observes: what is ``given``, what it brings, or what the learners of a scenario observe."""
+    """View that is ``given``, or that the policy brings, or of the learners of the scenario."""
     if given is not None:
         view = given if isinstance(given, View) else View(given)
         if trained_on not in (None, view.names):

@@ -18,11 +18,9 @@ class Held(NamedTuple):
     knows: str = SENSORS
 
     def begin(self, alert: State, body: int) -> Floats:
-        """Return the command, [n] m/s2."""
         return first_command(self.name, alert.car[:, BRAKING, body])
 
     def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
-        """Return the command, which is the memory."""
         return memory, memory
 
 
@@ -30,7 +28,7 @@ FULL_BRAKE, COAST = Held("full_brake"), Held("coast")
 
 
 def make_held(argument: str | None, settings: Any) -> Held:
-    """Return the script with the name ``settings.spec``. Raises ``InvalidInput`` unless its argument is right."""
+    """The script with the name ``settings.spec``. Raises ``InvalidInput`` for a wrong argument."""
     check_role(settings.spec)
     return Held(settings.spec)
 

@@ -54,10 +54,10 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on s
 
 
 def schema_option(module: str, function: str, kind: str) -> Any:
-    """Return the type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
+    """Type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
 
-    The ``function`` returns the schema; its ``module`` is imported only when the option is used. ``kind`` names the
-    kind of file in the help text.
+    ``module``, with the ``function`` that returns the schema, is imported only when the option is used. ``kind`` names
+    the kind of file in the help text.
     """
 
     def show_schema(asked: bool) -> None:
@@ -70,7 +70,7 @@ def schema_option(module: str, function: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Return the examples at the end of a help page, from command lines without ``ethbrake``."""
+    """Examples at the end of a help page, from command lines without ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
@@ -82,9 +82,8 @@ def say(text: str) -> None:
 class Out:
     """Output of a command of ``ethbrake``, used as ``with Out() as out``.
 
-    Inside the ``with`` block only results go to stdout. All other output, for instance of a user's agent, goes to
-    stderr. Ctrl-C ends the command with a message of one line and exit status 130. The message ends with ``remains``, a
-    text about the files that remain.
+    Inside the block only results go to stdout; all other output, for instance of a user's agent, goes to stderr. Ctrl-C
+    ends the command with exit status 130 and one line, which ends with ``remains``: which files remain.
     """
 
     def __init__(self, *, as_json: bool = False, force: bool = False, remains: str = "nothing was written") -> None:
@@ -94,7 +93,6 @@ class Out:
         self._turned = redirect_stdout(sys.stderr)
 
     def __enter__(self) -> Self:
-        """Redirect stdout to stderr, register the environments for the user's code, and return this object."""
         self._turned.__enter__()
         register_environments()
         return self
@@ -102,14 +100,14 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout; if the block was ended by Ctrl-C, print a message and exit with status 130."""
+        """Restore stdout; after Ctrl-C print a message and exit with status 130."""
         self._turned.__exit__(kind, error, trace)
         self.show_progress.end()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.remains}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
-        """Print the result of the command on stdout: as JSON the plain data ``content``, otherwise ``shown``."""
+        """Print the result on stdout: as JSON the plain data ``content``, otherwise ``shown``."""
         if self.as_json:
             self.print_json(content)
         else:
@@ -138,7 +136,7 @@ class Out:
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; call this method before any work.
+        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; for use before any work.
 
         ``endings`` are the allowed endings of the file's name, such as ``.csv``; without them every ending is allowed.
         ``what`` names the file's content in the error message. If ``path`` is None, nothing is checked.
@@ -165,20 +163,16 @@ class Out:
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int) -> None:
-        """Show the progress of the task ``name``: ``done`` of ``total`` units of work are done."""
+        """Show that ``done`` of ``total`` units of the task ``name`` are done."""
         self.show_progress(Progress(name, done, total))
 
 
 class _PlainConsole(Console):
-    """Console of rich that prints texts literally, without interpreting markup, and escapes control characters.
-
-    Without ``width`` (in characters), the console is as wide as the terminal.
-    """
+    """Console of rich that prints texts literally, without markup, and escapes control characters."""
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """Yield the styled segments of a text or table, with control characters escaped."""
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)

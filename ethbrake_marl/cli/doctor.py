@@ -1,4 +1,4 @@
-"""The command ``doctor``: check the versions and folders of this installation, and the physics on known results."""
+"""The command ``doctor``: check versions, folders, and the physics on known results."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Check:
 
 
 def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """Run all checks of the installation; return their results in the order in which the user should solve problems.
+    """Results of all checks, in the order in which the user should solve problems.
 
     With ``compile_all``, also compile the kernels (``compile_ahead``).
     """
@@ -81,7 +81,7 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
 
 def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """Return the check ``name`` with the result (ok, detail) of ``look()``; an error in ``look`` is a failed check."""
+    """Check ``name`` with the result (ok, detail) of ``look()``; an error in ``look`` is a failed check."""
     try:
         return Check(name, *look())
     except Exception as error:
@@ -89,7 +89,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Yield one check per dependency, which succeeds if a required version is installed.
+    """One check per dependency, which succeeds if a required version is installed.
 
     If a missing package is needed only by an extra, its check does not fail.
     """
@@ -182,7 +182,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    """Run Python with ``arguments`` in ``folder``; return the last line on stderr if it fails, else an empty text."""
+    """Run Python in ``folder``; return the last line on stderr if it fails, else an empty text."""
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 

@@ -1,4 +1,4 @@
-"""Registry of the functions that draw pages and pictures for commands; extensions register their functions here."""
+"""Registry of functions that draw pages and pictures for commands."""
 
 from __future__ import annotations
 
@@ -10,16 +10,14 @@ from ethbrake_marl.registry import Registry
 
 
 def register_page(shows: str, write: Callable[..., None]) -> None:
-    """Register the function that a command calls to write its page (a report) or its picture.
-
-    An installed package registers its function with an entry point of the group ``ethbrake_marl.pages``.
+    """Register the function that writes a command's page (a report) or picture. Entry points: ``ethbrake_marl.pages``.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``), ``"worlds"`` (``scenario sample``) or
             ``"run"`` (``ethbrake run``).
-        write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, what was
-            compared (``evaluation.compared``), and the command; for ``"worlds"``, the path of the file, the scenario,
-            the number of worlds and the seed. For ``"run"`` it returns a ``training.experiment.Report``.
+        write: its arguments are, for ``"evaluation"``, the path of the file, what was compared
+            (``evaluation.compared``), and the command; for ``"worlds"``, the path of the file, the scenario, the number
+            of worlds and the seed. For ``"run"`` it returns a ``training.experiment.Report``.
 
     """
     PAGES.add(shows, write, lambda other: other is write)
@@ -29,10 +27,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_of(shows: str, option: str) -> Callable[..., None]:
-    """Return the registered function that writes the page about ``shows``.
-
-    Raises ``InvalidInput``, whose message begins with the command's ``option``, if no such function is registered.
-    """
+    """Registered function that writes the page about ``shows``; ``InvalidInput`` begins with ``option``."""
     if shows not in PAGES:
         raise InvalidInput(f"{option}: the extension that draws this page ({shows}) is not installed")
     return PAGES[shows]

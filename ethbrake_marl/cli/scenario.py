@@ -89,7 +89,6 @@ def scenario_validate(path: NameArgument, as_json: JsonOption = False) -> None:
 
 
 def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
-    """Yield the lines of ``scenario validate``."""
     n, ranges = trial.drawn.worlds.n, _ranges(trial)
     learners = ", ".join(trial.known) or "none"
     yield f"OK  {scenario.name}: {scenario.vehicles} vehicles, learners: {learners}; tried in {n} worlds"
@@ -128,7 +127,7 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
 
 
 def _ranges(trial: Trial) -> dict[str, dict[str, float]]:
-    """Return least, median and largest value of every quantity in the worlds."""
+    """Least, median and largest value of every quantity in the worlds."""
     import numpy as np
 
     from ethbrake_marl.worlds.describe import quantities_of
@@ -147,7 +146,7 @@ def _kinds(trial: Trial) -> dict[str, Any]:
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
-    """Return the text as at most ``most`` lines of ``width`` characters; the rest is replaced by ``...``."""
+    """At most ``most`` lines of ``width`` characters; the rest is replaced by ``...``."""
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 

@@ -27,7 +27,6 @@ class Settings(NamedTuple):
     command: Mapping[str, Any]  # such as harm_count: total
 
     def change_scenario(self, name_or_path: str) -> Scenario:
-        """Return the scenario with these settings."""
         scenario = load_scenario(name_or_path)
         if not self.scenario:
             return scenario
@@ -35,14 +34,13 @@ class Settings(NamedTuple):
         return scenario.replace(**Override.put(content, self.scenario))
 
     def change_recipe(self, recipe: TrainingRecipe) -> TrainingRecipe:
-        """Return the recipe with these settings."""
         return recipe.replace(**Override.put(recipe.model_dump(mode="json"), self.recipe)) if self.recipe else recipe
 
 
 def read_settings(
     texts: Sequence[str] | None, recipe_keys: Sequence[str] = (), of_command: Sequence[str] = ()
 ) -> Settings:
-    """Return the settings ``KEY=VALUE`` of a command, by their owner.
+    """Settings ``KEY=VALUE`` of a command, by their owner.
 
     A key that the scenario and the recipe share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName``
     for an unknown key, and ``InvalidInput`` for an ambiguous one or a bad value.
@@ -75,7 +73,7 @@ def read_settings(
 
 
 def _counted(rules: Override, given: Sequence[Override], owner: str) -> Override:
-    """Return the setting of a count for which ``rules=NAME`` is short: that of the reward in a recipe."""
+    """Setting of a count for which ``rules=NAME`` is short: that of the reward in a recipe."""
     name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
     if not isinstance(name, str) or name not in RULES:
         raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(RULES)}")

@@ -116,13 +116,13 @@ def train_command(
 
 
 def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Path:
-    """Return the default folder of a run, ``runs/SCENARIO-RECIPE[-SCHEME]-seedSEED``."""
+    """Default folder of a run, ``runs/SCENARIO-RECIPE[-SCHEME]-seedSEED``."""
     plan = recipe if scheme is None else f"{recipe}-{scheme}"
     return Path("runs") / f"{scenario}-{plan}-seed{seed}"
 
 
 def changed(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
-    """Return the recipe with settings of the command line; say if only one of two keys that should agree is set."""
+    """Recipe with settings of the command line; say if only one of two keys that should agree is set."""
     from ethbrake_marl.files.overrides import Override
 
     if not overrides:

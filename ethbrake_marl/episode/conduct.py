@@ -10,25 +10,25 @@ from ethbrake_marl.motion.layout import COUNT, DROVE, NEXT_TIME, PUSHED, Floats
 
 
 def push(before: State, step: Step, after: State) -> Floats:
-    """Return the term push, [n]: minus the push of all contacts (m/s), the obstacle's included (``motion.push``)."""
+    """Term push, [n]: minus the push of all contacts (m/s), the obstacle's included (``motion.push``)."""
     check_exact(before, "the term push")
     return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
 
 
 def drove(before: State, step: Step, after: State) -> Floats:
-    """Return the term drove, [n, N]: minus what a positive command adds to the speed before the first impact (m/s)."""
+    """Term drove, [n, N]: minus what a positive command adds to the speed before the first impact (m/s)."""
     check_exact(before, "the term drove")
     return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
 
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
-    """Return the term still_moving, [n]: -1 for an end at the horizon with a vehicle in motion."""
+    """Term still_moving, [n]: -1 for an end at the horizon with a vehicle in motion."""
     check_exact(before, "the term still_moving")
     return 0.0 - step.out[TRUNCATED]
 
 
 def first_impact_s(before: State, after: State) -> Floats:
-    """Return until when the line has had no impact, [n] s: from ``before.time_s`` to ``after.time_s``.
+    """Time until which the line has had no impact, [n] s: from ``before.time_s`` to ``after.time_s``.
 
     No decision lies between the states.
     """
@@ -40,6 +40,6 @@ def first_impact_s(before: State, after: State) -> Floats:
 
 
 def driving_s(before: State, after: State) -> Floats:
-    """Return how long a positive command is in force before the line's first impact, [n, N] s."""
+    """How long a positive command is in force before the line's first impact, [n, N] s."""
     asked_mps, commands = after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1], after.commands_mps2
     return asked_mps / np.where(commands > 0.0, commands, 1.0)

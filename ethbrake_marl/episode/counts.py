@@ -38,24 +38,22 @@ IN_WORDS = {"first": "first-impact harm", "total": "total harm", "honest": "hone
 
 
 def weights_of(count: Count) -> Floats:
-    """Return the weights of a count."""
     return COUNTS[count] if isinstance(count, str) else count
 
 
 def check_count(what: str, count: object) -> None:
-    """Raise ``InvalidInput`` unless this is the name of a count."""
     if count not in COUNTS:
         raise InvalidInput(f"{what} = {count!r}: must be 'first', 'total' or 'honest'")
 
 
 def other_count(count: Count) -> str:
-    """Return the count that decides ties."""
+    """The count that decides ties."""
     return "total" if isinstance(count, str) and count == "first" else "first"
 
 
 @kernel
 def pair_amount(line, p, weights):
-    """Return what counts of the pair p of one world so far (m2/s2)."""
+    """Amount of the pair p of one world so far (m2/s2)."""
     harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
     beside = weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
     return harm + (weights[2] * line[PASSED, p] + beside)
@@ -63,13 +61,13 @@ def pair_amount(line, p, weights):
 
 @kernel
 def own_amount(line, p, weights):
-    """Return the part of ``pair_amount`` that the vehicle behind bears alone (m2/s2): for its driving and motion."""
+    """Part of ``pair_amount`` that the vehicle behind bears alone (m2/s2): for its driving and motion."""
     return weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
 
 
 @kernel
 def amount_so_far(line, weights):
-    """Return what counts of one world so far (m2/s2), added up from the obstacle to the rear: the only order used."""
+    """Amount of one world so far (m2/s2), added up from the obstacle to the rear: the only order used."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
         amount += pair_amount(line, p, weights)
@@ -77,7 +75,7 @@ def amount_so_far(line, weights):
 
 
 def pair_amounts(line: Floats, count: Count) -> Floats:
-    """Return what counts of each pair so far, [n, N + 1] m2/s2, as ``pair_amount`` does."""
+    """Amount of each pair so far, [n, N + 1] m2/s2."""
     first, total, passed, push, drove, moving = weights_of(count)
     harm = first * line[:, FIRST] + total * line[:, TOTAL]
     beside = push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING]
@@ -85,6 +83,6 @@ def pair_amounts(line: Floats, count: Count) -> Floats:
 
 
 def own_amounts(line: Floats, count: Count) -> Floats:
-    """Return the part of ``pair_amounts`` that the vehicle behind bears alone, [n, N + 1] m2/s2."""
+    """Part of ``pair_amounts`` that the vehicle behind bears alone, [n, N + 1] m2/s2."""
     drove, moving = weights_of(count)[4:]
     return np.asarray(drove * line[:, DROVE] + moving * line[:, MOVING])

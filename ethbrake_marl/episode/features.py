@@ -1,4 +1,4 @@
-"""Which features an observation can have: fixed scalings of single numbers, in groups that are computed together.
+"""Features of observations: fixed scalings of single numbers, in groups that are computed together.
 
 A vehicle observes ``clip(value / scale, low, high)``. What it does not know reads 0, with the feature ``known`` 0.
 """
@@ -23,8 +23,6 @@ Of = Literal["own", "neighbour"]
 
 
 class Feature(NamedTuple):
-    """One number of an observation."""
-
     name: str  # in its group (``speed``), or in full (``own.speed``)
     unit: str
     scale: float  # in `unit`
@@ -110,7 +108,7 @@ def _weight_share(state: State, body: int) -> Floats:
 def _of_both(
     name: str, unit: str, high: float, function: Callable[[State, int], Floats], meaning: str
 ) -> dict[str, Own]:
-    """Return a feature of the vehicle itself, ``own_NAME``, and the same of a neighbour, ``NAME``."""
+    """A feature of the vehicle itself, ``own_NAME``, and of a neighbour, ``NAME``."""
     return {
         f"own_{name}": Own(Feature(f"own_{name}", unit, 1.0, 0.0, high, f"own {meaning}"), "own", function),
         name: Own(
@@ -141,10 +139,10 @@ def register_feature(
         name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. A list names a feature of a neighbour as ``front_1.NAME``.
         function: ``function(state, body)``, or ``function(state, body, other)`` for a neighbour, returns the value in
             every world, [n], in ``unit``. ``body`` 1 is the front vehicle.
-        unit: unit of the value.
+        unit: of the value.
         scale: number above 0; ``clip(value / scale, low, high)`` is observed.
-        low: smallest number that is observed.
-        high: largest number that is observed.
+        low: smallest observed number.
+        high: largest observed number.
         of: whom the feature describes: the observer itself (``own``), or a ``neighbour``, where it knows one.
         unknown: value for a neighbour that is not known, in ``unit``.
 
@@ -205,7 +203,7 @@ GROUPS: Registry[Group] = Registry("group of features", "feature_groups", regist
 
 
 def side_of(name: str) -> int | None:
-    """Return the offset of a neighbour's group: ``front_2`` -2 (two ahead), ``rear_1`` 1; None for another name."""
+    """Offset of a neighbour's group: ``front_2`` -2 (two ahead), ``rear_1`` 1; None for another name."""
     match = SIDE.fullmatch(name)
     if match is None or int(match[2]) > MOST_NEIGHBOURS:
         return None
@@ -213,14 +211,14 @@ def side_of(name: str) -> int | None:
 
 
 def group_named(name: str) -> tuple[Feature, ...] | None:
-    """Return the features of a group, such as ``own``, ``front_1`` or ``contact``; None if there is no such group."""
+    """Features of a group, such as ``own``, ``front_1`` or ``contact``; None if there is no such group."""
     if side_of(name) is not None:
         return NEIGHBOUR
     return WHOLE_GROUPS[name] if name in WHOLE_GROUPS else GROUPS[name].features if name in GROUPS else None
 
 
 def feature_named(name: str) -> Feature:
-    """Return the feature with a full name, such as ``front_1.gap`` or ``place``. Raises ``UnknownName``."""
+    """The feature with a full name, such as ``front_1.gap`` or ``place``. Raises ``UnknownName``."""
     group, dot, own = name.partition(".")
     if not dot and name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature
@@ -235,23 +233,21 @@ def feature_named(name: str) -> Feature:
 
 
 def known_names() -> list[str]:
-    """Return what an ``observation:`` list may contain: groups first, then features; neighbours as ``front_1``."""
+    """Names for an ``observation:`` list: groups first, then features; neighbours as ``front_1``."""
     groups = [*WHOLE_GROUPS, "front_1", "rear_1", *GROUPS]
     inside = [f"{group}.{feature.name}" for group in groups for feature in group_named(group) or ()]
     return [*groups, *LISTS, *inside, *(name if FEATURES[name].of == "own" else f"front_1.{name}" for name in FEATURES)]
 
 
 def _names_of(listed: str) -> list[str]:
-    """Return the full names of a group, or of one feature."""
     group = group_named(listed)
     return [feature_named(listed).name] if group is None else [f"{listed}.{feature.name}" for feature in group]
 
 
 def listed_features(listed: object) -> tuple[str, ...]:
-    """Return the full names of an ``observation:`` list, groups replaced by their features.
+    """Full names of an ``observation:`` list: ``["own", "front_1.gap"]`` gives ``("own.speed", ..., "front_1.gap")``.
 
-    ``["own", "front_1.gap"]`` gives ``("own.speed", ..., "front_1.gap")``. Raises ``InvalidInput`` for something else
-    than a list, an unknown name, or a name that comes twice.
+    Raises ``InvalidInput`` for something else than a list, an unknown name, or a name that comes twice.
     """
     if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
         raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")

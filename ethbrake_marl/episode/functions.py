@@ -1,4 +1,4 @@
-"""Functions that users register (features, terms, objectives): what is asked of their names, docstrings and results."""
+"""Checks of functions that users register (features, terms, objectives): name, docstring, results."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from ethbrake_marl.motion.layout import Floats
 
 
 def described(kind: str, name: object, function: object, pattern: str, form: str) -> str:
-    """Return the docstring of a function that is to be registered, on one line.
+    """Docstring of a function to be registered, on one line; ``form`` is the ``pattern`` in words.
 
-    Raises ``InvalidInput`` for a bad name (``form`` is the ``pattern`` in words), or a function without a docstring.
+    Raises ``InvalidInput`` for a bad name or a missing docstring.
     """
     if not isinstance(name, str) or re.fullmatch(pattern, name) is None:
         raise InvalidInput(f"{kind} {name!r:.80}: the name must be 1 to 64 characters {form}")
@@ -25,7 +25,7 @@ def described(kind: str, name: object, function: object, pattern: str, form: str
 
 
 def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *shapes: tuple[int, ...]) -> Floats:
-    """Return the numbers that ``function(*given)`` returns, in one of the ``shapes``. Raises ``InvalidInput``."""
+    """Numbers that ``function(*given)`` returns, in one of the ``shapes``. Raises ``InvalidInput``."""
     try:
         value = np.asarray(function(*given))
     except InvalidInput as error:

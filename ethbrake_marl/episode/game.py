@@ -20,26 +20,26 @@ class Script(Protocol):
     """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do."""
 
     def begin(self, alert: State, body: int) -> Any:
-        """Return the memory for new episodes: None, an array with one row per world, or a tuple of memories."""
+        """Memory for new episodes: None, an array with one row per world, or a tuple of memories."""
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Return the commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the new memory."""
+        """Commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the new memory."""
 
 
 class Shield(Protocol):
     """Decides which of the proposed actions are applied."""
 
     def begin(self, game: Game, alert: State, state: State) -> Any:
-        """Return the memory for new episodes, whose first decision is ``state``."""
+        """Memory for new episodes, whose first decision is ``state``."""
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Any]:
-        """Return the actions to apply, [n, L], and the new memory.
+        """Actions to apply, [n, L], and the new memory.
 
         ``proposed`` [n, L] are in [-1, 1]; NaN: nothing is proposed. None: its own agents propose.
         """
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Return what users may want to know of it: name -> [n]."""
+        """Values to report: name -> [n]."""
 
 
 class Game(NamedTuple):
@@ -70,7 +70,7 @@ class Game(NamedTuple):
     shield: Shield | None = None
 
     def reset(self, alert: State) -> State:
-        """Return the episodes of these worlds at their first decision. Scripts have decided once, at the alert."""
+        """Episodes of these worlds at their first decision. Scripts have decided once, at the alert."""
         wanted, memories = alert.wanted, dict(alert.memories)
         if self.scripts:
             wanted = wanted.copy()
@@ -86,11 +86,11 @@ class Game(NamedTuple):
         return state._replace(memories=memories)
 
     def step(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """Return the state after one step of all worlds, and what the step did.
+        """State after one step of all worlds, and what the step did.
 
-        ``actions`` [n, L] of the learners, in [-1, 1]; behind a shield they are proposals, NaN where there is none, and
-        None lets the shield's own agents propose. ``donate``: the memory of ``state`` may be reused. What raises leaves
-        ``state`` as it was. Raises ``InvalidInput`` for bad actions.
+        ``actions`` [n, L] of the learners, in [-1, 1]; behind a shield they are proposals, NaN where there is none,
+        and None lets the shield's own agents propose. ``donate``: the memory of ``state`` may be reused. An error
+        leaves ``state`` as it was. Raises ``InvalidInput`` for bad actions.
         """
         if self.shield is not None:
             if actions is not None:
@@ -103,7 +103,7 @@ class Game(NamedTuple):
         return self.rewarding.complete(state, step, after)
 
     def first_decision(self, alert: State) -> State:
-        """Return the episodes at their first decision, before shaping and shield. Scripts have decided.
+        """Episodes at their first decision, before shaping and shield. Scripts have decided.
 
         Raises ``InvalidInput`` for worlds of a scenario with another physics.
         """
@@ -111,28 +111,28 @@ class Game(NamedTuple):
         return one_step.first_decision(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """Return the state after one step, and what it did: ``step`` without shield and without terms of the reward."""
+        """``step`` without shield and without terms of the reward."""
         return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
-        """Return the agents of some vehicles, body -> agent, so that each sees what it may see."""
+        """Agents of some vehicles, body -> agent, so that each sees what it may see."""
         return drivers
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Return of whom vehicle ``body`` does not know everything at its first decision, [n, N + 1]."""
+        """Bodies of which vehicle ``body`` does not know everything at its first decision, [n, N + 1]."""
         return alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
 
     def own_infos(self, state: State) -> dict[str, Any]:
-        """Return the infos that only this game has: name -> [n] or [n, N]."""
+        """Infos that only this game has: name -> [n] or [n, N]."""
         if self.shield is None:
             return {}
         return {f"shield_{name}": value for name, value in self.shield.infos(self, state).items()}
 
     def observe(self, state: State, bodies: Ints) -> list[Observations]:
-        """Return what each of the ``bodies`` observes, [n, F] each."""
+        """Observation of each of the ``bodies``, [n, F] each."""
         return [self.views[i].observe(state, np.array([i]), self.rules.time_step_s)[:, 0] for i in bodies.tolist()]
 
     def observe_alike(self, state: State, bodies: Sequence[int] | Ints) -> Observations:
-        """Return what the ``bodies``, which have one view, observe, [n, len(bodies), F]."""
+        """Observations of the ``bodies``, which have one view, [n, len(bodies), F]."""
         bodies = np.asarray(bodies, np.int64)
         return self.views[bodies[0]].observe(state, bodies, self.rules.time_step_s)

@@ -64,14 +64,14 @@ def report(line, car, clock, wanted, bodies, borne, out):
 
 
 def numbers(state: State, bodies: Ints) -> Floats:
-    """Return NUMBERS of the bodies in every world, [n, bodies, len(NUMBERS)]."""
+    """NUMBERS of the bodies in every world, [n, bodies, len(NUMBERS)]."""
     out = np.empty((state.n, len(bodies), len(NUMBERS)))
     report(state.line, state.car, state.clock, state.wanted, bodies, np.empty((2, state.vehicles)), out)
     return out
 
 
 def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str, Any]:
-    """Return the infos that belong to a world, and terms of vehicles: name -> [n] or [n, N]. ``step`` None: a reset."""
+    """Infos of a world, and terms of vehicles: name -> [n] or [n, N]. ``step`` None: a reset."""
     counted = game.rewarding.counted
     worlds = {"world_seed": np.full(state.n, seed), "world": state.clock[:, NUMBER].astype(np.int64)}
     if step is None:
@@ -82,7 +82,7 @@ def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str,
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
-    """Return one dictionary for each world and body, world by world."""
+    """One dictionary for each world and body, world by world."""
     infos = []
     shared = per_body(of_step(game, state, step, seed) | game.own_infos(state), state.n, bodies)
     for values, common in zip(numbers(state, bodies).reshape(-1, len(NUMBERS)).tolist(), shared, strict=True):
@@ -93,7 +93,7 @@ def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies:
 
 
 def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, Any]]:
-    """Return columns, [n] or [n, N], as one dictionary for each world and body, world by world."""
+    """Columns, [n] or [n, N], as one dictionary for each world and body, world by world."""
     shared = {name: value.tolist() for name, value in columns.items() if value.ndim == 1}
     own = {name: value[:, bodies - 1].tolist() for name, value in columns.items() if value.ndim == 2}
     rows = []
@@ -104,7 +104,7 @@ def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, An
 
 
 def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) -> dict[str, Any]:
-    """Return the infos of one body in every world: name -> [n]."""
+    """Infos of one body in every world: name -> [n]."""
     columns = dict(zip(NUMBERS, numbers(state, np.array([body]))[:, 0].T, strict=True))
     columns["collided"] = columns["collided"] == 1.0
     for name, value in (of_step(game, state, step, seed) | game.own_infos(state)).items():

@@ -24,7 +24,7 @@ class Curve(NamedTuple):
 
 
 def _power(share: Floats) -> Floats:
-    """Return ``min(share^1.531, 1)``, with the same bits on every processor."""
+    """``min(share^1.531, 1)``, with the same bits on every processor."""
     positive = share > 0.0
     return np.where(positive, np.minimum(exp_each(1.531 * log_each(np.where(positive, share, 1.0))), 1.0), 0.0)
 
@@ -47,7 +47,7 @@ CURVES = {
 
 
 def risks(changes: Floats, curve: str) -> Floats:
-    """Return each vehicle's probability of an injury, [n, 2, N], by changes of speed at its front and rear (m/s).
+    """Each vehicle's probability of an injury, [n, 2, N], by changes of speed at its front and rear (m/s).
 
     It is 0 on a side that was not hit, where the logistic curves would be above 0.
     """
@@ -56,7 +56,7 @@ def risks(changes: Floats, curve: str) -> Floats:
 
 
 def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
-    """Return expected injuries in 1,000 lines, [n], as if one impact had done each pair's harm [n, N + 1] (m2/s2).
+    """Expected injuries in 1,000 lines, [n], as if one impact had done each pair's harm [n, N + 1] (m2/s2).
 
     A vehicle that is hit on both sides counts with the larger of its two risks. Exact for first impacts of two
     vehicles; too large where several impacts of a pair add up.
@@ -71,9 +71,9 @@ def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
 
 
 def speed_changes(before: State, after: State) -> Floats:
-    """Return each vehicle's largest change of speed by one impact between two states, at its front and rear.
+    """Each vehicle's largest change of speed by one impact between two states, at its front and rear, [n, 2, N] m/s.
 
-    [n, 2, N] m/s. No decision lies between the states. A push by a vehicle in contact is no impact.
+    No decision lies between the states. A push by a vehicle in contact is no impact.
     """
     out = np.zeros((after.n, 2, after.vehicles))
     struck = np.asarray((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
@@ -83,7 +83,7 @@ def speed_changes(before: State, after: State) -> Floats:
 
 
 def injured(changes: Floats, curve: str) -> Floats:
-    """Return expected injuries of each vehicle in 1,000 lines, [n, N], from its largest changes [n, 2, N] (m/s).
+    """Expected injuries of each vehicle in 1,000 lines, [n, N], from its largest changes [n, 2, N] (m/s).
 
     The side with the larger change counts.
     """

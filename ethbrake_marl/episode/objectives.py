@@ -49,7 +49,7 @@ FIRST_WEIGHT = 1000.0  # weight of A in ``first:A,then:B``; B keeps the scale fo
 
 
 class Harm(NamedTuple):
-    """Harm of n worlds over some time, from which an objective computes what a vehicle should minimise."""
+    """Harm of n worlds over some time."""
 
     pairs: Floats  # [n, N + 1] harm of each pair, m2/s2; column 0: with the obstacle
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
@@ -58,7 +58,7 @@ class Harm(NamedTuple):
 
     @classmethod
     def of(cls, pairs: Floats, own: Floats, car: Floats) -> Harm:
-        """Return the harm whose pairs have ``pairs``, of which the vehicle behind bears ``own`` alone, [n, N + 1]."""
+        """Harm of pairs, [n, N + 1], of which the vehicle behind bears ``own`` [n, N + 1] alone."""
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             whole = whole + pairs[:, p]
@@ -66,7 +66,7 @@ class Harm(NamedTuple):
         return cls(pairs, borne + own[:, :-1], whole, car)
 
     def weighted(self, weights: Floats) -> Floats:
-        """Return ``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for the ``weights`` [n, N]; sums from front to rear."""
+        """``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for the ``weights`` [n, N]; sums from front to rear."""
         harm, whole = np.zeros(len(self.borne)), np.zeros(len(self.borne))
         for j in range(self.borne.shape[1]):
             harm = harm + weights[:, j] * self.borne[:, j]
@@ -75,8 +75,6 @@ class Harm(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """A kind of objective."""
-
     form: str  # how it is written; with ":" it takes an argument
     about: str
     amount: Callable[[Harm, int, Objective], Floats]  # (harm, vehicle from 0, what is written) -> [n]
@@ -85,7 +83,6 @@ class Kind(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name in the registry."""
         return self.form.partition(":")[0]
 
     def __reduce__(self) -> tuple[Callable[[str], Kind], tuple[str]]:
@@ -103,15 +100,14 @@ class Objective(NamedTuple):
 
     @property
     def is_sum(self) -> bool:
-        """Whether this is a weighted sum of the vehicles' harm."""
         return self.kind.weights is not None and all(part.is_sum for part in self.parts)
 
     def amount(self, harm: Harm, vehicle: int) -> Floats:
-        """Return what ``vehicle`` (from 0) should minimise, [n]."""
+        """Amount that ``vehicle`` (from 0) should minimise, [n]."""
         return self.kind.amount(harm, vehicle, self)
 
     def weights(self, car: Floats, vehicle: int) -> Floats:
-        """Return the weight of each vehicle's harm, [n, N]. Raises ``InvalidInput`` unless this is a weighted sum."""
+        """Weight of each vehicle's harm, [n, N]. Raises ``InvalidInput`` unless this is a weighted sum."""
         if self.kind.weights is None:
             known = ", ".join(kind.form for kind in OBJECTIVES.loaded.values() if kind.weights)
             raise InvalidInput(
@@ -127,7 +123,7 @@ def _kind(name: str) -> Kind:
 
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
-    """Return the objective of a text such as ``own``, ``social:45`` or ``weighted:1,4,1``. Raises ``InvalidInput``."""
+    """Objective of a text such as ``own``, ``social:45`` or ``weighted:1,4,1``. Raises ``InvalidInput``."""
     name, (_, colon, argument) = name_of(text), text.partition(":")
     kind = OBJECTIVES[name]
     if name == "vehicle_K":
@@ -169,12 +165,12 @@ def _first_and_then(text: str, argument: str) -> tuple[Objective, ...]:
 
 
 def name_of(text: str) -> str:
-    """Return the name of a kind of objective in a text: of ``social:45`` ``social``, of ``vehicle_3`` ``vehicle_K``."""
+    """Kind of the objective in a text: of ``social:45`` ``social``, of ``vehicle_3`` ``vehicle_K``."""
     return re.sub("vehicle_[1-9][0-9]?", "vehicle_K", text) if ":" not in text else text.partition(":")[0]
 
 
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
-    """Return the objective of each vehicle, front to rear. Raises ``InvalidInput`` for a bad text or a wrong number."""
+    """Objective of each vehicle, front to rear. Raises ``InvalidInput`` for a bad text or a wrong number."""
     each = [declared] * vehicles if isinstance(declared, str) else declared
     if not isinstance(each, Sequence) or not all(isinstance(text, str) for text in each):
         raise InvalidInput(
@@ -205,10 +201,10 @@ def _check_vehicles(text: str, objective: Objective, vehicles: int) -> None:
 
 
 def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: bool) -> list[int]:
-    """Return the pairs whose impacts cost ``vehicle`` (from 0) nothing: K for Vehicles K and K + 1, 0 for the obstacle.
+    """Pairs whose impacts cost ``vehicle`` (from 0) nothing: K for Vehicles K and K + 1, 0 for the obstacle.
 
-    In such a pair no vehicle's harm has a weight. Only weights of 0 that somebody wrote count, in ``weighted`` and
-    ``vehicle_K``; that ``own`` is indifferent to others, and ``social:90`` to the vehicle itself, is what they mean.
+    Only weights of 0 that somebody wrote count, in ``weighted`` and ``vehicle_K``; that ``own`` is indifferent to
+    others, and ``social:90`` to the vehicle itself, is what they mean.
     """
     if objective.kind.name not in ("weighted", "vehicle_K"):
         return []
@@ -217,7 +213,7 @@ def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: b
 
 
 def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: str) -> Floats:
-    """Return how much each vehicle's amount has grown since ``before`` (None: since the alert), [n, N].
+    """Growth of each vehicle's amount since ``before`` (None: since the alert), [n, N].
 
     A weighted sum is taken of the harm since then; any other amount is the amount after minus the amount before.
     """
@@ -236,7 +232,7 @@ def amounts(objectives: Sequence[Objective], before: State | None, after: State,
 
 
 def _cosine_and_sine(angle_deg: float) -> tuple[float, float]:
-    """Return cosine and sine of an angle, with the same bits on every processor: power series in exact fractions."""
+    """Cosine and sine with the same bits on every processor: power series in exact fractions."""
     if angle_deg == 90.0:
         return 0.0, 1.0
     angle, term, sums = Fraction(math.radians(angle_deg)), Fraction(1), [Fraction(0), Fraction(0)]
@@ -263,7 +259,7 @@ def _joined(first_and_then: Sequence[Floats]) -> Floats:
 
 
 def register_objective(name: str, function: Callable[[Harm, int], Floats]) -> None:
-    """Register an objective, which scenarios and rewards then know. Entry points: ``objectives``.
+    """Register an objective for scenarios and rewards. Entry points: ``ethbrake_marl.objectives``.
 
     ``function(harm, vehicle)`` returns what ``vehicle`` (from 0) should minimise, [n]; its docstring says what that is.
     Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring.

@@ -47,8 +47,6 @@ N_OWN, N_NEIGHBOUR, N_ROLE, N_OBSTACLE = len(OWN), len(NEIGHBOUR), len(ROLE), le
 
 
 class Plan(NamedTuple):
-    """How a view is computed."""
-
     offsets: Ints  # of the observed neighbours: -1 is the next vehicle ahead
     role: bool
     obstacle: bool
@@ -81,7 +79,7 @@ class View:
         return f"View({list(self.names)})"
 
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
-        """Return the observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
+        """Observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
         plan = self.plan
         seen = np.empty((state.n, len(observers), len(self.names)), np.float32)
         observe_worlds(
@@ -102,7 +100,6 @@ class View:
 
     @cached_property
     def plan(self) -> Plan:
-        """How this view is computed."""
         listed = list(dict.fromkeys(name.partition(".")[0] for name in self.names if "." in name))
         offsets = [offset for name in listed if (offset := side_of(name)) is not None]
         inside = ["own", *(name for name in listed if side_of(name) is not None)]
@@ -128,24 +125,23 @@ class View:
 
 
 def knows(state: State, body: int, other: int) -> NDArray[np.bool_]:
-    """Return whether a body may act on news of another one, which exists, [n]."""
+    """Whether a body may act on news of another one, which exists, [n]."""
     if not 0 < other <= state.vehicles:
         return np.zeros(state.n, np.bool_)
     return np.asarray(state.time_s >= state.know[:, body, other])
 
 
 def scaling_of(features: Sequence[Feature]) -> Floats:
-    """Return 1 / scale, low and high of features, [3, F]."""
+    """1 / scale, low and high of features, [3, F]."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
 def scaled(values: Floats, scaling: Floats) -> Floats:
-    """Return what is observed of ``values`` [..., F]."""
     return np.clip(values * scaling[0], scaling[1], scaling[2])
 
 
 def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[np.bool_]) -> Floats:
-    """Return what is observed of a feature with a function, [n]. Raises ``InvalidInput`` for a bad result.
+    """Observed value of a feature with a function, [n].
 
     ``offset`` is that of the neighbour, who is ``known`` [n] or not; 0: a feature of the vehicle itself.
     """
@@ -162,14 +158,14 @@ def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[n
 
 @kernel
 def full_stop_m(speed, latency_left, capacity):
-    """Return the distance (m) until a vehicle is at rest whose brakes act at once (``forces.stopping_m``)."""
+    """Distance (m) until a vehicle is at rest whose brakes act at once (``forces.stopping_m``)."""
     speed = max(speed, 0.0)
     return speed * latency_left + speed * speed / (2.0 * capacity)
 
 
 @kernel
 def fitting_deceleration(speed, latency_left, room):
-    """Return the deceleration (m/s2) that stops a vehicle after ``room`` (m): ``v^2 / (2 (room - v tau))``.
+    """Deceleration (m/s2) that stops a vehicle after ``room`` (m): ``v^2 / (2 (room - v tau))``.
 
     Less than 1 mm after the latency counts as 1 mm, which is clipped in the observation.
     """
@@ -179,7 +175,6 @@ def fitting_deceleration(speed, latency_left, room):
 
 @kernel
 def bounded(value, scaling, f):
-    """Return what is observed of the value of feature f."""
     return min(max(value * scaling[0, f], scaling[1, f]), scaling[2, f])
 
 

@@ -1,8 +1,7 @@
 """What would happen? Two functions answer, with the motion of the episode itself.
 
-``played``: the end of every episode that follows a plan, decision by decision; its harm is the plan's ``price``. To the
-last bit this is the harm that happens if the plan is followed. ``hold``: the harm if bodies hold constant commands, for
-many commands, in one piece: fast, but rounded differently.
+``played`` follows a plan, decision by decision, to the same bits as the episode. ``hold`` holds constant commands, in
+one piece: fast, but rounded differently.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 
 
 def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
-    """Return working memory: of the physics, and for one world's line and commands."""
+    """Working memory: of the physics, and for one world's line and commands."""
     return scratch_for(bodies), np.zeros((LINE_ROWS, bodies)), np.zeros(bodies)
 
 
@@ -63,10 +62,10 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, mem
 def played(
     game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf, *, donate: bool = False
 ) -> tuple[State, Floats]:
-    """Return the last states of episodes whose learners follow their plans from now on, and their harm, [n] m2/s2.
+    """Last states of episodes whose learners follow their plans from now on, and their harm, [n] m2/s2.
 
     ``plans`` [n, T, L] are the learners' actions at every decision; the last one repeats. An episode stops where its
-    harm is above ``most`` [n]. The harm is infinite where a check of the physics fails. Scripts that look at the state
+    harm is above ``most`` [n]. The harm is infinite where a check of the physics fails; scripts that look at the state
     are asked as in the episode, which raises ``PhysicsError`` instead. ``donate``: the memory of ``state`` may be
     reused.
     """
@@ -89,12 +88,12 @@ def played(
 
 
 def price(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> Floats:
-    """Return the harm of every episode, [n] m2/s2, if its learners follow their plan from now on; see ``played``."""
+    """Harm of every episode, [n] m2/s2, if its learners follow their plan from now on; see ``played``."""
     return played(game, state, plans, count, most)[1]
 
 
 def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float, count: Count) -> Floats:
-    """Return the harm in this count, and in the one that decides ties, [2, n, C] m2/s2, if ``bodies`` hold commands.
+    """Harm in this count, and in the one that decides ties, [2, n, C] m2/s2, if ``bodies`` hold commands.
 
     ``until_s`` is the horizon: what still moves then counts as it does there. ``tried`` [n, C, B] are C commands of the
     bodies (m/s2); the others hold ``wanted`` [n, N + 1].

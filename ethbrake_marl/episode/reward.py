@@ -40,11 +40,11 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class WithoutEffect(UserWarning):
-    """Warning: a setting has no effect, such as an objective in a reward that gives harm the weight 0."""
+    """A setting has no effect, such as an objective in a reward that gives harm the weight 0."""
 
 
 def own_terms() -> list[str]:
-    """Return the names of registered terms, without loading any."""
+    """Names of registered terms, without loading any."""
     return [name for name in TERMS if name not in RewardParams.model_fields]
 
 
@@ -139,7 +139,6 @@ class RewardParams(FileModel):
 
     @property
     def weights(self) -> dict[str, float]:
-        """Weight of every built-in and every registered term."""
         return {**{name: getattr(self, name) for name in BUILT_IN}, **self.terms}
 
 
@@ -153,7 +152,7 @@ Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
 
 def reward_params(reward: Reward) -> RewardParams:
-    """Return the settings of a reward. Raises ``UnknownName`` or ``InvalidInput``."""
+    """Settings of a reward. Raises ``UnknownName`` or ``InvalidInput``."""
     if isinstance(reward, RewardParams):
         return reward
     if isinstance(reward, str):
@@ -190,7 +189,7 @@ class Rewarding(NamedTuple):
     def of(
         cls, reward: Reward, objective: Declared, vehicles: int, learners: Ints, times: tuple[float, float], vector: Any
     ) -> tuple[Rewarding, Rules]:
-        """Return the reward, and the rules of a step with its weights.
+        """The reward, and the rules of a step with its weights.
 
         ``objective`` is the scenario's; ``times`` are time step and horizon (s); ``vector`` are the components of a
         vector reward, or None. Warns if an objective has no effect.
@@ -241,7 +240,7 @@ class Rewarding(NamedTuple):
         return not self.terms and self.shaping is None and not self.components
 
     def complete(self, before: State, step: Step, after: State) -> tuple[State, Step]:
-        """Return the state with the memory of the reward, and the step with the whole reward."""
+        """State with the memory of the reward, and step with the whole reward."""
         values = {name: function(before, step, after) for name, _, function in self.terms}
         if self.shaping is not None:
             values["shaping"], memory = self.shaping.value(before, step, after)
@@ -263,7 +262,7 @@ class Rewarding(NamedTuple):
         return after, step
 
     def shared(self, step: Step) -> dict[str, Floats]:
-        """Return the values of the terms that the compiled step knows, [n]."""
+        """Values of the terms that the compiled step knows, [n]."""
         known = {"harm": -step.counted, "terminal": step.out[SAFE_END]}
         return {name: value for name, value in known.items() if name in self.counted}
 

@@ -1,4 +1,4 @@
-"""The state of a batch of episodes, as a value: a snapshot, a branch, the last state of an episode are States."""
+"""The state of a batch of episodes, as a value."""
 
 from __future__ import annotations
 
@@ -61,18 +61,18 @@ class State(NamedTuple):
     memories: Mapping[Any, Any]  # body -> memory of its script; a name -> memory of a shield or term
 
     def take(self, rows: Any) -> State:
-        """Return the episodes ``rows`` (indices, a mask or a slice)."""
+        """The episodes ``rows`` (indices, a mask or a slice)."""
         state: State = take(self, rows)
         return state
 
     def put(self, rows: Any, new: State, *, donate: bool = False) -> State:
-        """Return this state with the episodes ``new`` in ``rows``. ``donate``: its own arrays may be reused."""
+        """The state with the episodes ``new`` in ``rows``. ``donate``: its own arrays may be reused."""
         state: State = put(self, rows, new, donate)
         return state
 
     @staticmethod
     def join(parts: Sequence[State], merged: Callable[[Sequence[Any]], Any] = np.concatenate) -> State:
-        """Return the episodes of all parts, which have memories of the same kinds, in one state.
+        """Join the episodes of all parts, which have memories of the same kinds.
 
         ``merged`` returns one array of those of the parts; by default they stand one after the other.
         """
@@ -80,7 +80,7 @@ class State(NamedTuple):
         return state
 
     def read_only(self) -> State:
-        """Return the same episodes, whose arrays cannot be changed by mistake."""
+        """The same episodes, whose arrays cannot be changed by mistake."""
         line, car, clock, know, wanted = (array.view() for array in self[:5])
         for view in (line, car, clock, know, wanted):
             view.setflags(write=False)
@@ -88,7 +88,6 @@ class State(NamedTuple):
 
     @property
     def n(self) -> int:
-        """Number of worlds."""
         return len(self.line)
 
     @property
@@ -179,19 +178,19 @@ class State(NamedTuple):
         return np.asarray(self.line[:, COUNT].any(axis=1))
 
     def harm(self, count: Count = "first") -> Floats:
-        """Return the harm of each world so far, [n] m2/s2, as ``count`` says (``episode.counts``)."""
+        """Harm of each world so far, [n] m2/s2, as ``count`` says (``episode.counts``)."""
         self._check_count(count)
         out = np.empty(self.n)
         _harm(self.line, weights_of(count), out)
         return out
 
     def pair_harm(self, count: Count = "first") -> Floats:
-        """Return the harm of each pair of neighbours so far, [n, N - 1] m2/s2."""
+        """Harm of each pair of neighbours so far, [n, N - 1] m2/s2."""
         self._check_count(count)
         return pair_amounts(self.line, count)[:, 1:-1]
 
     def borne_harm(self, count: Count = "first") -> Floats:
-        """Return the harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
+        """Harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
         self._check_count(count)
         own, out = own_amounts(self.line, count), np.empty((self.n, self.vehicles))
         split_harm(pair_amounts(self.line, count) - own, self.car[:, MASS], out)
@@ -212,7 +211,7 @@ def check_exact(state: State, what: str) -> None:
 
 
 def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
-    """Return a memory with ``function(array, ...)`` in place of each array; ``others`` are memories of the same kind.
+    """A memory with ``function(array, ...)`` in place of each array; ``others`` are memories of the same kind.
 
     A memory is None, an array with one row per world, or a tuple or mapping of memories, such as a state.
     """
@@ -227,7 +226,7 @@ def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """Return ``rows`` of a memory. Those of a slice are copied: a kernel is compiled again for another layout."""
+    """``rows`` of a memory. A slice is copied: a kernel is compiled again for another layout."""
     if isinstance(rows, slice):
         return mapped(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)
@@ -236,7 +235,7 @@ def take(memory: Any, rows: Any) -> Any:
 
 
 def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
-    """Return a memory with ``new`` in ``rows``: a copy, or the same arrays if they are donated."""
+    """A memory with ``new`` in ``rows``: a copy, or the same arrays if they are donated."""
 
     def written(old: Any, part: Any) -> Any:
         array = old if donate else old.copy()
@@ -254,7 +253,7 @@ def _harm(line, weights, out):
 
 @kernel
 def front_share(harm, front_mass, rear_mass):
-    """Return the part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)`` (eq. harm).
+    """Part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)`` (eq. harm).
 
     The larger part is computed and the smaller one is what is left, so both add up to ``harm`` exactly.
     """
@@ -280,6 +279,6 @@ def split_world(pair_harm, mass, borne):
 
 @large
 def split_harm(pair_harm, mass, out):
-    """Do the same for n worlds: ``pair_harm`` and ``mass`` [n, N + 1], ``out`` [n, N]."""
+    """``split_world`` for n worlds: ``pair_harm`` and ``mass`` [n, N + 1], ``out`` [n, N]."""
     for k in range(len(out)):
         split_world(pair_harm[k], mass[k], out[k])

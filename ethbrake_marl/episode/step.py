@@ -128,7 +128,7 @@ def command(car, wanted, learners, actions):
 
 @kernel
 def stands(line, wanted):
-    """Return whether every vehicle is at rest and no command or force would move it."""
+    """Whether every vehicle is at rest and no command or force would move it."""
     at_rest = True
     for i in range(1, line.shape[1]):
         at_rest = at_rest and line[SPEED, i] == 0.0 and wanted[i] <= 0.0 and line[FORCE, i] <= 0.0
@@ -137,7 +137,7 @@ def stands(line, wanted):
 
 @kernel
 def note_motion(line):
-    """Note in the row MOVING, at the horizon, how fast vehicles still move."""
+    """Store how fast vehicles still move at the horizon, in the row MOVING."""
     for i in range(1, line.shape[1]):
         line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
 
@@ -146,8 +146,7 @@ def note_motion(line):
 def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     """Advance one running world to its next decision, in place; return what ``drive`` met, and whether all is at rest.
 
-    The times of decisions are multiples from the first one, so that an episode has the same times wherever it is
-    played.
+    Times of decisions are multiples from the first one, so that an episode has the same times wherever it is played.
     """
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
@@ -163,7 +162,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
 
 @kernel
 def beside_harm(line: Floats, count: Floats) -> float:
-    """Return what counts of one world so far beside first-impact and total harm (m2/s2)."""
+    """Amount of one world so far beside first-impact and total harm (m2/s2)."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
         amount += count[2] * line[PASSED, p] + count[3] * line[PUSHED, p]
@@ -217,7 +216,6 @@ def step_worlds(
 
 @large
 def drive_worlds(line, car, time, until, wanted, scratch):
-    """Do the work of ``advance_worlds`` on contiguous arrays."""
     failed = -1
     for k in range(len(until)):
         if drive(line[k], car[k], wanted[k], scratch, time[k], until[k]) == FAILED:
@@ -247,14 +245,14 @@ def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[in
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:
-    """Return worlds at the alert: Vehicle 1 begins to brake, and nobody has decided yet."""
+    """Worlds at the alert: Vehicle 1 begins to brake, and nobody has decided yet."""
     clock = np.zeros((len(line), CLOCK_COLUMNS))
     clock[:, NUMBER] = numbers
     return State(line, car, clock, know, wanted, {})
 
 
 def advanced(state: State, until_s: Floats) -> State:
-    """Return the state at ``until_s`` [n] if all hold ``state.wanted``."""
+    """State at ``until_s`` [n] if all hold ``state.wanted``."""
     line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
     car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others
     failed = drive_worlds(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
@@ -265,7 +263,7 @@ def advanced(state: State, until_s: Floats) -> State:
 
 
 def first_decision(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
-    """Return episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
+    """Episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
 
     Until then ``alert.wanted`` is commanded.
     """
@@ -279,7 +277,7 @@ def first_decision(alert: State, deciders: Ints, time_step_s: float, horizon_s: 
 def step(
     rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
 ) -> tuple[State, Step]:
-    """Return the state after one step, and what the step did.
+    """State after one step, and what the step did.
 
     ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` are those that look at the state at every
     decision. Raises ``InvalidInput`` for a bad action. ``state`` does not change, unless its memory is donated.
@@ -299,7 +297,7 @@ def step(
 
 
 def scripted(scripts: Mapping[int, Any], state: State) -> State:
-    """Return the state with new commands, in memory of their own, and memories of the scripts that look at it."""
+    """State with new commands, in memory of their own, and memories of the scripts that look at it."""
     wanted, memories, commands = state.wanted.copy(), dict(state.memories), {}
     for i, script in scripts.items():
         commands[i], memories[i] = asked(script, state, memories[i], i)
@@ -310,10 +308,7 @@ def scripted(scripts: Mapping[int, Any], state: State) -> State:
 
 
 def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None) -> State:
-    """Return the state with the commands of scripts and learners, as at the beginning of a step.
-
-    Raises ``InvalidInput`` for a bad action.
-    """
+    """State with the commands of scripts and learners, as at the beginning of a step."""
     given = proposals(rules, numbers_of(rules, actions, state.n), state.n)
     if np.isnan(given).any():
         _check_actions(rules, given[np.isnan(given).any(axis=1).argmax()])
@@ -325,7 +320,7 @@ def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Flo
 
 
 def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
-    """Return the learners' actions as float64. Raises ``InvalidInput`` unless they are numbers of the shape [n, L]."""
+    """Actions as float64 [n, L]. Raises ``InvalidInput``."""
     shape = n, len(rules.learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
         raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
@@ -333,7 +328,7 @@ def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
 
 
 def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
-    """Return proposed actions in memory of their own, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for others."""
+    """Proposed actions in memory of their own, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput``."""
     actions = numbers_of(rules, actions, n)
     size = np.abs(actions)
     if not (size > 1.0).any():
@@ -344,15 +339,14 @@ def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
 
 
 def begin(script: Any, alert: State, body: int) -> Any:
-    """Return the memory of a script for new episodes. Raises ``AgentFailed`` if the script raises something."""
+    """Memory of a script for new episodes. Raises ``AgentFailed`` if the script raises something."""
     return _remembered(script, _called(script, "begin", alert, body), alert.n, body)
 
 
 def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-    """Return the commands of a script, [n] m/s2, and its new memory.
+    """Commands of a script, [n] m/s2, and its new memory.
 
-    Raises ``AgentFailed`` for commands that are no numbers or beyond a capacity of the vehicle, and if the script
-    raises something.
+    Raises ``AgentFailed`` if the script raises something, or for commands that are no numbers or beyond a capacity.
     """
     name = getattr(script, "name", type(script).__name__)
     answer = _called(script, "act", state, memory, body)
@@ -379,7 +373,7 @@ def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, An
 
 
 def _remembered(script: Any, memory: Any, n: int, body: int) -> Any:
-    """Return a memory; somebody else's is checked, and cannot be changed in place, because plays share it."""
+    """Memory that cannot be changed in place, because plays share it; somebody else's is checked."""
     if type(script).__module__.startswith("ethbrake_marl."):
         return memory
 
@@ -420,7 +414,7 @@ def _check_actions(rules: Rules, actions: Floats) -> None:
 
 
 def failure(state: State, row: int, start_s: float, until_s: float) -> PhysicsError:
-    """Return the error for a world in which a check of the physics failed: a defect of this package."""
+    """Error for a world in which a check of the physics failed: a defect of this package."""
     number = int(state.clock[row, NUMBER])
     reason = f"a check of the physics failed between {start_s:g} s and {until_s:g} s"
     return PhysicsError({row if number < 0 else number: reason})

@@ -48,7 +48,7 @@ BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
 
 
 class Term(NamedTuple):
-    """A term that somebody has registered."""
+    """A registered term."""
 
     name: str
     function: TermFunction
@@ -56,7 +56,7 @@ class Term(NamedTuple):
     meaning: str
 
     def value(self, before: State, step: Step, after: State) -> Floats:
-        """Return the value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns something else."""
+        """Value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns something else."""
         what, given = f"term {self.name!r}", (before.read_only(), step, after.read_only())
         value = called(what, self.function, given, (after.n,), (after.n, after.vehicles))
         running = ~before.ended
@@ -74,7 +74,7 @@ def register_term(name: str, function: TermFunction, *, unit: str = "1") -> None
     Args:
         name: 1 to 64 characters ``a-z``, ``0-9``, ``_``, beginning with a letter, not ending in ``_`` and a number.
         function: ``function(before, step, after)`` returns [n] or [n, N].
-        unit: unit of the value.
+        unit: of the value.
 
     """
     form = "a-z, 0-9 and _, beginning with a letter and not ending in _ and a number"
@@ -101,7 +101,7 @@ BUILT_IN = {  # name -> (unit, meaning)
 
 
 def collision(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Return the term collision, [n]; ``params`` are ``RewardParams``. Another physics brings its own."""
+    """Term collision, [n]; ``params`` are ``RewardParams``. Another physics brings its own."""
     check_exact(before, "the sum of the term collision")
     if isinstance(params.k_energy, float):
         return -params.k_energy * step.total_harm
@@ -109,19 +109,19 @@ def collision(params: Any, before: State, step: Step, after: State) -> Floats:
 
 
 def pair_energies(params: Any, vehicles: int) -> Floats:
-    """Return ``k_energy`` of every pair, [N + 1]; the obstacle has that of the first pair of vehicles."""
+    """``k_energy`` of every pair, [N + 1]; the obstacle has that of the first pair of vehicles."""
     each = params.k_energy if isinstance(params.k_energy, tuple) else (params.k_energy,) * (vehicles - 1)
     return np.array([each[0], *each, 0.0])
 
 
 def jerk(before: State, step: Step, after: State) -> Floats:
-    """Return the term jerk, [n, N]."""
+    """Term jerk, [n, N]."""
     rate = (after.forces_mps2 - before.forces_mps2) / step.time_step_s
     return -rate * rate
 
 
 def risk(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Return the term risk, [n, N]; ``params`` are ``RewardParams``."""
+    """Term risk, [n, N]; ``params`` are ``RewardParams``."""
     closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
     room = np.maximum(after.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0
@@ -135,7 +135,7 @@ def risk(params: Any, before: State, step: Step, after: State) -> Floats:
 
 
 def potential(rules: Rules, state: State) -> Floats:
-    """Return minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
+    """Minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
 
     Each learner tries nine shares of its capacity, front to rear (several learners: twice); all others brake fully. The
     harm is what the reward counts. Nothing follows the end of an episode, whose last step has counted what still moves.
@@ -157,11 +157,10 @@ class Shaping(NamedTuple):
     discount: float
 
     def begin(self, state: State) -> Floats:
-        """Return the memory of new episodes."""
         return potential(self.rules, state)
 
     def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
-        """Return the value, [n, N], and the new memory, [n]."""
+        """Value, [n, N], and new memory, [n]."""
         new = potential(self.rules, after)
         value = np.zeros((after.n, after.vehicles))
         value[:, self.rules.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
@@ -169,12 +168,12 @@ class Shaping(NamedTuple):
 
 
 def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
-    """Return the term harm of vehicles with objectives, [n, N]."""
+    """Term harm of vehicles with objectives, [n, N]."""
     return -amounts(objectives, before, after, count)
 
 
 def component(name: str, count: str) -> TermFunction:
-    """Return the term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]."""
+    """Term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]."""
     number = int(name.rpartition("_")[2]) if "_" in name else 1
     return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, count)
 
@@ -193,7 +192,7 @@ def _grown(amounts_of: Callable[..., Floats], count: str, before: State, after: 
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:
-    """Return the names of a vector reward's components: ``vehicles`` stands for the harm of each vehicle.
+    """Components of a vector reward: ``vehicles`` stands for the harm of each vehicle.
 
     ``counted`` are the terms of the reward, which can be components too. Raises ``InvalidInput`` for an empty list or a
     repeated name, ``UnknownName`` for an unknown one.

@@ -1,4 +1,4 @@
-"""Teams that drove the same list of worlds, with everything that a page about them needs."""
+"""Teams that drove the same list of worlds, for pages about them."""
 
 from __future__ import annotations
 
@@ -41,6 +41,6 @@ class Compared(NamedTuple):
         return cls(scenario, teams, result, summarise(result), harm_count)
 
     def worlds(self, rows: Iterable[int] | Ints) -> State:
-        """Return the worlds of some rows, at the alert."""
+        """Worlds of some rows, at the alert."""
         numbers, seed = self.result.worlds["world"], self.result.about["seed"]
         return State.join([self.scenario.sample(1, seed, first=int(numbers[row])) for row in rows])

@@ -30,7 +30,7 @@ def evaluate(
     jobs: int = 1,
     on_done: Callable[[int], None] | None = None,
 ) -> Result:
-    """Let agents drive the same worlds, each once; return what they did.
+    """Let agents drive the same worlds, each once.
 
     ``eb.evaluate("paper-random", "full_brake,ppo+step")`` is the shortest form. The result is the same, to the last
     bit, for any number of processes.

@@ -48,7 +48,6 @@ class Result:
 
     @property
     def n(self) -> int:
-        """Number of worlds."""
         return len(self.worlds["world"])
 
     @property
@@ -65,19 +64,18 @@ class Result:
         return f"Result({self.about['scenario']!r}, {count_of(self.n, 'world')}: {', '.join(self.columns):.200})"
 
     def measure_of(self, column: str) -> Measure:
-        """Return the measure that a column belongs to."""
+        """Measure that a column belongs to."""
         mine = [each for each in self.measures if column == each.name or column.startswith(f"{each.name}_")]
         return max(mine, key=lambda measure: len(measure.name))
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names of the teams."""
         return iter(self.columns)
 
     def __contains__(self, team: object) -> bool:
         return team in self.columns
 
     def take(self, rows: Any) -> Result:
-        """Return the result in some of its worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
+        """Result of some of its worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
         columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
         worlds = {name: each[rows] for name, each in self.worlds.items()}
         if not len(worlds["world"]):
@@ -87,7 +85,7 @@ class Result:
         return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
-        """Return a table with one row per team and world: name of a column -> values. A missing number is NaN."""
+        """Table with one row per team and world: name of a column -> values. A missing number is NaN."""
         names = list(dict.fromkeys(name for own in self.columns.values() for name in own))
         table: Columns = {"agent": np.repeat([*self.columns], self.n)}
         table |= {name: np.tile(each, len(self.columns)) for name, each in self.worlds.items()}
@@ -98,7 +96,7 @@ class Result:
         return table | {"knows": np.repeat([self.knows[team] for team in self.columns], self.n)}
 
     def to_pandas(self) -> Any:
-        """Return the table of ``arrays`` as a ``DataFrame``. Raises ``MissingExtra`` without pandas."""
+        """Table of ``arrays`` as a ``DataFrame``. Raises ``MissingExtra`` without pandas."""
         with naming_extras():
             from pandas import DataFrame
 
@@ -187,7 +185,6 @@ def evaluate(
 def drive_chunk(
     alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]
 ) -> dict[str, Columns]:
-    """Return the columns of every team in these worlds."""
     return {name: _driven(alert, name, team, game, measures) for name, team in agents.items()}
 
 
@@ -219,14 +216,14 @@ def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    """Return the columns of all chunks; one that is missing in a chunk is missing."""
+    """Columns of all chunks; one that is missing in a chunk is missing."""
     return {
         name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
     }
 
 
 def hidden_from(alert: State, game: Game) -> Bools:
-    """Return whether the V2X channel hides something from a learner at its first decision, [n].
+    """Whether the V2X channel hides something from a learner at its first decision, [n].
 
     The learner does not know all of a vehicle, or that one reacts later than its messages say, because it waits itself.
     """
@@ -237,12 +234,11 @@ def hidden_from(alert: State, game: Game) -> Bools:
 
 
 def known_by(team: Team) -> str:
-    """Return what a team has to know, as one text: ``messages + true model``."""
+    """What a team has to know, as one text: ``messages + true model``."""
     return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _known(team).values())
 
 
 def _known(team: Team) -> dict[str, str]:
-    """Return vehicle, or ``shield`` -> what it has to know."""
     each = {f"vehicle_{body}": getattr(agent, "knows", UNSTATED) for body, agent in team.drivers.items()}
     return each if team.shield is None else {**each, "shield": getattr(team.shield, "knows", MODEL)}
 

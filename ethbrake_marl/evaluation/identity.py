@@ -24,7 +24,7 @@ WORDS = ("name", "title", "description", "source")  # keys of a scenario that do
 
 
 def worlds_sha256(worlds: State) -> str:
-    """Return the SHA-256 of worlds at the alert: all their arrays, little-endian, without the push, which is 0."""
+    """SHA-256 of worlds at the alert: all their arrays, little-endian, without the push, which is 0."""
     digest = hashlib.sha256()
     for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
         digest.update(f"{array.shape}".encode())
@@ -33,7 +33,7 @@ def worlds_sha256(worlds: State) -> str:
 
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
-    """Return what a result should say of a ``Scenario``, and of the seed of its worlds; for ``evaluate(about=...)``."""
+    """Description of a ``Scenario`` and the seed of its worlds, for ``evaluate(about=...)``."""
     content = json.dumps(scenario.content(without=WORDS), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
     about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
@@ -41,15 +41,14 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of every package that affects a result, those of extensions included.
-
-    With them the SHA-256 of each Python file of the user that this process ran.
+    """Versions of Python and of every package that affects a result, and the SHA-256 of each Python file of the user
+    that this process ran.
     """
     own = {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
     return own | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Return the SHA-256 of the manifest of each vehicle's policy; vehicles without a policy of ours are left out."""
+    """SHA-256 of the manifest of each vehicle's policy; vehicles without a policy of ours are left out."""
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
     return {f"vehicle_{body}": each.manifest_sha256 for body, each in manifests.items() if each is not None}

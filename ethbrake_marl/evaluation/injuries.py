@@ -25,11 +25,10 @@ class Injuries:
         self.curve, self.changes = curve, np.zeros((alert.n, 2, alert.vehicles))
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Look at the impacts between two states."""
         self.changes = np.maximum(self.changes, speed_changes(before, after))
 
     def result(self, last: State) -> Given:
-        """Return the injuries of the line and of each vehicle, [n]."""
+        """Injuries of the line and of each vehicle, [n]."""
         each = injured(self.changes, self.curve)
         return {"": each.sum(axis=1), **{f"{i + 1}": column for i, column in enumerate(each.T)}}
 

@@ -55,10 +55,10 @@ class Watch(Protocol):
     """Measures episodes while they run."""
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Look at what happened between two states; ``step`` None: between the alert and the first decision."""
+        """Look at two successive states; ``step`` None: between the alert and the first decision."""
 
     def result(self, last: State) -> Given:
-        """Return the value, as a measure does."""
+        """Value, as of a measure."""
 
 
 class Statistic(NamedTuple):
@@ -75,7 +75,7 @@ class Statistic(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """A measure: a function of the last states, or a watch of all states."""
+    """A function of the last states, or a watch of all states."""
 
     name: str
     of: Callable[[Game, State, State], Given] | None = None
@@ -86,7 +86,7 @@ class Measure(NamedTuple):
 
 
 def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
-    """Return the columns of a measure: name -> [n]. Raises ``InvalidInput`` for a value of another shape or kind."""
+    """Columns of a measure: name -> [n]. Raises ``InvalidInput`` for a value of another shape or kind."""
     if given is None:
         return {}
     parts: Mapping[str, Any] = given if isinstance(given, Mapping) else {"": given}
@@ -116,7 +116,7 @@ def collided(game: Game, alert: State, last: State) -> Given:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> Given:
-    """Return the harm of the line, and what each vehicle bears of it; no honest cost where impacts are not exact."""
+    """Harm of the line, and what each vehicle bears of it; no honest cost where impacts are not exact."""
     if count == "honest" and PHYSICS in last.memories:
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
@@ -207,7 +207,7 @@ DEFAULT = (
 
 @contextmanager
 def naming(measure: Measure) -> Iterator[None]:
-    """Context manager: raise ``InvalidInput``, which names the measure, if its function fails."""
+    """Raise ``InvalidInput``, which names the measure, if its function fails."""
     try:
         yield
     except EthBrakeError:

@@ -67,7 +67,7 @@ def _checked(
     shown: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> Measure:
-    """Return the measure that the arguments of ``register_measure`` describe. Raises the same errors."""
+    """Measure that the arguments of ``register_measure`` describe. Raises the same errors."""
     right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
     if not isinstance(name, str) or re.fullmatch(right, name) is None:
         raise InvalidInput(
@@ -103,7 +103,7 @@ _REWARDED: dict[str, TermFunction] = {
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
-    """Return the measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
+    """Measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
 
     A measure of a file is called ``NAME``, or ``FILE.py:NAME`` if another one of ``names`` is called ``NAME``. Raises
     ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
@@ -118,7 +118,6 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
 
 
 def _in_full(name: str, measure: Measure) -> Measure:
-    """Return a measure of a file under its full name ``FILE.py:NAME``, and any other measure as it is."""
     file = name.removesuffix(f":{measure.name}")
     if file == name:
         return measure
@@ -172,7 +171,7 @@ def _summed(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """Return the term, which is 0 for a team without a shield, so that a table can compare both. Rewards refuse it."""
+    """The term, which is 0 for a team without a shield, so that a table can compare both. Rewards refuse it."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)
@@ -184,8 +183,6 @@ def _objective(name: str, game: Game, alert: State, last: State) -> Given:
 
 
 class SummedTerm:
-    """Adds up a term of a reward over all steps."""
-
     def __init__(self, term: TermFunction, game: Game, alert: State) -> None:
         self.term, self.sum = term, np.zeros(alert.n)
 
@@ -197,5 +194,4 @@ class SummedTerm:
             self.sum = np.where(ended, 0.0, value) + (self.sum if self.sum.shape == value.shape else 0.0)
 
     def result(self, last: State) -> Given:
-        """Return the sum."""
         return self.sum

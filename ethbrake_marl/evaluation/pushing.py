@@ -18,7 +18,7 @@ HARD_MPS2 = 1.0  # a command above this is hard driving
 
 
 def own_way_m(alert: State, body: int, until_s: float) -> Floats:
-    """Return the way of a vehicle until ``until_s``, if nobody touches it, [n] m."""
+    """Way of a vehicle until ``until_s``, if nobody touches it, [n] m."""
     check_exact(alert, "pushed_m")
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
@@ -28,7 +28,7 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 def with_post(state: State) -> Floats:
-    """Return a copy of the lines, with a far post where there is no obstacle, whose gap shows Vehicle 1's way."""
+    """Copy of the lines, with a far post where there is no obstacle, whose gap shows Vehicle 1's way."""
     line = state.line.copy()
     line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
     return line
@@ -53,7 +53,7 @@ class PushedAway:
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> Given:
-        """Return the metres of each vehicle, and whether those of Vehicle 1 are more than 5."""
+        """Metres of each vehicle, and whether those of Vehicle 1 are more than 5."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
             f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - own
@@ -89,7 +89,6 @@ class DroveTowards:
         self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the time between two states."""
         driving = driving_s(before, after)
         hard = (driving > 0.0) & (after.commands_mps2 > HARD_MPS2)
         self.time_s += first_impact_s(before, after) - before.time_s
@@ -97,7 +96,7 @@ class DroveTowards:
         self.hard |= hard[:, self.learners - 1].any(axis=1)
 
     def result(self, last: State) -> Given:
-        """Return the shares of the time, and whether a learner drove hard."""
+        """Shares of the time, and whether a learner drove hard."""
         share = self.driving_s / np.where(self.time_s > 0.0, self.time_s, 1.0)[:, np.newaxis]
         each = {f"{i + 1}": column for i, column in enumerate(share.T)}
         return {"": share[:, self.learners - 1].max(axis=1, initial=0.0), **each, "hard": self.hard}

@@ -1,7 +1,6 @@
 """Record one episode with closely spaced samples, for figures and viewers.
 
-A team drives as in an evaluation. Between two decisions the motion is computed again, from the state at the first one.
-The record ends with the episode.
+Between two decisions the motion is computed again, from the state at the first one.
 """
 
 from __future__ import annotations
@@ -76,12 +75,12 @@ class EpisodeRecord:
 
     @property
     def initial(self) -> State:
-        """The world at the alert."""
+        """World at the alert."""
         return self.states[0]
 
     @property
     def last(self) -> State:
-        """The state at the end, with the harm of the episode."""
+        """State at the end, with the harm of the episode."""
         return self.states[-1]
 
     def __repr__(self) -> str:
@@ -110,14 +109,14 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
 
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
-    """Let a team drive some worlds together, and record the motion of each, as ``record_episode`` does."""
+    """Record some worlds that a team drives together, each as ``record_episode`` does."""
     check_exact(worlds, "a record of the motion between decisions")
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_recorded([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
 
 
 def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> EpisodeRecord:
-    """Return the record of one world from its states at the alert, at all decisions and at the end."""
+    """Record of one world from its states at the alert, at all decisions and at the end."""
     until = 2 + sum(not state.ended[0] for state in states[1:])
     states, world = states[:until], states[0]
     pieces = [_between(before, after, sample_s) for before, after in pairwise(states)]
@@ -138,7 +137,7 @@ def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> E
 
 
 def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
-    """Return k pieces of the motion between two states: times [k, 2], lines [k, 2, ...], and commands [k, N + 1].
+    """Pieces of the motion between two states: times [k, 2], lines [k, 2, ...], and commands [k, N + 1].
 
     Lines are those at the beginning and the end of a piece; without an obstacle, a post measures Vehicle 1's way.
     """
@@ -154,7 +153,7 @@ def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floa
 
 
 def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
-    """Return the impacts; pieces of the motion with impacts are driven again, for the times of the first."""
+    """Impacts; pieces of the motion with impacts are driven again, for the times of the first."""
     rows = [FIRST, TOTAL, COUNT]
     made = lines[:, 1, rows] - lines[:, 0, rows]
     piece, pair = np.nonzero(made[:, 2])

@@ -38,11 +38,11 @@ class Saved(NamedTuple):
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """Object of the first team, for what is the same in all."""
+        """Values of the first team that are the same for all."""
         return next(iter(self.agents.values()))
 
     def estimate(self, agent: str, key: str) -> Estimate:
-        """Return a mean with its interval and its standard error."""
+        """Mean with its interval and its standard error."""
         own = self.agents[agent]
         ends = own[f"{key}_interval"]
         return Estimate(own[key], ends and (ends[0], ends[1]), own[f"{key}_error"], own[f"{key}_freedom"])
@@ -131,7 +131,7 @@ def _digest(objects: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _beside(file: Path, beside: Mapping[str, str] | None) -> tuple[Columns | None, str]:
-    """Return the rows per world, or None and why there are none."""
+    """Rows per world, or None and the reason."""
     if beside is None:
         return None, f"{file} was written without a file that has one row per world; evaluate again with --per-world"
     rows = file.parent / beside["file"]

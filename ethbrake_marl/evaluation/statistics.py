@@ -42,7 +42,7 @@ Clusters = NDArray[Any] | None
 
 
 def mean(values: Floats, clusters: Clusters = None) -> Estimate:
-    """Return the mean with its t interval, ``mean -+ t s / sqrt(n)``.
+    """Mean with its t interval, ``mean -+ t s / sqrt(n)``.
 
     If no value is negative, the interval does not go below 0. If all values are 0, there is no interval: zeros show
     that more is rare, but not how much more it can be.
@@ -55,12 +55,13 @@ def mean(values: Floats, clusters: Clusters = None) -> Estimate:
 
 
 def difference(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate:
-    """Return the mean of ``values - baseline`` with its t interval."""
+    """Mean of ``values - baseline`` with its t interval."""
     return _mean(values - baseline, clusters)
 
 
 def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate | None:
-    """Return ``1 - r`` for ``r = mean(values) / mean(baseline)``, by the delta method; None if the baseline is 0.
+    """Relative decrease ``1 - r`` for ``r = mean(values) / mean(baseline)``, by the delta method; None if the baseline
+    is 0.
 
     The standard error of r is ``std(values - r baseline) / (sqrt(n) abs(mean(baseline)))``.
     """
@@ -74,12 +75,11 @@ def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Est
 
 
 def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
-    """Return the share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
+    """Share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
 
     The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width
-    ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of
-    independent worlds that would have the same standard error, ``1 + p (1 - p) / error^2``, at most the number of
-    worlds, times ``(z / t)^2``
+    ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds that
+    would have the same standard error, ``1 + p (1 - p) / error^2``, at most the number of worlds, times ``(z / t)^2``
     (Korn and Graubard 1998). If all worlds are alike, it is ``1 / sum h_g^2`` times ``(z / t)^2``.
     """
     share, n = int(np.count_nonzero(truths)) / len(truths), float(len(truths))
@@ -98,7 +98,7 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
 
 
 def wilson(share: float, count: float) -> tuple[float, float]:
-    """Return the ends of Wilson's interval for a share of ``count`` independent draws; both may be no whole numbers."""
+    """Ends of Wilson's interval for a share of ``count`` independent draws; both may be no whole numbers."""
     shrink = 1.0 + Z * Z / count
     centre = (share + Z * Z / (2.0 * count)) / shrink
     half = Z / shrink * sqrt(share * (1.0 - share) / count + Z * Z / (4.0 * count * count))
@@ -106,7 +106,7 @@ def wilson(share: float, count: float) -> tuple[float, float]:
 
 
 def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
-    """Return the difference of two means of other worlds with Welch's interval, from their standard errors.
+    """Difference of two means of other worlds with Welch's interval, from their standard errors.
 
     Its square error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. No interval if one
     of the standard errors is not known.
@@ -130,7 +130,7 @@ def _mean(values: Floats, clusters: Clusters) -> Estimate:
 
 
 def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters) -> Estimate:
-    """Return a ratio with its interval; ``residuals`` [n] are x - r y, and ``weights`` [n] are y."""
+    """Ratio with its interval; ``residuals`` [n] are x - r y, and ``weights`` [n] are y."""
     n, whole = len(residuals), fsum(weights)
     if clusters is None:
         if n < 2:
@@ -147,13 +147,13 @@ def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters
 
 
 def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Return both sums over each cluster, [G]."""
+    """Both sums over each cluster, [G]."""
     which = np.unique(clusters, return_inverse=True)[1]
     return np.bincount(which, residuals).astype(np.float64), np.bincount(which, weights).astype(np.float64)
 
 
 def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, float, float] | tuple[None, None, None]:
-    """Return standard error, degrees of freedom and skewness of a ratio from sums [G]; None if one has all weight."""
+    """Standard error, degrees of freedom and skewness of a ratio from sums [G]; None if one has all weight."""
     groups, share = len(residuals), weights / whole
     rest = 1.0 - share
     if groups < 2 or not (rest > LEAST_REST).all():
@@ -165,10 +165,10 @@ def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, fl
 
 
 def _freedom(share: Floats, scale: Floats) -> float:
-    """Return Satterthwaite's ``tr(K)^2 / tr(K^2)``, with ``K_gk = scale_g^.5 C_gk scale_k^.5`` and, for the shares h,
+    """Satterthwaite's ``tr(K)^2 / tr(K^2)``, with ``K_gk = scale_g^.5 C_gk scale_k^.5`` and, for the shares h,
 
-    ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)``: the covariance of the deviations from the common ratio if
-    each recording's own deviation has the variance h_g^2.
+    ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)``: the covariance of the deviations from the common ratio
+    if each recording's own deviation has the variance h_g^2.
     """
     whole = fsum(share * share)
     two, three, four = (fsum(scale * share**power) for power in (2, 3, 4))
@@ -178,7 +178,6 @@ def _freedom(share: Floats, scale: Floats) -> float:
 
 
 def _transformed(t: float, skewness: float) -> float:
-    """Return Hall's transformation of a quantile."""
     if abs(skewness) < 1e-9:
         return t
     return 3.0 / skewness * (cbrt(1.0 + skewness * (t - skewness / 6.0)) - 1.0)

@@ -67,7 +67,6 @@ class SummaryTable(list[SummaryRow]):
         return sheet.only(k for k, name in enumerate(sheet.names) if name in names).html()
 
     def sheet(self) -> Sheet:
-        """Return the table with all columns that have a heading."""
         columns = [
             Column(each.heading, key, short=each.short, **_FORMATS.get(each.kind, {}))
             for key, (_, each) in self.shown.items()
@@ -80,7 +79,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal: intervals of the first columns below their values, of others nowhere."""
+        """Table for a terminal: intervals of the first columns below their values, of others nowhere."""
         sheet, agent = self.sheet(), Column("Agent,\nwhat it knows", text=True)
         columns = [
             replace(each, interval="below" if each.name in FIRST_COLUMNS else "hidden")
@@ -92,7 +91,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
-        """Return the table of what was asked for and has no column of its own; None without any."""
+        """Table of named measures without a column of their own; None without any."""
         asked = {
             key: f"{key} ({measure.unit})" if measure.unit and each.kind != "decrease" else key
             for key, (measure, each) in self.shown.items()
@@ -102,11 +101,10 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("Measures", ["Agent", "Measure", Column("Mean or rate")], rows, gap=1) if rows else None
 
     def tables(self) -> list[Sheet]:
-        """Return the tables to print."""
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Return what a reader should know before believing the numbers: rejected worlds, exploits, hidden values."""
+        """Notes for the reader of the numbers: rejected worlds, exploits, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
             drawn = rejected + self.parameters["count"]
@@ -129,26 +127,25 @@ class SummaryTable(list[SummaryRow]):
         return notes
 
     def meanings(self) -> dict[str, str]:
-        """Return what the columns mean: heading -> text."""
+        """Meanings of the columns: heading -> text."""
         own = {each.heading: measure.meaning for measure, each in self.shown.values() if each.heading}
         return HEAD | {name: text for name, text in own.items() if not name.startswith("Decrease")}
 
     def to_markdown(self) -> str:
-        """Return the table as Markdown, with the texts below it."""
         return f"{self.sheet().markdown()}\n\n{self._below()}\n"
 
     def to_latex(self) -> str:
-        """Return the table as LaTeX ``tabular`` with the rules of the package ``booktabs``."""
+        """LaTeX ``tabular`` with the rules of the package ``booktabs``."""
         return self.sheet().latex()
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return plain data: one object per team, with the digests, versions and ``parameters`` of the result."""
+        """Plain data: one object per team, with the digests, versions and ``parameters`` of the result."""
         identity = {key: self.parameters[key] for key in IDENTITY if key in self.parameters}
         parameters = {key: value for key, value in self.parameters.items() if key not in IDENTITY}
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
 
     def to_pandas(self) -> Any:
-        """Return a ``DataFrame`` with one row per team; ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
+        """A ``DataFrame`` with one row per team; ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
 
         A missing number is NaN. Raises ``MissingExtra`` without pandas.
         """
@@ -170,7 +167,7 @@ class SummaryTable(list[SummaryRow]):
 
 
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
-    """Return the table of a result, one row per team.
+    """Table of a result, one row per team.
 
     ``baseline``: team that the others are compared with, paired by world. Without full braking, the default, there are
     no comparisons; any other team must be in the result (``UnknownName``).
@@ -202,7 +199,7 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
 
 
 def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
-    """Return key of an estimate -> its column, measure and statistic; comparisons and predictions last."""
+    """Key of an estimate -> its column, measure and statistic; comparisons and predictions last."""
     shown: dict[str, tuple[str, Measure, Statistic]] = {}
     kinds = {name: column.dtype.kind for own in result.columns.values() for name, column in own.items()}
     minimised = result.about.get("agent_settings", {}).get("harm_count")
@@ -237,7 +234,7 @@ def _estimate(
 
 
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
-    """Return one table for each group of worlds, by its name, in alphabetical order.
+    """One table for each group of worlds, by its name, in alphabetical order.
 
     ``by``: ``scenario`` of a mixture, ``recording``, or a vehicle's type such as ``vehicle_2_type``. Raises
     ``InvalidInput`` if the worlds have no groups, ``UnknownName`` for another name.
@@ -256,7 +253,7 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
 
 
 def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Result]) -> Sheet:
-    """Return one table of several evaluations, such as the tests of a standard: a section for each, a row per team.
+    """One table of several evaluations, such as the tests of a standard: a section for each, a row per team.
 
     A team has passed if no vehicle collides in any world.
     """

@@ -23,7 +23,7 @@ class Face:
     begins_again = False  # whether an ended episode is followed by the next one, without a reset
 
     def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
-        """Open a game, whose episodes are truncated after ``most_steps``; None: at the horizon alone."""
+        """Open a game whose episodes are truncated after ``most_steps``; None: at the horizon alone."""
         if most_steps is not None:
             check_whole_number("number of steps of an episode", most_steps, 1)
         (self.scenario, self.game), self.render_mode, self._most_steps = opened, render_mode, most_steps
@@ -35,7 +35,6 @@ class Face:
             raise InvalidInput(f"scenario {self.scenario.name!r} has no learner; pass learners=['vehicle_2']")
 
     def _begin(self, n: int, seed: int | None, options: Any) -> State:
-        """Start episodes in n worlds."""
         self.episode = self.stream.reset(n, seed, options)
         self.renderer.began(self.episode)
         return self.episode
@@ -59,7 +58,7 @@ class Face:
         return state, step
 
     def _rewards(self, step: Step) -> Floats:
-        """Return the rewards of a step, [n, B], or [n, B, K] where they are vectors."""
+        """Rewards of a step, [n, B], or [n, B, K] where they are vectors."""
         rewards: Floats = (step.reward if step.vector is None else step.vector).take(self.bodies - 1, axis=1)
         return rewards
 
@@ -67,17 +66,16 @@ class Face:
         return dictionaries(self.game, state, step, self.stream.seed or 0, self.bodies)
 
     def describe_worlds(self) -> dict[str, Any]:
-        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        """Drawn values of each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         return self.stream.describe(self._begun("describe_worlds"))
 
     def describe_world(self) -> dict[str, Any]:
-        """Return what was drawn for the first running world: a name such as ``gap_1_m`` or ``scenario`` -> value."""
+        """Drawn values of the first running world."""
         return {name: column[0].item() for name, column in self.describe_worlds().items()}
 
     def render(self) -> Any:
-        """Return a picture, as the render mode has it; a tuple of many worlds."""
+        """Picture in the render mode; a tuple of many worlds."""
         return self.renderer.render()
 
     def close(self, **kwargs: Any) -> None:
-        """Give back what the render mode holds."""
         self.renderer.close()

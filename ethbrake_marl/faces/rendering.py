@@ -22,7 +22,7 @@ class Renderer:
         """Called after a step."""
 
     def render(self) -> Any:
-        """Return what the render mode promises; of many worlds, a list."""
+        """Picture in the render mode; of many worlds, a list."""
 
     def close(self) -> None:
         """Give back windows and files."""
@@ -40,12 +40,10 @@ RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", registe
 
 
 def render_metadata() -> dict[str, Any]:
-    """Return what ``metadata`` says of pictures."""
     return {"render_modes": [*RENDERERS], "render_fps": FRAMES_PER_SECOND}
 
 
 def make_renderer(environment: Any, mode: str | None) -> Any:
-    """Return the renderer of a mode. Raises ``InvalidInput``."""
     if mode is None:
         return Renderer()
     if mode not in RENDERERS:

@@ -43,7 +43,7 @@ def make_sb3_vec_env(
     render_mode: str | None = None,
     actions: int | None = None,
 ) -> EthBrakeVecEnv:
-    """Return ``n_envs`` worlds for Stable-Baselines3, which are simulated together.
+    """``n_envs`` worlds for Stable-Baselines3, which are simulated together.
 
     ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``; under
     ``reward="honest"`` pushing hardly pays.
@@ -126,7 +126,6 @@ class EthBrakeVecEnv(Face, VecEnv):
         raise InvalidInput(f"appended = {self.appended!r}: must be 'number', 'state' or None")
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the worlds for the next reset."""
         self._seeds = [chosen_seed(seed)] * self.num_envs
         return self._seeds
 
@@ -165,7 +164,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return self._observe(state), reward.astype(np.float32), over.repeat(len(self.bodies)), infos
 
     def _renew(self, state: State, step: Step, ended: Any, infos: list[dict[str, Any]]) -> State:
-        """Write the last infos of the episodes that have ended, and begin the next ones."""
+        """Write the last infos of ended episodes, and begin the next ones."""
         L, last = len(self.bodies), state.take(ended)
         rows = (ended[:, np.newaxis] * L + np.arange(L)).reshape(-1)
         terms = {name: term[ended] for name, term in step.terms.items()}
@@ -203,7 +202,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return np.concatenate([rows, more], axis=1, dtype=np.float32)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return what a restored environment needs, between two steps, as arrays and numbers."""
+        """Plain data from which ``restore`` goes on, between two steps."""
         stream = [self.stream.seed, self.stream.next]
         return copy.deepcopy({"stream": stream, **{name: getattr(self, name) for name in SAVED}})
 
@@ -215,19 +214,17 @@ class EthBrakeVecEnv(Face, VecEnv):
             setattr(self, name, saved[name])
 
     def render(self, mode: str | None = None) -> Any:
-        """Return the texts of all worlds (``ansi``), or one picture of all of them."""
+        """Texts of all worlds (``ansi``), or one picture of all of them."""
         return self.get_images() if self.render_mode == "ansi" else VecEnv.render(self, mode)
 
     def get_images(self) -> list[Any]:
-        """Return a picture of each world."""
         return self.renderer.render() or []
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of this environment, once per row."""
+        """An attribute of this environment, once per row."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of this environment, for all rows."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 
@@ -237,7 +234,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False once per row: there are no environments of their own to wrap."""
+        """False once per row: there are no environments of their own to wrap."""
         return [False for _ in self._get_indices(indices)]
 
     def _refuse_some_rows(self, what: str, indices: Any) -> None:

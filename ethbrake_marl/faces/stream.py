@@ -20,7 +20,7 @@ OPTIONS = ("initial_state", "listed_world")
 
 
 class UnknownResetOption(UserWarning):
-    """Warning: ``options`` of ``reset`` has a key that nobody knows."""
+    """``options`` of ``reset`` has an unknown key."""
 
 
 class Stream:
@@ -33,9 +33,9 @@ class Stream:
         self.given: Drawn | None = None  # the worlds that the last reset asked for
 
     def reset(self, n: int, seed: int | None, options: Any = None) -> State:
-        """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
+        """New episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
 
-        What raises changes nothing. Raises ``InvalidInput`` for a bad seed or option; warns of unknown options.
+        An error changes nothing. Raises ``InvalidInput`` for a bad seed or option; warns of unknown options.
         """
         first = self.next if seed is None else 0
         seed = chosen_seed(self.seed if seed is None else seed)
@@ -45,14 +45,13 @@ class Stream:
         return state
 
     def next_episodes(self, n: int) -> State:
-        """Return the next n worlds at their first decision, in memory of their own."""
+        """The next n worlds at their first decision, in memory of their own."""
         assert self.seed is not None
         state = self.game.reset(self.game.draw(n, self.seed, self.next))
         self.next += n
         return state
 
     def describe(self, state: State) -> dict[str, Any]:
-        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         numbers, seed = state.clock[:, NUMBER].astype(np.int64), self.seed or 0
         place, parts = np.arange(state.n), [] if self.given is None else [self.given]
         of_stream = np.flatnonzero(numbers >= 0)
@@ -63,7 +62,7 @@ class Stream:
         return {**columns, "world_seed": np.full(state.n, seed), "world": numbers}
 
     def _asked_for(self, n: int, options: Any) -> Drawn | None:
-        """Return the worlds of the options of a reset; None: it asks for none."""
+        """Worlds of the options of a reset; None: it asks for none."""
         if options is None:
             return None
         if not isinstance(options, Mapping):
@@ -95,7 +94,7 @@ class Stream:
 
 
 def chosen_seed(seed: int | None) -> int:
-    """Return a seed as it is given, or one of 63 bits from the operating system. Raises ``InvalidInput``."""
+    """The seed, or one of 63 bits from the operating system. Raises ``InvalidInput``."""
     if seed is None:
         return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:

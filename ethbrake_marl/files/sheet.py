@@ -1,4 +1,4 @@
-"""``Sheet``: a table of estimates and texts, with output for terminal, Markdown, HTML, CSV and JSON."""
+"""A table of estimates and texts, for terminal, Markdown, HTML, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ class Estimate:
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Format estimate and interval as in a ``Column``: ``24.19 [23.85, 24.53]``."""
+        """Estimate and interval as in a ``Column``: ``24.19 [23.85, 24.53]``."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """Return ``value``, and ``interval`` as ``[low, high]`` or null."""
+        """Mapping with ``value``, and ``interval`` as ``[low, high]`` or null."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Convert estimates to a dictionary for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; null if unknown."""
+        """Estimates for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; null if unknown."""
         cells: dict[str, Any] = {}
         for name, each in estimates.items():
             cells[name] = None if each is None else each.value
@@ -83,7 +83,6 @@ class Column:
 
     @property
     def name(self) -> str:
-        """Name of the column in CSV and JSON."""
         return self.key or self.heading
 
     def show(self, cell: Cell) -> Shown:
@@ -98,7 +97,7 @@ class Column:
         return Shown(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
 
     def in_terminal(self, shown: Shown) -> str:
-        """Return the text of a cell in a terminal, whose lines after the first are less prominent."""
+        """Text of a cell in a terminal, whose lines after the first are less prominent."""
         if self.interval == "beside":
             return shown.in_words
         return shown.value + (f"\n{shown.interval}" if shown.interval and self.interval == "below" else "")
@@ -137,16 +136,14 @@ class Sheet:
 
     @property
     def headings(self) -> list[str]:
-        """Headings in documents."""
         return [column.heading for column in self._columns()]
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns in CSV and JSON."""
         return [column.name for column in self._columns()]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
-        """Yield each row as a tuple of formatted cells, one per column, and each section as its name."""
+        """Each row as a tuple of formatted cells, one per column, and each section as its name."""
         columns = self._columns()
         for row in self.rows:
             if isinstance(row, str):
@@ -156,23 +153,22 @@ class Sheet:
                 yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """Return the table reduced to these columns (indices from 0)."""
+        """The table reduced to these columns (indices from 0)."""
         names = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Return the indices of the columns in which some row has a value; all indices if the table has no rows."""
+        """Indices of the columns in which some row has a value; all indices if the table has no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
         ]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the table, with the note below, for a terminal.
+        """In a cell with several lines of text, all but the first line are dim.
 
-        In a cell with several lines of text, all but the first line are dim. Names in the first column are never
-        broken: those that do not fit are numbered and listed below the table.
+        Names in the first column are never broken: those that do not fit are numbered and listed below the table.
         """
         from rich import box
         from rich.table import Table
@@ -209,7 +205,7 @@ class Sheet:
             yield Text(f"\n{note}", "dim")
 
     def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
-        """Return how many columns a terminal of ``width`` characters shows, and names that do not fit -> numbers."""
+        """How many columns a terminal of ``width`` characters shows, and names that do not fit -> numbers."""
         columns = self._columns()
         texts = [[each.short or each.heading, *(row[k] for row in rows)] for k, each in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
@@ -224,7 +220,7 @@ class Sheet:
         return shown, {name: f"[{number}]" for number, name in enumerate(long, 1)}
 
     def markdown(self) -> str:
-        """Return the table as Markdown, without title and note.
+        """Markdown without title and note.
 
         Markdown tables have no sections, so each row's first cell begins with the section: ``Section: cell``.
         """
@@ -239,7 +235,7 @@ class Sheet:
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
     def latex(self) -> str:
-        """Return the table as a LaTeX ``tabular`` with the rules of ``booktabs``, without title and note."""
+        """LaTeX ``tabular`` with the rules of ``booktabs``, without title and note."""
         columns = self._columns()
         lines = [" & ".join(_latex(column.heading) for column in columns) + r" \\", r"\midrule"]
         for row in self.shown():
@@ -249,7 +245,7 @@ class Sheet:
         return "\n".join([rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", *lines, r"\bottomrule", r"\end{tabular}"])
 
     def html(self) -> str:
-        """Return the table as HTML for a notebook or a page, with the title above and the note below.
+        """HTML for a notebook or a page, with the title above and the note below.
 
         All content is escaped unless it has a method ``__html__``. The first cell of a row is the heading of the row.
         """
@@ -278,7 +274,7 @@ class Sheet:
         return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
-        """Return one mapping per row: name of a column -> cell; an estimate also has an entry for its interval.
+        """One mapping per row: name of a column -> cell; an estimate also has an entry for its interval.
 
         Sections are omitted.
         """
@@ -292,12 +288,12 @@ class Sheet:
         return rows
 
     def csv(self) -> str:
-        """Return the table as CSV text (``csv_text``), one line per row."""
+        """CSV text (``csv_text``), one line per row."""
         return csv_text(self.json())
 
 
 def terminal_text(*shown: RenderableType) -> str:
-    """Return tables and texts as plain text, as wide as this terminal: in a script, a notebook and a file alike."""
+    """Tables and texts as plain text, as wide as this terminal: in a script, a notebook and a file alike."""
     from rich.console import Console
 
     text = io.StringIO()
@@ -307,7 +303,7 @@ def terminal_text(*shown: RenderableType) -> str:
 
 
 def flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row with two entries, ``x_low`` and ``x_high``, in place of a pair ``x_interval``."""
+    """Row with two entries, ``x_low`` and ``x_high``, in place of a pair ``x_interval``."""
     line: dict[str, Any] = {}
     for name, value in row.items():
         if name.endswith("_interval"):
@@ -319,7 +315,7 @@ def flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return ``flat`` rows as CSV text with a header line: all columns, in order of appearance.
+    """CSV text of ``flat`` rows with a header line: all columns, in order of appearance.
 
     None and missing values are written as empty cells.
     """
@@ -344,9 +340,9 @@ def _latex(text: str) -> str:
 
 
 def _html(value: object) -> str:
-    """Return ``value`` escaped for HTML, with control and direction characters as Python escapes.
+    """Escape ``value`` for HTML, with control and direction characters as Python escapes.
 
-    For an object with a method ``__html__``, return the result of that method.
+    An object with a method ``__html__`` gives its own HTML.
     """
     known: Callable[[], str] | None = getattr(value, "__html__", None)
     return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

@@ -19,17 +19,13 @@ _HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write ``data`` to ``path``, replacing an existing file; a reader sees either the old or the new content."""
     with new_file(path) as partial:
         partial.write_bytes(data)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Context manager: yield the path of a temporary file, which is renamed to ``path`` if the block succeeds.
-
-    If the ``with`` block raises an error, the temporary file is deleted.
-    """
+    """Path of a temporary file, which is renamed to ``path`` if the block succeeds, else deleted."""
     partial = _temporary(path.parent)
     try:
         yield partial
@@ -42,7 +38,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check, before a long computation, that a file can be written to ``path``; return ``path`` as a ``Path``.
+    """Check, before a long computation, that a file can be written to ``path``.
 
     Raises ``AlreadyExists`` if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be
     written, or if ``path`` is a folder, device, pipe or symbolic link, which ``force`` does not replace.
@@ -71,7 +67,7 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
-    """Check that ``path`` can be used as a folder for results; it need not exist yet and is not created.
+    """Check that ``path``, which need not exist, can be used as a folder for results; it is not created.
 
     Raises ``InvalidInput`` if the path is not a folder or is not writable. Raises ``AlreadyExists`` if the folder
     contains one of the file names in ``files`` and ``force`` is False.
@@ -97,10 +93,10 @@ def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
 
 @contextmanager
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Context manager: yield a temporary folder, which is renamed to ``path`` if the block succeeds, else deleted.
+    """A temporary folder, which is renamed to ``path`` if the block succeeds, else deleted.
 
-    With ``replace``, an existing folder ``path`` is deleted after the block has succeeded. Without ``replace``,
-    ``AlreadyExists`` is raised if ``path`` exists before or after the block.
+    With ``replace``, an existing folder is then deleted. Without it, ``AlreadyExists`` is raised if ``path`` exists
+    before or after the block.
     """
     if not replace:
         _refuse_existing(path)
@@ -122,7 +118,7 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete the folder ``path``. The folder is renamed first, so an interruption leaves no half-deleted ``path``."""
+    """Delete a folder; it is renamed first, so an interruption leaves no half-deleted ``path``."""
     aside = _temporary(path.parent)
     path.rename(aside)
     shutil.rmtree(aside)
@@ -139,7 +135,7 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def hold_lock(lock: Path, other: str) -> Iterator[None]:
-    """Context manager: hold the lock file ``lock`` while the block runs. The lock is also released if the process ends.
+    """Hold the lock file ``lock`` while the block runs. The lock is also released if the process ends.
 
     Raises ``InvalidInput`` if another process holds the lock (with the message ``other``), or if the file cannot be
     used as a lock.
@@ -163,5 +159,4 @@ def _refuse_existing(path: Path) -> None:
 
 
 def _temporary(folder: Path) -> Path:
-    """Return the path of a new temporary file or folder in ``folder``."""
     return folder / f"{_HIDDEN}{uuid4().hex}{_UNFINISHED}"

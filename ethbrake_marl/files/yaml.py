@@ -20,7 +20,7 @@ _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def parse_numeral(text: str) -> float | None:
-    """Return the number that ``text`` represents (infinity if it is too large), or None if it is not a number."""
+    """Number that ``text`` represents (infinity if it is too large), or None if it is not a number."""
     return float(text) if _NUMERAL.fullmatch(text) else None
 
 
@@ -30,7 +30,7 @@ _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """Return ``value`` as text in YAML's flow style; reading the text gives an equal value.
+    """Text in YAML's flow style; reading it gives an equal value.
 
     ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null. For error
     messages, the text is cut off after ``longest`` characters.
@@ -92,7 +92,7 @@ class Document:
     lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
     def where(self, path: YamlPath) -> str:
-        """Return file and line number of the value at ``path``, such as ``my.yaml, line 7``.
+        """File and line number of the value at ``path``, such as ``my.yaml, line 7``.
 
         If the value does not exist, the line is that of the innermost mapping or list around the path.
         """
@@ -103,7 +103,7 @@ class Document:
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """Context manager: if the block raises ``InvalidInput``, put ``where(path)`` in front of its message."""
+        """If the block raises ``InvalidInput``, put ``where(path)`` in front of its message."""
         try:
             yield
         except InvalidInput as error:
@@ -164,7 +164,6 @@ class _Loader(yaml.SafeLoader):
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Compose the next node. PyYAML calls this method."""
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
         problem = ""
         if isinstance(event, yaml.AliasEvent):
@@ -184,7 +183,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
-    """Return the value of a node, and add the line numbers of all its values to ``lines``."""
+    """Value of a node; the line numbers of all its values are added to ``lines``."""
     lines.setdefault(path, node.start_mark.line + 1)
     if isinstance(node, yaml.ScalarNode):
         return _scalar(node)
@@ -205,7 +204,7 @@ def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
 
 
 def _scalar(node: yaml.ScalarNode) -> Any:
-    """Return a scalar's value. A quoted or block scalar is always text."""
+    """Value of a scalar; a quoted or block scalar is always text."""
     if node.style is not None:
         return str(node.value)
     value = next(

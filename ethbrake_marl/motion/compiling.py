@@ -3,9 +3,8 @@
 A kernel is a function on arrays of numbers, compiled by numba. Kernels use + - * / sqrt, min, max and comparisons only,
 without fast-math: a world has the same bits in every batch and on every processor.
 
-Numba keeps the machine code of a function, and does not notice when a function that it calls changes. The folder of the
-machine code is therefore named by the digest of the core's kernels, of all kernels beside it, and of those in the
-folders of extensions from which these import something.
+Numba does not notice when a function that a kernel calls changes. The folder of the machine code is therefore named by
+the digest of the core's kernels, of all kernels beside it, and of those in the folders of extensions that these import.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Says so when this process compiles its first kernel; one that is loaded says nothing."""
+    """Announce the first compilation of a kernel in this process."""
 
     def on_start(self, happened: event.Event) -> None:
         tell_compilation()
@@ -68,7 +67,7 @@ def large(function: Function) -> Function:
 
 @cache
 def folder_of(file: str) -> Path:
-    """Return the folder with the machine code of the kernels in ``file``, which may call those that it imports.
+    """Folder with the machine code of the kernels in ``file``, which may call those that it imports.
 
     If the cache folder is temporary, machine code that may only be read (a container's image) is copied into it. Warns
     if there is none to copy.
@@ -91,7 +90,7 @@ def folder_of(file: str) -> Path:
 
 
 def _has_copied(home: Path | None, folder: Path) -> bool:
-    """Copy the machine code for a temporary ``folder``; return False if there is none that may be read and trusted."""
+    """Copy the machine code for a temporary ``folder``; False if there is none that may be read and trusted."""
     try:
         kept = None if home is None or not can_be_trusted(home) else home / folder.name
         if kept is None or not any(kept.rglob("*.*")):

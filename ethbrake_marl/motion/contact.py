@@ -13,13 +13,13 @@ from ethbrake_marl.motion.compiling import kernel, large
 
 @kernel
 def gap_after(gap, closing, pressing, jerk, time):
-    """Return the gap (m) after ``time`` (s)."""
+    """Gap (m) after ``time`` (s)."""
     return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
 
 
 @kernel
 def contact(gap, closing, pressing):
-    """Return time (s) and closing speed (m/s) of the first contact at jerk 0; ``(inf, 0)`` if there is none.
+    """Time (s) and closing speed (m/s) of the first contact at jerk 0; ``(inf, 0)`` if there is none.
 
     Let ``D = w^2 + 2 b g``. If ``w > 0``, there is no contact for ``D < 0``, otherwise one at
     ``t = 2 g / (w + sqrt(D))``. If ``w <= 0``, there is one only for ``b > 0``, at ``t = (sqrt(D) - w) / b``. The
@@ -39,7 +39,7 @@ def contact(gap, closing, pressing):
 
 @large
 def contact_on_cubic(gap, closing, pressing, jerk, end):
-    """Return time (s) and closing speed (m/s) of the first contact before ``end`` (s); ``(inf, 0)`` if there is none.
+    """Time (s) and closing speed (m/s) of the first contact before ``end`` (s); ``(inf, 0)`` if there is none.
 
     The closing speed ``w + b t + j t^2 / 2`` has at most two roots, and the gap is monotone between them. The contact
     is in the first part at whose end the gap is at most 0: Newton's method, with a bisection where a step leaves the
@@ -83,7 +83,7 @@ def contact_on_cubic(gap, closing, pressing, jerk, end):
 
 @kernel
 def first_return(value, rate, jerk):
-    """Return the first t > 0 (s) at which ``value + rate t + jerk t^2 / 2`` is 0; infinite if there is none.
+    """First t > 0 (s) at which ``value + rate t + jerk t^2 / 2`` is 0; infinite if there is none.
 
     A ``value`` that is 0 now does not count: the result is the next time.
     """

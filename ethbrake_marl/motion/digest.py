@@ -1,4 +1,4 @@
-"""Which physics this is: a digest of the code in this folder, which stands in whatever depends on it."""
+"""Which physics this is: a digest of the code in this folder."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ FORM = (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
 
 @cache
 def physics_digest() -> str:
-    """Return 16 hexadecimal digits that change with the code of the physics, and not with its texts and comments."""
+    """16 hexadecimal digits of the code of the physics, without comments and the content of texts.
+
+    A docstring that is added or deleted changes them; other words in it do not.
+    """
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parent.glob("*.py")):
         if path.name in ("compiling.py", Path(__file__).name):  # how it is compiled, and this file

@@ -67,13 +67,13 @@ LATE_S, LATE_MPS2 = 1e-9, 1e-12  # delay of a parting, so that rounding cannot u
 
 @kernel
 def crossing_s(below, rate):
-    """Return the time (s) until ``below`` (m/s2, at most 0), which grows at ``rate`` (m/s3), is surely above 0."""
+    """Time (s) until ``below`` (m/s2, at most 0), which grows at ``rate`` (m/s3), is surely above 0."""
     return math.inf if rate <= 0.0 else max(-below / rate, 0.0) + LATE_S + LATE_MPS2 / rate
 
 
 @large
 def parting_s(car, scratch, head, tail):
-    """Return the time (s) until the bodies ``head..tail``, which move as one, part or start to move; infinite: never.
+    """Time (s) until the bodies ``head..tail``, which move as one, part or start to move; infinite: never.
 
     A moving block splits when its front bodies alone would accelerate more than the whole. A block that its brakes hold
     starts to move when its front bodies drive away, or when its rear bodies would move backward.
@@ -143,7 +143,7 @@ def accelerate(line, car, scratch, ahead, builds):
 
 @kernel
 def next_event(line, car, scratch, now, end, parting, ahead, builds):
-    """Return the time (s) to the next event, at most ``end - now``, and set when each speed and pair has its own.
+    """Set when each speed and pair has its next event; return the time (s) to the first, at most ``end - now``.
 
     Events: contact, parting (in ``parting`` s), rest, the speed limit, a command that takes effect, a force that
     reaches its command or 0.
@@ -283,7 +283,7 @@ def move_apart(line, car, scratch, duration, ahead, builds):
 
 @kernel
 def through_interval(line, car, scratch, start, until, ahead, builds):
-    """Do the work of ``drive``: at once if no two bodies touch, otherwise from event to event.
+    """The body of ``drive``: at once if no two bodies touch, otherwise from event to event.
 
     ``builds`` must be a constant.
     """

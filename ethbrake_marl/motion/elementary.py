@@ -1,8 +1,6 @@
 """Exponential, logarithm and normal quantile by exact operations, + - * / and sqrt, so all machines get the same bits.
 
-The C library and numpy have several implementations of exp, log and pow, and choose one by the processor. The results
-of these implementations differ in the last bits. The functions of this module do the same IEEE operations in the same
-order on every machine, so worlds drawn from a seed have the same bits everywhere. Each error bound in this module is
+The C library and numpy choose an implementation by the processor, and the last bits differ. Each error bound here is
 the largest error, rounded up, that a comparison with values of 40 digits has shown.
 """
 
@@ -58,7 +56,7 @@ _FRACTIONS = 150  # terms of the continued fraction: for x >= 2 its remainder is
 
 @kernel
 def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
-    """Return the value at ``x`` of the polynomial with ``coefficients`` (highest power first), by Horner's rule."""
+    """Polynomial with ``coefficients``, highest power first, by Horner's rule."""
     total = 0.0
     for coefficient in coefficients:
         total = total * x + coefficient
@@ -67,7 +65,7 @@ def _polynomial(coefficients: tuple[float, ...], x: float) -> float:
 
 @kernel
 def exp_rest(x: float, k: int) -> float:
-    """Return ``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
+    """``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
 
     The result is the Taylor series of ``e^y`` up to ``y^13``, with ``y = x - k ln 2``, so ``|y| <= ln(2) / 2``. The
     relative error of ending the series there is 5e-18.
@@ -77,10 +75,7 @@ def exp_rest(x: float, k: int) -> float:
 
 @kernel
 def exp(x: float) -> float:
-    """Return ``e^x`` within 1.5 ulp; infinite above 709.78, 0 below -708.
-
-    The function computes ``2^k e^(x - k ln 2)`` for the whole number k nearest to ``x / ln 2``.
-    """
+    """``e^x`` within 1.5 ulp, as ``2^k e^(x - k ln 2)``; infinite above 709.78, 0 below -708."""
     if not x < _LARGEST_EXPONENT:
         return np.inf if x >= _LARGEST_EXPONENT else np.nan
     if x < _LEAST_EXPONENT:
@@ -91,7 +86,7 @@ def exp(x: float) -> float:
 
 @kernel
 def _log_parts(x: float) -> tuple[float, float]:
-    """Return two numbers whose sum is ``ln x``, for a finite x > 0; the pair is more accurate than a single number.
+    """Two numbers whose sum is ``ln x``, for a finite x > 0; the pair is more accurate than a single number.
 
     With ``x = 2^k m`` and m between ``sqrt(1/2)`` and ``sqrt(2)``, the first number is k times the leading bits of
     ``ln 2``; this product is exact. The second number is the rest of ``k ln 2``, plus the series of
@@ -109,17 +104,17 @@ def _log_parts(x: float) -> tuple[float, float]:
 
 @kernel
 def log(x: float) -> float:
-    """Return ``ln x`` within 1 ulp, for a finite x > 0."""
+    """``ln x`` within 1 ulp, for a finite x > 0."""
     whole, rest = _log_parts(x)
     return whole + rest
 
 
 @kernel
 def normal_quantile(p: float) -> float:
-    """Return the number x below which a standard normal variable lies with probability p, within 1.5 ulp.
+    """Number below which a standard normal variable lies with probability p, within 1.5 ulp.
 
-    p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], let q be the smaller of p and 1 - p. The function
-    represents ``r = sqrt(-2 ln q)`` as the sum of two numbers; the first has 24 bits, so its square is exact.
+    p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], let q be the smaller of p and 1 - p.
+    ``r = sqrt(-2 ln q)`` is the sum of two numbers; the first has 24 bits, so its square is exact.
     """
     q = p - 0.5
     if abs(q) <= 0.25:
@@ -142,12 +137,11 @@ def normal_quantile(p: float) -> float:
 
 @kernel
 def normal_probability(x: float) -> float:
-    """Return the probability that a standard normal variable is below x; the relative error is 1e-13 for x > -30.
+    """Probability that a standard normal variable is below x; the relative error is 1e-13 for x > -30.
 
-    Let phi be the standard normal density. For ``0 <= x <= 2``, the probability of a value above x is computed by the
-    series ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``. For larger x, this probability is computed by the continued
-    fraction ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``. For ``x < 0``, the result is the probability of a value above
-    -x.
+    With the standard normal density phi, the probability of a value above x is, for ``0 <= x <= 2``,
+    ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``, and for larger x the continued fraction
+    ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``. For ``x < 0`` the result is the probability of a value above -x.
     """
     a = abs(x)
     density = _PER_SQRT_2PI * exp(-0.5 * a * a)
@@ -179,20 +173,20 @@ def _of_each(values: Floats, which: int) -> Floats:
 
 
 def exp_each(values: Floats) -> Floats:
-    """Return ``exp`` of each entry, in the same shape."""
+    """``exp`` of each entry."""
     return _of_each(values, 0)
 
 
 def log_each(values: Floats) -> Floats:
-    """Return ``log`` of each entry, in the same shape."""
+    """``log`` of each entry."""
     return _of_each(values, 1)
 
 
 def normal_quantile_each(values: Floats) -> Floats:
-    """Return ``normal_quantile`` of each entry, in the same shape."""
+    """``normal_quantile`` of each entry."""
     return _of_each(values, 2)
 
 
 def logistic(values: Floats) -> Floats:
-    """Return ``1 / (1 + e^-x)`` of each entry, in the same shape."""
+    """``1 / (1 + e^-x)`` of each entry."""
     return 1.0 / (1.0 + exp_each(-values))

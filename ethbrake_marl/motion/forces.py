@@ -28,7 +28,7 @@ ROUNDING_S = 1e-9  # an onset this shortly before the end of an interval is at i
 
 @kernel
 def acts(latency, time):
-    """Return whether a command takes effect before ``time``. At ``time`` itself the next decision replaces it.
+    """Whether a command takes effect before ``time``. At ``time`` itself the next decision replaces it.
 
     ``latency`` and ``time`` (s) count from the same moment.
     """
@@ -37,7 +37,7 @@ def acts(latency, time):
 
 @kernel
 def force_now(force, wanted, brake_rate, release_rate):
-    """Return the force (m/s2) just after the command ``wanted`` (m/s2) has taken effect.
+    """Force (m/s2) just after the command ``wanted`` (m/s2) has taken effect.
 
     The command itself if the rate (m/s3) towards it is infinite, otherwise the present ``force``.
     """
@@ -61,7 +61,7 @@ def plan_force(line, car, scratch, i, builds):
 
 @kernel
 def force_range(force, rate, speed, limit):
-    """Return ``(forward, backward, rate of forward, rate of backward)``: what own forces do in each direction.
+    """``(forward, backward, rate of forward, rate of backward)``: what own forces do in each direction.
 
     The acceleration (m/s2) by own forces if the body is about to move forward, the same for backward, and their rates
     (m/s3). They differ in two cases: brakes at rest act against motion in either direction; a vehicle that drives at
@@ -83,7 +83,7 @@ def force_range(force, rate, speed, limit):
 
 @kernel
 def settle(low, high, low_jerk, high_jerk):
-    """Return acceleration (m/s2) and jerk (m/s3) of a body: the value nearest to 0 in the range that its forces allow.
+    """Acceleration (m/s2) and jerk (m/s3) of a body: the value nearest to 0 in the range that its forces allow.
 
     ``[low, high]`` is the range (m/s2), ``low_jerk`` and ``high_jerk`` (m/s3) are the rates of its ends.
     """
@@ -96,7 +96,7 @@ def settle(low, high, low_jerk, high_jerk):
 
 @kernel
 def stopping_m(speed, latency_left, capacity, rate):
-    """Return the distance (m) until a vehicle is at rest: it coasts for its latency, then brakes fully.
+    """Distance (m) until a vehicle is at rest: it coasts for its latency, then brakes fully.
 
     With speed v (m/s, at least 0), latency left tau (s), capacity a (m/s2) and rate r (m/s3), the distance is
     ``v tau + v^2 / (2 a) + v a / (2 r) - a^3 / (24 r^2)``. A vehicle with ``v < a^2 / (2 r)`` stops before its brakes
@@ -118,7 +118,7 @@ def _stopping_each(speed, latency_left, capacity, rate, out):
 
 
 def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
-    """Return ``stopping_m`` of n vehicles, [n] m."""
+    """``stopping_m`` of n vehicles, [n] m."""
     out, tidy = np.empty(len(speed)), np.ascontiguousarray
     _stopping_each(tidy(speed), tidy(latency_left), tidy(capacity), tidy(rate), out)
     return out

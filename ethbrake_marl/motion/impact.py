@@ -134,9 +134,9 @@ def resolve_cluster(line, car, scratch, first, last):
 
 @large
 def note_thrown(line, scratch, p):
-    """Add an impact's change of the closing speed of pair p to the row THROWN; if it is its own impact, add its push.
+    """Add an impact's change of the closing speed of pair p, which has had one, to the row THROWN.
 
-    The pair has had an impact before.
+    If the impact is the pair's own, also add its push.
     """
     change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
     closing = scratch[CLOSING, p]
@@ -147,7 +147,7 @@ def note_thrown(line, scratch, p):
 
 @large
 def after_impact_of(car, scratch, first, last, body):
-    """Return the speed (m/s) of ``body`` after the impact if only the bodies ``first..last`` were there."""
+    """Speed (m/s) of ``body`` after the impact if only the bodies ``first..last`` were there."""
     largest = 0.0
     for p in range(first, last):
         largest = max(largest, scratch[CLOSING, p])

@@ -89,5 +89,5 @@ FAR_M = 1e300  # gap ahead of a line without an obstacle
 
 
 def scratch_for(bodies: int) -> Floats:
-    """Return scratch memory for worlds of so many bodies."""
+    """Scratch memory for worlds of so many bodies."""
     return np.zeros((ROWS, bodies))

@@ -29,7 +29,7 @@ from ethbrake_marl.motion.layout import ACCELERATION, HIGH, JERK, JOINED, LOW, L
 
 @kernel
 def integral_of_largest(value, rate, count, duration):
-    """Return the integral from 0 to ``duration`` of the largest of the ``count`` lines ``value[k] + rate[k] t``.
+    """Integral from 0 to ``duration`` of the largest of the ``count`` lines ``value[k] + rate[k] t``.
 
     From one crossing to the next the largest line becomes steeper, so it changes at most ``count - 1`` times.
     """
@@ -51,7 +51,7 @@ def integral_of_largest(value, rate, count, duration):
 
 @kernel
 def alone(car, scratch, body, last, toward, side, held):
-    """Return the acceleration (m/s2) of ``body`` if only the bodies from it to ``last`` were there.
+    """Acceleration (m/s2) of ``body`` if only the bodies from it to ``last`` were there.
 
     ``toward`` is 1 for the bodies behind a contact, where the largest mean counts, and -1 for those in front, where the
     smallest does. ``side`` is the row of their own accelerations. ``held``: the block does not speed up or slow down,
@@ -69,7 +69,7 @@ def alone(car, scratch, body, last, toward, side, held):
 
 @large
 def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
-    """Return the speed (m/s) that ``alone`` gives ``body``, where brakes build up; ``side_jerk``: row of the rates."""
+    """Speed (m/s) that ``alone`` gives ``body``, where brakes build up; ``side_jerk``: row of the rates."""
     count, mass, force, rate = 0, 0.0, 0.0, 0.0
     for i in range(body, last + toward, toward):
         if car[MASS, i] == math.inf:

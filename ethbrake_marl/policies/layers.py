@@ -1,7 +1,5 @@
-"""Layers of a network with the same bits in any batch, on any machine.
-
-Mathematics libraries round ``tanh`` and sums differently on different machines, and even at different positions of an
-array. Here both are fixed sequences of IEEE operations.
+"""Layers of a network with the same bits in any batch, on any machine: ``tanh`` and sums are fixed sequences of IEEE
+operations.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 
 
 def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers:
-    """Return the layers of the network whose tensors are called ``name.0.weight`` to ``name.output.bias``."""
+    """Layers of the network whose tensors are called ``name.0.weight`` to ``name.output.bias``."""
     names = [f"{name}.{k}" for k in range(hidden)] + [f"{name}.output"]
     return [
         (np.ascontiguousarray(tensors[f"{each}.weight"]), np.ascontiguousarray(tensors[f"{each}.bias"]))

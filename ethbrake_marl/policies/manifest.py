@@ -31,7 +31,7 @@ version_of = cache(version)  # reading one takes a millisecond
 
 
 def installed_versions() -> dict[str, str]:
-    """Return name -> version of Python, of the physics, and of every package on which a training may depend."""
+    """Name -> version of Python, of the physics, and of every package on which a training may depend."""
     own = {"python": platform.python_version(), PHYSICS: physics_digest()}
     return own | {name: version_of(name) for name in PACKAGES} | versions_used()
 
@@ -79,7 +79,7 @@ class Manifest(Finite):
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a manifest without its key ``manifest_sha256``, as ASCII JSON, sorted and without spaces.
+    """SHA-256 of a manifest without its key ``manifest_sha256``, as ASCII JSON, sorted and without spaces.
 
     It shows damage and edits; it is not a signature.
     """

@@ -18,7 +18,7 @@ CAPACITIES = ("own.braking_capacity", "own.driving_capacity")
 
 
 def onnx_model(manifest: Manifest, observation: View, tensors: Mapping[str, Float32s]) -> bytes:
-    """Return the model of a policy (``Policy.to_onnx``). Its metadata name the ``features`` of an observation.
+    """ONNX model of a policy (``Policy.to_onnx``). Its metadata name the ``features`` of an observation.
 
     Raises ``InvalidInput`` if the policy does not observe both its capacities, ``MissingExtra`` without onnx.
     """

@@ -55,21 +55,19 @@ class Policy:
 
     @cached_property
     def actor(self) -> Actor:
-        """What computes the actions."""
         return Actor(self.manifest.network, self.tensors)
 
     @cached_property
     def observation(self) -> View:
-        """What the policy observes."""
         return View(self.manifest.observation.features)
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32, each by itself."""
+        """Actions [n, 1] in [-1, 1] for observations [n, F] float32, each by itself."""
         return self.actor(observations)
 
     @classmethod
     def make(cls, tensors: Mapping[str, Float32s], *, network: NetworkSpec, observation: View, **manifest: Any) -> Self:
-        """Return a policy of these tensors. ``manifest``: the other fields of ``Manifest``, but hashes and versions.
+        """Policy of these tensors. ``manifest``: the other fields of ``Manifest``, but hashes and versions.
 
         Raises ``InvalidInput`` with the bad tensor or field.
         """
@@ -96,7 +94,7 @@ class Policy:
             write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
 
     def to_onnx(self) -> bytes:
-        """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+        """ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
         The acceleration is the action times the capacity to brake or to drive, as the policy observes them. The model
         adds products in another order than this package. Raises ``MissingExtra`` without the package onnx.
@@ -109,12 +107,11 @@ def _own_sha256(manifest: Manifest) -> str:
 
 
 def serialised(tensors: Mapping[str, Float32s]) -> bytes:
-    """Return the file of these tensors."""
     return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
 
 
 def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
-    """Return the tensors of a file, read-only, by name.
+    """Tensors of a file, read-only, by name.
 
     Raises ``ValueError`` for a tensor whose name or shape is not the network's, or an entry that is not finite.
     """

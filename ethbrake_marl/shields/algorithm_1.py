@@ -1,9 +1,10 @@
-"""The paper's hybrid (Algorithm 1): at the alert, a policy or E-V2X-BM gets the whole episode, whoever does less harm.
+"""The paper's hybrid (Algorithm 1): at the alert, the policy or E-V2X-BM gets the whole episode, whichever does less
+harm.
 
 The policy is played from the alert on; its harm is compared with H*, the harm of E-V2X-BM's constant deceleration. With
-the coupled H*, which is the price of this deceleration, the harm of the episode is the smaller of both numbers, to the
-last bit, if the policy drives again as it was played (a policy with random actions does not). With the paper's own
-pairwise H* nothing is bounded: it is about half of the harm that this deceleration does.
+the coupled H*, the harm of the episode is the smaller of both numbers, to the last bit, if the policy drives again as
+it was played (a policy with random actions does not). With the paper's own pairwise H* nothing is bounded: it is about
+half of the harm that this deceleration does.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the a
 
 
 class Memory(NamedTuple):
-    """What the shield remembers of n episodes with one learner."""
+    """Memory of n episodes with one learner."""
 
     chosen: Bools  # [n] whether the policy drives
     policy_harm: Floats  # [n] harm of the policy's play (m2/s2)
@@ -67,7 +68,7 @@ class EpisodeShield:
             )
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision ``state``, with the driver of each episode."""
+        """Memory at the first decision ``state``, with the driver of each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
         remembered = begin(game.agents({body: agent})[body], alert, body)
@@ -85,7 +86,7 @@ class EpisodeShield:
         )  # fmt: skip
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Return the action of the driver that was chosen at the alert, [n, 1], and the new memory."""
+        """Action of the driver that was chosen at the alert, [n, 1], and the new memory."""
         memory: Memory = state.memories["shield"]
         (body,) = self.drivers
         own, after = propose(game.agents(self.drivers), state, {body: memory.agent})
@@ -97,7 +98,6 @@ class EpisodeShield:
         )
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Return what users may want to know: name -> [n] or [n, N]."""
         memory: Memory = state.memories["shield"]
         return {
             "chosen_policy": memory.chosen,

@@ -1,4 +1,4 @@
-"""What every shield reports of its last decision, and the term of a reward that counts replaced actions."""
+"""What every shield reports of its last decision, and a reward term that counts replaced actions."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ShieldReason(IntEnum):
 
 
 def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
-    """Return body -> agent from front to rear. Raises ``InvalidInput`` for what is no agent."""
+    """Body -> agent from front to rear. Raises ``InvalidInput`` for what is no agent."""
     for body, agent in (drivers or {}).items():
         check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
     return dict(sorted((drivers or {}).items()))
@@ -56,19 +56,18 @@ def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:
 
 
 def check_harm_count(count: str) -> None:
-    """Raise ``InvalidInput`` for an unknown count of harm."""
     check_count("shield: harm_count", count)
 
 
 def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
-    """Return values of learners [n, L] as values of vehicles, [n, N]; ``other`` for those that follow scripts."""
+    """Values of learners [n, L] as values of vehicles, [n, N]; ``other`` for those that follow scripts."""
     wide = np.full((state.n, state.vehicles), other, columns.dtype)
     wide[:, game.rules.learners - 1] = columns
     return wide
 
 
 def intervention(before: State, step: Step, after: State) -> Floats:
-    """Return minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
+    """Minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
     memory = after.memories.get("shield")
     if memory is None:
         raise InvalidInput(

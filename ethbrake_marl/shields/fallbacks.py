@@ -1,7 +1,6 @@
 """Plans for a shield: what may follow an action, and what the learners do if nobody proposes anything.
 
-A plan [n, T, L] has the learners' actions at every decision. Nothing here is trusted: the shield asks for the price of
-each plan.
+A plan [n, T, L] has the learners' actions at every decision. The shield prices each plan itself.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ ALONE = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried w
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
-    """Return the plans at the alert, constant actions: [n, T, L] each.
+    """Plans at the alert, constant actions: [n, T, L] each.
 
     One learner: E-V2X-BM. Several: full braking, E-V2X-BM of one while the others brake fully, and for each the best
     share of its brakes, one after the other.
@@ -46,18 +45,18 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
 
 
 def held(game: Game, actions: Floats) -> Floats:
-    """Return the plans that repeat actions [n, L] up to the horizon."""
+    """Plans that repeat actions [n, L] up to the horizon."""
     decisions = int(np.ceil(game.rules.horizon_s / game.rules.time_step_s)) + 1
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
 def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
-    """Return the best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
+    """Best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
 
     Their harm is the largest over the states that a world may be in, which stand one after the other in ``states``.
-    Tried are the plan's next actions, all of them a little harder or softer: deviations from a good plan are mended by
-    small changes far more often than by a fixed set of constants that spans all brakes. With several learners, also
-    these actions with another one of a single learner, from all of its brakes.
+    Tried are the plan's next actions, all of them a little harder or softer: small changes mend deviations from a good
+    plan far more often than a fixed set of constants that spans all brakes. With several learners, also these actions
+    with another one of a single learner, from all of its brakes.
     """
     learners, rows, each = game.rules.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]
@@ -77,7 +76,7 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
 def rollout(
     game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: str, most: Any = np.inf
 ) -> Floats:
-    """Return the plans with the actions of agents that drive from now on, as long as the harm is at most ``most`` [n].
+    """Plans with the actions of agents that drive from now on, as long as the harm is at most ``most`` [n].
 
     ``state`` has the agents' memories.
     """

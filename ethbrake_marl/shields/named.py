@@ -1,4 +1,4 @@
-"""A shield by its name: what stands after a ``+`` in an agent's name, and the mode of ``eb.shield``."""
+"""Shields by name: after a ``+`` in an agent's name, and as the mode of ``eb.shield``."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class NamedShield(NamedTuple):
     argument: str | None = None  # the option that is the text after the colon
 
     def __call__(self, team: Team, text: str | None, settings: Any) -> Team:
-        """Return the team with the shield. Raises ``InvalidInput`` for bad options, and for a team that has a shield.
+        """The team with the shield. Raises ``InvalidInput`` for bad options, and for a team that has a shield.
 
         ``settings`` are ``names.AgentSettings``.
         """

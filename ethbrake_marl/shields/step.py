@@ -58,7 +58,7 @@ NO_DECISION, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER,
 
 
 class Memory(NamedTuple):
-    """What the shield remembers of n episodes with L learners."""
+    """Memory of n episodes with L learners."""
 
     plan: Floats  # [n, T, L] actions at every decision; only those from now on count
     price: Floats  # [n] harm of the episode under the plan (m2/s2)
@@ -115,11 +115,11 @@ class StepShield:
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the states that the worlds may be in now, M rows for each world, the nominal one first."""
+        """States that the worlds may be in now, M rows for each world, the nominal one first."""
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Return the harm of plans, [n] m2/s2: the largest over the M ``states`` of each world, or above ``most``.
+        """Harm of plans, [n] m2/s2: the largest over the M ``states`` of each world, or above ``most``.
 
         It is infinite where a vehicle would bear more than its cap (``caps`` [n, N] m2/s2).
         """
@@ -129,27 +129,26 @@ class StepShield:
         return harm
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
-        """Return the plans if the shield's agents drive on from the nominal ``state``, as long as harm <= ``most``."""
+        """Plans if the shield's agents drive on from the nominal ``state``, as long as harm <= ``most``."""
         return rollout(game, self.drivers, state, plans, self.count, most)
 
     def bound(self, memory: Memory) -> Floats:
-        """Return the bound on the harm of each episode, [n] m2/s2."""
+        """Bound on the harm of each episode, [n] m2/s2."""
         return np.maximum(memory.price, memory.first + self.allowance) if self.allowance else memory.price
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision ``state``."""
         return self.first_memory(game, alert, state, state, self.agents_at(game, alert))
 
     def agents_at(self, game: Game, alert: State) -> dict[int, Any]:
-        """Return the memories of the shield's agents for new episodes, body -> memory."""
+        """Memories of the shield's agents for new episodes, body -> memory."""
         return {body: begin(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Return the constant actions from which the first plan is chosen, [n, T, L] each."""
+        """Constant actions from which the first plan is chosen, [n, T, L] each."""
         return first_plans(game, alert, state, self.count)
 
     def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
-        """Return the memory at the first decision ``state``: the best constant actions, or the agents' own play."""
+        """Memory at the first decision ``state``: the best constant actions, or the agents' own play."""
         rows, plans = np.arange(state.n), self.plans(game, alert, state, states)
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         plan, harm = np.stack(plans)[prices.argmin(axis=0), rows], prices.min(axis=0)
@@ -170,7 +169,6 @@ class StepShield:
         )  # fmt: skip
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Return the actions to apply, [n, L], and the new memory."""
         memory: Memory = state.memories["shield"]
         proposed, state = self.asked(game, state, proposed)
         if not donate:
@@ -207,7 +205,7 @@ class StepShield:
         )  # fmt: skip
 
     def asked(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
-        """Return the proposals, [n, L], NaN for none, and the state with the memories of the shield's agents.
+        """Proposals, [n, L], NaN for none, and the state with the memories of the shield's agents.
 
         They propose what nobody else does. If one remembers, they are asked at every decision.
         """
@@ -260,7 +258,6 @@ class StepShield:
         return reason, least
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Return what users may want to know: name -> [n] or [n, N]."""
         memory: Memory = state.memories["shield"]
         borne = {}
         if memory.caps is not None:
@@ -279,7 +276,7 @@ class StepShield:
 
 
 def part(states: State, rows: Ints, M: int) -> State:
-    """Return the M states of each of the worlds ``rows``, which increase."""
+    """The M states of each of the worlds ``rows``, which increase."""
     if len(rows) * M == states.n:
         return states
     return states.take(rows if M == 1 else (rows[:, np.newaxis] * M + np.arange(M)).ravel())
@@ -287,7 +284,7 @@ def part(states: State, rows: Ints, M: int) -> State:
 
 @cache
 def trials(learners: int) -> Bools:
-    """Return which of L proposals are tried together, [1 or 1 + L, L]: all of them, then one by one from the front."""
+    """Which of L proposals are tried together, [1 or 1 + L, L]: all of them, then one by one from the front."""
     alone = np.eye(learners, dtype=np.bool_)
     return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
 

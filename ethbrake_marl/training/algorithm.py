@@ -1,4 +1,4 @@
-"""``Algorithm``: what a learning algorithm is. It builds a model of Stable-Baselines3, which can then be trained."""
+"""What a learning algorithm is: it builds a model of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class Algorithm(ABC):
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
-        """Return a new model on the CPU, whose random numbers depend on the recipe's seed only.
+        """New model on the CPU, whose random numbers depend on the recipe's seed only.
 
         ``environment`` has one row for each learner in each world.
         """
 
     def actors(self, model: BaseAlgorithm) -> list[Any]:
-        """Return the policies inside the model that choose actions, one for each of ``training.groups``."""
+        """Policies inside the model that choose actions, one for each of ``training.groups``."""
         return [model.policy]
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of an actor's weights: name in a policy file -> tensor.
+        """Copy of an actor's weights: name in a policy file -> tensor.
 
         The networks are PPO's if the action is clipped, else SAC's.
         """
@@ -53,7 +53,7 @@ class Algorithm(ABC):
 
 
 def tensors_of(name: str, layers: Iterable[nn.Module]) -> dict[str, Float32s]:
-    """Return the weights of a perceptron's linear layers: ``name.0.weight``, ... ``name.output.bias``."""
+    """Weights of a perceptron's linear layers: ``name.0.weight``, ... ``name.output.bias``."""
     *hidden, output = (layer for layer in layers if isinstance(layer, nn.Linear))
     tensors: dict[str, Float32s] = {}
     for k, layer in enumerate(hidden):
@@ -66,5 +66,4 @@ def _of_layer(name: str, layer: nn.Linear) -> dict[str, Float32s]:
 
 
 def array_of(tensor: Tensor) -> Float32s:
-    """Return a copy of a tensor as an array."""
     return tensor.detach().cpu().numpy().astype(np.float32)

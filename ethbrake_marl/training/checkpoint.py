@@ -31,7 +31,7 @@ LARGEST_BYTES = 1 << 36
 
 
 def capture(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the state of a model, its environment and the global random generators, as plain data and arrays."""
+    """State of a model, its environment and the global random generators, as plain data and arrays."""
     environment: Any = model.env
     memory: Any = getattr(model, "replay_buffer", None)
     log = model.logger
@@ -90,7 +90,7 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
 
 
 def like(new: Any, saved: Any) -> Any:
-    """Return saved data with the types of ``new``: arrays in place of tensors, named tuples in place of plain ones.
+    """Saved data with the types of ``new``: arrays in place of tensors, named tuples in place of plain ones.
 
     Raises ``ValueError`` if the entries differ, or the shape or type of an array.
     """
@@ -110,7 +110,6 @@ def like(new: Any, saved: Any) -> Any:
 
 
 def to_tensors(tree: Any) -> Any:
-    """Return a tree with tensors in place of arrays, and plain tuples in place of named ones."""
     if isinstance(tree, np.ndarray):
         return torch.from_numpy(tree.copy())  # policies' tensors are read-only
     if isinstance(tree, dict):
@@ -122,7 +121,7 @@ def to_tensors(tree: Any) -> Any:
 
 
 def files_in(folder: Path) -> list[Path]:
-    """Return the checkpoints in a folder, newest first, unread."""
+    """Checkpoints in a folder, newest first, unread."""
     return sorted(folder.glob("step_*.pt"), reverse=True)
 
 
@@ -151,7 +150,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def newest(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
-    """Return the newest checkpoint that is whole, or None, and why newer ones are not: these are deleted."""
+    """The newest whole checkpoint, or None, and why newer ones are not whole: these are deleted."""
     reasons: list[str] = []
     for path in files_in(folder):
         try:

@@ -1,6 +1,6 @@
-"""The main experiment: train the learners, and let what they learned, its shield and the baselines drive the same list.
+"""The main experiment: train the learners, then evaluate them, their shield and the baselines on one list.
 
-A *report* is what an extension adds: it says which measures it wants, and is given the finished experiment.
+A *report* is what an extension adds: it names measures, and gets the finished experiment.
 """
 
 from __future__ import annotations
@@ -41,13 +41,12 @@ class Experiment(NamedTuple):
 
     @property
     def learned(self) -> str:
-        """Name of what was learned."""
         return POLICY if POLICY in self.compared.teams else TEAM
 
     def in_another(
         self, scenario: Scenario, episodes: int, baselines: Sequence[str], measures: Sequence[str]
     ) -> Compared:
-        """Let what was learned, its shield and baselines drive the same list of another scenario."""
+        """Evaluate the learned team, its shield and baselines on the list of another scenario."""
         count = self.compared.harm_count
         teams = compared_teams(self.trained, scenario, count, baselines)
         seed = self.compared.result.about["seed"]
@@ -64,12 +63,11 @@ class Report(Protocol):
 
 
 class Tables:
-    """The report where no extension has one: the tables of the evaluation."""
+    """The report without an extension: the tables of the evaluation."""
 
     measures: tuple[str, ...] = ("pushed_m",)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Write nothing more."""
         return experiment.compared.table.tables(), f"results: {experiment.trained.directory / RESULTS}"
 
 
@@ -132,7 +130,7 @@ def run_experiment(
 
 
 def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
-    """Return the names that can be used; why others cannot is reported as progress. Raises what full braking raises."""
+    """Names that can be used; why others cannot is reported as progress. Raises what full braking raises."""
     found = []
     for number, name in enumerate(names):
         try:
@@ -148,7 +146,7 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 def compared_teams(
     trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
-    """Return the teams to compare, by name: baselines, then what was learned, without and with a shield.
+    """Teams to compare, by name: baselines, then the learned team, without and with a shield.
 
     With several learners there is also the team ``all but vehicle_i`` for each learner, which then brakes fully.
     """
@@ -164,5 +162,5 @@ def compared_teams(
 
 
 def without(vehicle: str) -> str:
-    """Return the name of the trained team in which ``vehicle`` brakes fully."""
+    """Name of the trained team in which ``vehicle`` brakes fully."""
     return f"all but {vehicle}"

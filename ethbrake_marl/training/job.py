@@ -34,16 +34,13 @@ def folder_of_many(folder: Path, *results: str) -> Iterator[None]:
 
 
 class Job(NamedTuple):
-    """One training of many. It can be pickled."""
-
     training: Training
     folder: Path  # of its run, which need not exist
     settings: tuple[str, ...] = ()  # ``KEY=VALUE``, by which it differs from files, for ``config.json``
 
     def finish(self, on_progress: OnProgress | None = None) -> bool:
-        """Do what is left of the training; return False if Ctrl-C stopped it. Raises the errors of ``train``.
-
-        Raises ``InvalidInput`` if the folder has another training, or something else.
+        """Do what is left of the training; False if Ctrl-C stopped it. Raises the errors of ``train``, and
+        ``InvalidInput`` if the folder has another training, or something else.
         """
         recipe, scenario = self.training.recipe, self.training.scenario
         if not self.folder.exists():
@@ -67,10 +64,7 @@ class Job(NamedTuple):
         return ""
 
     def result(self) -> dict[str, float]:
-        """Return the measurement of the saved policy: ``steps``, ``harm`` (which decides which one is best), and more.
-
-        The training must have finished.
-        """
+        """Measurement of the saved policy of a finished training: ``steps``, ``harm`` (which decides), and more."""
         count = self.training.recipe.reward.harm_count
         evaluations = read_object(RunFolder(self.folder).status)["evaluations"]
         best = min(evaluations, key=lambda each: deciding(each, count))

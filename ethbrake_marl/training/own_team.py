@@ -67,7 +67,7 @@ def save_team(
 
 
 def network_of(name: str, actor: Any) -> NetworkSpec:
-    """Return the network of an actor. Raises ``InvalidInput`` if it is something else than the contract says."""
+    """Network of an actor. Raises ``InvalidInput`` for an actor that breaks the contract."""
     mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
     layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
     linear, between = layers[::2], layers[1::2]

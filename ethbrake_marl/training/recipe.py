@@ -45,7 +45,7 @@ class LearningRate(FileModel):
     )
 
     def at(self, remaining: float) -> float:
-        """Return the learning rate ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
+        """Learning rate ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
 
         ``remaining`` is the fraction (1 to 0) of the training's steps that is not yet done.
         """
@@ -158,7 +158,7 @@ class TrainingRecipe(FileModel):
         return 1
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the networks of a policy that observes ``observation_size`` features, as policy files describe them.
+        """Networks of a policy that observes ``observation_size`` features, as policy files describe them.
 
         An algorithm whose actor is not PPO's, one action that is clipped to [-1, 1], overrides this method.
         """
@@ -175,7 +175,7 @@ class TrainingRecipe(FileModel):
         """Raise ``InvalidInput`` if the recipe does not fit the number of learners."""
 
     def replace(self, **changes: Any) -> Self:
-        """Return the recipe with other values: ``replace(seed=3)``. Raises ``InvalidInput`` as ``load_recipe`` does."""
+        """The recipe with other values: ``replace(seed=3)``. Raises ``InvalidInput`` as ``load_recipe`` does."""
         content = {**self.model_dump(mode="json"), **{key: plain(value) for key, value in changes.items()}}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         return changed  # type: ignore[return-value]  # another class only with another algorithm
@@ -258,27 +258,26 @@ class SacRecipe(TrainingRecipe):
         return self.log_every_updates
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the actor's network; the critics, which also see the action, are not part of a policy."""
+        """The actor's network; the critics, which also see the action, are not part of a policy."""
         return super().network_spec(observation_size).model_copy(update={"value_hidden": (), "output": "tanh"})
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Return the files of all recipes that come with the package, by name; an extension's stand in its own folder."""
+    """Files of all recipes that come with the package, by name; an extension's stand in its own folder."""
     files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
     return {file.stem: file for file in files}
 
 
 def usable_recipes() -> dict[str, Path]:
-    """Return the files of all shipped recipes whose algorithm is installed, by name."""
+    """Files of all shipped recipes whose algorithm is installed, by name."""
     return {name: file for name, file in shipped_recipes().items() if _algorithm_in(read_yaml(file)) in ALGORITHMS}
 
 
 def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> TrainingRecipe:
     """Load a recipe by name, by the path of its file, or from the content of such a file.
 
-    What ends in ``.yaml`` or has a path separator is a path; ``~`` is the user's home. A ``TrainingRecipe`` is returned
-    as it is. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key, value and what
-    would be right for bad content.
+    What ends in ``.yaml`` or has a path separator is a path. Raises ``UnknownName`` for an unknown name, and
+    ``InvalidInput`` with file, line, key, value and what would be right for bad content.
     """
     if isinstance(recipe, TrainingRecipe):
         return recipe
@@ -293,12 +292,12 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> Trai
 
 
 def _algorithm_in(document: Document) -> object:
-    """Return the value of ``algorithm`` in a recipe file; ``ppo`` if the key is missing."""
+    """Value of ``algorithm``; ``ppo`` if the key is missing."""
     return document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
 
 
 def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
-    """Return the recipe that a document describes; ``shipped`` is its file if it comes with the package."""
+    """The recipe of a document; ``shipped`` is its file if it comes with the package."""
     name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
         right = f"must be one of {', '.join(ALGORITHMS)}"
@@ -313,7 +312,7 @@ def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Return the keys that are possible in place of the last key of ``path``; a reward also has own terms."""
+        """Keys that are possible in place of the last key of ``path``; a reward also has own terms."""
         inside = super().known(path)
         return [*inside, *own_terms()] if path[:-1] == ("reward",) else inside
 
@@ -366,7 +365,7 @@ VARIANTS: Registry[type[Any]] = Registry(
 
 
 def algorithm_of(recipe: TrainingRecipe) -> Any:
-    """Return a new object of the recipe's learning algorithm, a ``training.algorithm.Algorithm``.
+    """New object of the recipe's learning algorithm, a ``training.algorithm.Algorithm``.
 
     Raises ``InvalidInput`` if the algorithm has no variant for the recipe's device.
     """

@@ -56,7 +56,7 @@ class RunFolder:
             new.write_status("running")
 
     def held(self) -> AbstractContextManager[None]:
-        """Return the context in which no other process can train here. It raises ``InvalidInput`` if one does."""
+        """Context in which no other process can train here; raises ``InvalidInput`` if one does."""
         return hold_lock(self.path / "run.lock", "another process is training in this folder")
 
     def write_status(self, status: Status, **more: Any) -> None:
@@ -88,7 +88,7 @@ class RunFolder:
                 self.write_status(ended, reason=reason, written=written)
 
     def training(self) -> Training:
-        """Return the training that a run records.
+        """Training that a run records.
 
         Raises ``InvalidInput`` if this is no run, if a file is damaged, or if a folder is a link.
         """
@@ -121,7 +121,7 @@ class RunFolder:
                 path.unlink()
 
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
-        """Return the writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
+        """Writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
 
         ``steps``: those before the first row to come, of a training that goes on; None: the events begin anew.
         """
@@ -141,5 +141,4 @@ class RunFolder:
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file, whole or not at all."""
     write_file(file, json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")

@@ -46,7 +46,7 @@ class _OwnPartForTheActor(MlpExtractor):
         self.own = own
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        """Return the output of the actor's last hidden layer for observations [n, F]."""
+        """Output of the actor's last hidden layer for observations [n, F]."""
         return super().forward_actor(features[:, : self.own])
 
 
@@ -82,11 +82,10 @@ class SeparatePolicies(BasePolicy):
 
     @property
     def policies(self) -> list[ActorCriticPolicy]:
-        """Policies of the learners, front to rear."""
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1]."""
+        """Actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1]."""
         count = len(observation)
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
         for number, policy, rows in self._by_learner(observation):
@@ -95,7 +94,7 @@ class SeparatePolicies(BasePolicy):
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
-        """Return the critics' values [n, 1] for observations [n, F + 1]."""
+        """Critics' values [n, 1] for observations [n, F + 1]."""
         values = torch.empty(len(observation), 1)
         for number, policy, rows in self._by_learner(observation):
             values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])
@@ -139,7 +138,6 @@ class IndependentPPO(PPO):
             self.policy, self.rollout_buffer, self._logger = joint, buffer, log
 
     def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
-        """Return the rows of a learner."""
         own, count = self.policy.policies[number].observation_space, len(self.names)
         part = RolloutBuffer(
             buffer.buffer_size, own, self.action_space, self.device, self.gae_lambda, self.gamma, self.n_envs // count

@@ -162,7 +162,7 @@ def resume(
 
 
 def agent_of(training: Training, directory: Path) -> str:
-    """Return the name of the trained agent for ``--agents``."""
+    """Name of the trained agent for ``--agents``."""
     return f"{'policy' if len(training.learners) == 1 else 'team'}@{directory}"
 
 
@@ -206,7 +206,7 @@ def _prepared(
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv:
-    """Return the environment of a training, with one row for each learner in each world."""
+    """Environment of a training, with one row for each learner in each world."""
     recipe = training.recipe
     scenario, game = open_game(training.scenario, reward=recipe.reward, observation=list(training.row.names))
     appended = APPENDED.get(training.scheme)

@@ -30,7 +30,7 @@ class Training(NamedTuple):
 
     @classmethod
     def of(cls, recipe: Any, scenario: AnyScenario, **changes: Any) -> Training:
-        """Return the training of a recipe in a scenario, both as ``load_recipe`` and ``load_scenario`` take them.
+        """Training of a recipe in a scenario, both as ``load_recipe`` and ``load_scenario`` take them.
 
         Learners observe what the recipe lists, else what the scenario lists. ``changes``: other values for keys of the
         recipe. Raises ``InvalidInput`` if recipe and scenario do not fit each other.
@@ -93,7 +93,7 @@ class Training(NamedTuple):
         return ", ".join(dict.fromkeys(declared[body - 1] for body in self.scenario.learners))
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Return everything that affects the training as plain data: defaults too, words not."""
+        """Everything that affects the training, as plain data: defaults too, words not."""
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
 
@@ -103,7 +103,7 @@ class Training(NamedTuple):
         return hashlib.sha256(json.dumps(self.content(), sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the content of ``config.json``; ``settings`` are those of a command."""
+        """Content of ``config.json``; ``settings`` are those of a command."""
         return {
             "recipe": self.recipe.model_dump(mode="json"),
             "scenario": self.scenario.declared(),
@@ -113,13 +113,12 @@ class Training(NamedTuple):
         }
 
     def who_drives(self) -> str:
-        """Return, for instance, ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """For instance, ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         parts = (f"{self.drivers[group[0]]} drives {', '.join(group)}" for group in self.groups)
         return f"scheme {self.scheme}: {'; '.join(parts)}"
 
 
 def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners: Sequence[str]) -> None:
-    """Raise ``InvalidInput`` if no vehicle learns, or if scheme or recipe do not fit the number of learners."""
     where = f"scenario {scenario.name!r}"
     if not learners:
         raise InvalidInput(f"{where} has no learner; give at least one vehicle the role learner")

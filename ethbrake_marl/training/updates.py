@@ -77,7 +77,6 @@ class BetweenUpdates(BaseCallback):
 
     @property
     def chosen(self) -> Policies:
-        """The result so far."""
         return self.best or self.policies
 
     def _on_step(self) -> bool:
@@ -136,7 +135,6 @@ class BetweenUpdates(BaseCallback):
             self.logger.record(f"eval/{name}", number)
 
     def log_row(self) -> None:
-        """Write a row of the logs."""
         self.logger.record("steps", self.model.num_timesteps, exclude="tensorboard")
         model: Any = self.model
         if self.count and hasattr(model, "dump_logs"):
@@ -145,7 +143,6 @@ class BetweenUpdates(BaseCallback):
             self.logger.dump(step=model.num_timesteps)
 
     def report(self) -> None:
-        """Report progress."""
         if self.tell is None:
             return
         recipe = self.training.recipe
@@ -216,7 +213,9 @@ class BetweenUpdates(BaseCallback):
 
 
 def check_finite(model: BaseAlgorithm) -> None:
-    """Raise ``TrainingDiverged`` unless losses and weights are finite, and the noise of exploration too and above 0."""
+    """Raise ``TrainingDiverged`` unless losses and weights are finite, and the noise of exploration is finite and above
+    0.
+    """
     losses = torch.tensor([value for name, value in model.logger.name_to_value.items() if name.endswith("loss")])
     noise = getattr(model.policy, "log_std", torch.zeros(1)).detach().exp()
     if not all(bool(torch.isfinite(each).all()) for each in (losses, *model.policy.parameters(), noise, 1.0 / noise)):
@@ -227,7 +226,7 @@ def check_finite(model: BaseAlgorithm) -> None:
 
 
 def policies_of(training: Training, steps: int, tensors: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
-    """Return the policy of each learner after ``steps`` decisions: learners of one group share one.
+    """Policy of each learner after ``steps`` decisions: learners of one group share one.
 
     ``tensors`` has those of each group's policy.
     """

@@ -25,8 +25,6 @@ BENCHMARK = (  # scenarios that ship with a table of best known harm, which the 
 
 @dataclass(frozen=True, slots=True)
 class CatalogueEntry:
-    """A shipped or registered scenario."""
-
     name: str
     title: str
     path: Path
@@ -38,7 +36,7 @@ class CatalogueEntry:
 
 
 def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
-    """Return the folder of the shipped scenarios or recipes (``train``), in the checkout or the installed package."""
+    """Folder of the shipped scenarios or recipes (``train``), in the checkout or the installed package."""
     checkout = _PACKAGE.parent / folder
     return checkout if (_PACKAGE.parent / "pyproject.toml").is_file() else _PACKAGE / "_data" / folder
 
@@ -46,8 +44,8 @@ def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
     """Register the scenarios of a folder by name: its file ``my-name.yaml`` becomes ``--scenario my-name``.
 
-    A file is checked only when its scenario is used. Raises ``InvalidInput`` for a folder without such files, and
-    ``AlreadyExists`` if one has the name of another scenario.
+    A file is checked when its scenario is used. Raises ``InvalidInput`` for a folder without such files, and
+    ``AlreadyExists`` for a name in use.
     """
     path = Path(folder).expanduser().resolve()
     files = sorted(path.glob("*.yaml"))
@@ -65,8 +63,8 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
 def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
     """Load a scenario by name, by the path of its file (``scenario_path``), or from the content of such a file.
 
-    A ``Scenario`` is returned as it is. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` with file,
-    line, key and value for a bad file, or one whose key ``name`` is not the name of the file.
+    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key and value for a bad file, or
+    one whose key ``name`` differs from its file name.
     """
     if isinstance(scenario, Scenario):
         return scenario
@@ -84,11 +82,10 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
 
 
 def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
-    """Return the path of a scenario's file; a path need not exist.
+    """Path of a scenario's file, which need not exist.
 
-    What ends in ``.yaml`` or ``.yml`` is a path. Otherwise shipped and registered names come first, so that no file
-    changes the meaning of a command. Any other name means a file below ``folder``: ``my/folder/mine`` means
-    ``my/folder/mine.yaml`` or ``mine.yml``. ``~`` is the user's home.
+    Names ending in ``.yaml`` or ``.yml`` are paths. Otherwise shipped and registered names come first, so that no file
+    changes the meaning of a command. ``my/folder/mine`` means ``my/folder/mine.yaml`` or ``mine.yml`` below ``folder``.
     """
     text, paths = str(name_or_path), _known_paths()
     path = folder / Path(text).expanduser()
@@ -103,14 +100,14 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Return the names in a group: ``benchmark``, or a folder of shipped scenarios; empty if there is no such group."""
+    """Names in a group: ``benchmark``, or a folder of shipped scenarios; empty for an unknown group."""
     if name == "benchmark":
         return list(BENCHMARK)
     return sorted(path.stem for path in shipped_folder().glob("*/*.yaml") if path.parent.name == name)
 
 
 def list_scenarios() -> list[CatalogueEntry]:
-    """Return every shipped and registered scenario, sorted by name, without checking it."""
+    """Shipped and registered scenarios, sorted by name; their files are not checked."""
     entries = []
     for name, path in sorted(_known_paths().items()):
         content = read_yaml(path).content
@@ -126,7 +123,6 @@ def _known_paths() -> dict[str, Path]:
 
 
 def _whole(document: Document, folder: Path) -> Document:
-    """Return the document with the content of the scenario and CSV files that it names, relative to ``folder``."""
     content = _with_rows(document, (), document.content, folder)
     listed = content.get("mixture") if isinstance(content, dict) else None
     if isinstance(listed, list | tuple):
@@ -135,7 +131,6 @@ def _whole(document: Document, folder: Path) -> Document:
 
 
 def _member(document: Document, i: int, entry: Any, folder: Path) -> Any:
-    """Return entry i of a mixture with the content of its scenario. What is no entry is left to the schema."""
     if not isinstance(entry, dict) or "scenario" not in entry:
         return entry
     at: YamlPath = ("mixture", i, "scenario")
@@ -147,7 +142,6 @@ def _member(document: Document, i: int, entry: Any, folder: Path) -> Any:
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:
-    """Return the content of one scenario, which stands at ``at`` in the document, with the rows of its table."""
     table = content.get("table") if isinstance(content, dict) else None
     if not (isinstance(table, dict) and isinstance(table.get("file"), str)) or "rows" in table:
         return content

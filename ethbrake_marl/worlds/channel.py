@@ -68,7 +68,7 @@ class Equipage(Part):
 
 
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
-    """Return the number k of periods that a burst of losses lasts, for uniform numbers ``u``.
+    """Number k of periods that a burst of losses lasts, for uniform numbers ``u``.
 
     k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. No logarithm: every machine gets the same k.
     """
@@ -87,22 +87,22 @@ class Extension(Protocol):
     schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
 
     def read(self, key: str, value: Any) -> Any:
-        """Return the value of a key as plain data. Refuses (``files.model.refuse``) a bad value."""
+        """Value of a key as plain data; a bad value is refused (``files.model.refuse``)."""
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Return the keys of messages that have an effect because of this extension. Refuses keys without effect."""
+        """Keys of messages that have an effect because of this extension; keys without effect are refused."""
 
     def is_random(self, v2x: V2X) -> bool:
-        """Return whether random numbers determine what vehicles know, beside those of the channel."""
+        """Whether it draws random numbers of its own."""
 
     def check(self, scenario: Scenario) -> None:
         """Refuse a scenario in which these keys cannot be used."""
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
-        """Return the memory of n worlds at the alert."""
+        """Memory of n worlds at the alert."""
 
     def game(self, game: Game) -> Game:
-        """Return the game with this extension."""
+        """Game with this extension."""
 
 
 def register_v2x_extension(key: str, extension: Extension) -> None:
@@ -183,14 +183,14 @@ class V2X(Part):
 
     @model_serializer(mode="wrap")
     def _as_written(self, dump: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
-        """Return the keys in the file; the others, whose values the preset gives, are null or left out."""
+        """Keys of the file; those that the preset sets are null or left out."""
         whole = not (info.exclude_unset or info.exclude_none)
         return {
             key: each if key in self._keys else None for key, each in dump(self).items() if whole or key in self._keys
         }
 
     def _check(self) -> None:
-        """Refuse keys that have no effect, and a channel that may leave a vehicle without any news."""
+        """Refuse keys without effect, and a channel that may leave a vehicle without any news."""
         used = [key for extension in self.extensions for key in extension.uses(self)]
         unused = [key for key in OF_MESSAGES if key not in used]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)
@@ -220,7 +220,6 @@ class V2X(Part):
 
     @property
     def extensions(self) -> tuple[Extension, ...]:
-        """The extensions whose keys are written here."""
         return tuple(dict.fromkeys(EXTENSIONS[key] for key in self.model_extra or ()))
 
     @property
@@ -244,7 +243,7 @@ class V2X(Part):
         return self.by_link and (heard or seen or own)
 
     def first_message_s(self, u: Floats) -> Floats:
-        """Return tau of links (s) for uniform numbers ``u`` [..., PER_LINK]; infinite: no message arrives."""
+        """Waiting time tau of links (s) for uniform numbers ``u`` [..., PER_LINK]; infinite: no message arrives."""
         delay = np.full(u.shape[:-1], -np.inf if self.link_latency_s is None else self.link_latency_s)
         if self.timing == "messages":
             periods = burst_periods(u[..., 1], self.loss_begins, self.loss_ends)
@@ -254,7 +253,7 @@ class V2X(Part):
         return delay
 
     def heard_and_seen(self, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """Return when i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
+        """When i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
 
         ``u`` [n, PER_LINK N^2] are the uniform numbers of the links, ``unheard`` [n or 1, N, N] says whose equipment
         lets no message through (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
@@ -269,7 +268,7 @@ class V2X(Part):
         return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
 
     def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """Return when each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
+        """When each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
         N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, unheard)
         latency = own_latency.copy()
         for i in range(1, N if self.timing != "latency" else 0):
@@ -280,14 +279,14 @@ class V2X(Part):
         return latency, known
 
     def latest_reaction_s(self, own_latency: Floats, unheard: Bools) -> Floats:
-        """Return upper bounds of the times from which vehicles can react, [n, N] s, from their own latencies."""
+        """Upper bounds of the times from which vehicles can react, [n, N] s."""
         n, N = own_latency.shape
         slowest = np.tile([1.0, 0.0, 0.0, 1.0], (n, N * N))  # numbers of links
         return self.news(own_latency, slowest, unheard)[0]
 
 
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:
-    """Register a channel as a preset, which every scenario can then use: ``v2x: name``.
+    """Register a channel that every scenario can then use: ``v2x: name``.
 
     ``settings`` is the content of ``v2x`` in a scenario, such as ``{"preset": "nominal", "lost": 0.1}``. Raises
     ``AlreadyExists`` if the name belongs to another channel, ``InvalidInput`` for a bad name or bad settings.

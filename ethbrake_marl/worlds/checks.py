@@ -1,4 +1,4 @@
-"""Checks of a scenario that concern several keys together. Each refuses the first mistake, with its place."""
+"""Checks of a scenario that concern several keys; each refuses the first mistake, with its place."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_whole(scenario: Scenario) -> None:
-    """Refuse a scenario whose keys contradict each other. It is no mixture."""
+    """Refuse a scenario, which is no mixture, whose keys contradict each other."""
     if scenario.types is not None:
         check_types(scenario.types, scenario.vehicle_types, scenario.vehicles)
     _check_declared_once(scenario)
@@ -42,7 +42,7 @@ def check_whole(scenario: Scenario) -> None:
 
 
 def _check_declared_once(scenario: Scenario) -> None:
-    """Refuse a quantity that nobody declares for some vehicle, or that is declared twice."""
+    """Refuse a quantity that is declared twice, or not at all, for some vehicle."""
     for key, rule in RULES.items():
         value = getattr(scenario, key)
         kinds = scenario.vehicle_types or {} if key in OF_A_TYPE else {}
@@ -67,7 +67,6 @@ def _check_declared_once(scenario: Scenario) -> None:
 
 
 def _check_channel(scenario: Scenario) -> None:
-    """Refuse a time step above the horizon, and V2X equipment that has no effect."""
     v2x = scenario.v2x
     in_time = scenario.time_step_s <= scenario.horizon_s
     right = f"must not be above horizon_s ({scenario.horizon_s:g} s)"
@@ -113,14 +112,12 @@ _EXAMPLES = {"name": "name: my-scenario", "scenario": "{scenario: paper-random, 
 
 
 class ScenarioWording(Wording):
-    """Texts for error messages about the content of a scenario file."""
-
     def instead(self, key: str) -> str:
-        """Return what to write instead of a key that people try, or that earlier versions had."""
+        """What to write instead of a wrong or former key."""
         return _INSTEAD.get(key, "")
 
     def needed(self, path: YamlPath) -> str:
-        """Return advice on what to write at ``path``, with an example."""
+        """Advice on what to write at ``path``, with an example."""
         rule, key = RULES.get(str(path[-1])), str(path[-1])
         if rule is None:
             return f"write, for instance, {_EXAMPLES[key]}" if key in _EXAMPLES else f"write {_DISTRIBUTION}"
@@ -128,12 +125,10 @@ class ScenarioWording(Wording):
         return f"write, for instance, {key}: {rule.example}{other} ({rule.meaning})"
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair whose value is at ``path``, such as ``vehicle_2``."""
         rule = RULES.get(str(path[0])) if len(path) > 1 else None
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return what would be valid instead of a bad quantity or role."""
         given, kind = detail["input"], detail["type"]
         if kind == "quantity" or (kind == "float_type" and detail["loc"][-1] == "#number"):
             hints = [suggestion(str(key), DISTRIBUTIONS) for key in given] if isinstance(given, dict) else []

@@ -1,4 +1,4 @@
-"""What a world's quantities are: those that are declared, those that follow from them, and what must hold of them."""
+"""Quantities that follow from the declared ones, and what must hold of them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def world_values(
     declared: Callable[[str], Floats],
     settle: Callable[[str, Floats], Floats] = lambda _, values: values,
 ) -> Values:
-    """Return all quantities of k worlds except the distance of the obstacle, from the declared ones.
+    """All quantities of k worlds except the distance of the obstacle, from the declared ones.
 
     ``speed = line speed + own deviation``, ``gap = time gap x speed of the rear vehicle`` and ``latency = own latency +
     time of the alert`` grow with what is declared: bounds of the declared quantities give bounds of these. Friction
@@ -48,7 +48,7 @@ def world_values(
 
 
 def obstacle_gap(scenario: Scenario, values: Values, declared: Callable[[str], Floats]) -> Floats:
-    """Return the distance from Vehicle 1 to the obstacle, [k, 1] m, in a scenario with an obstacle.
+    """Distance from Vehicle 1 to the obstacle, [k, 1] m, in a scenario with an obstacle.
 
     It is declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: the margin is what is left if Vehicle 1 brakes fully
     (longer while its brakes build up: ``motion.forces.stopping_m``).
@@ -62,10 +62,10 @@ def obstacle_gap(scenario: Scenario, values: Values, declared: Callable[[str], F
 
 
 def mistakes(scenario: Scenario, low: Values, high: Values) -> Iterator[tuple[str, int, int, str]]:
-    """Yield what cannot be in k worlds whose quantities are from ``low`` to ``high``, each [k, entries].
+    """Contradictions in k worlds whose quantities are from ``low`` to ``high``, each [k, entries].
 
-    A mistake is the key of a quantity (``v2x``: of news), the index of the vehicle, the row of the first such world,
-    and what would be right.
+    Each has the key of a quantity (``v2x``: of news), the vehicle's index, the row of the first such world, and what
+    would be right.
     """
 
     def first(holds: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What was drawn, as columns of a table: quantities of each world, its vehicle types, its member, its recording."""
+"""Drawn worlds as columns of a table: quantities, vehicle types, member, recording."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 def columns_of(drawn: Drawn) -> dict[str, NDArray[np.generic]]:
-    """Return all columns of drawn worlds: ``world`` (its number), ``kinds_of`` and ``quantities_of``, [n] each."""
+    """All columns of drawn worlds, [n] each: ``world`` (its number), ``kinds_of`` and ``quantities_of``."""
     numbers = drawn.worlds.clock[:, NUMBER].astype(np.int64)
     return {"world": numbers, **kinds_of(drawn), **quantities_of(drawn.worlds, drawn.friction)}
 
 
 def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str, Floats]:
-    """Return the quantities of worlds at the alert: ``gap_1_m`` and so on -> [n], as ``worlds_from_table`` reads them.
+    """Quantities of worlds at the alert, name -> [n], as ``worlds_from_table`` reads them.
 
     Capacities are those on the road, whose ``friction`` [n] is a column if every world has one. An obstacle, rates and
     weights are columns if a world has them; a distance is NaN where there is no obstacle, and what is infinite is the
@@ -46,14 +46,14 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
 
 
 def fixed_columns(scenario: Scenario) -> set[str]:
-    """Return the columns of ``quantities_of`` that are the same in every world; gaps and speeds never are."""
+    """Columns of ``quantities_of`` that are the same in every world; gaps and speeds never are."""
     keys = [key for key in CAR_ROWS if key in USUAL or key in scenario.sources] + ["restitution"]
     ends = {RULES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
     return {name for name, (low, high) in ends.items() if low == high}
 
 
 def kinds_of(drawn: Drawn) -> dict[str, Texts]:
-    """Return columns of texts: ``scenario`` of a mixture, ``recording``, ``vehicle_1_type`` and so on."""
+    """Columns of texts: ``scenario`` of a mixture, ``recording``, ``vehicle_1_type`` and so on."""
     columns = {"scenario": drawn.scenarios, RECORDING: drawn.recordings}
     types = drawn.types.T if (drawn.types != "").any() else ()
     columns = {name: column for name, column in columns.items() if (column != "").any()}
@@ -61,10 +61,10 @@ def kinds_of(drawn: Drawn) -> dict[str, Texts]:
 
 
 def clusters_of(columns: Mapping[str, NDArray[Any]]) -> Texts | None:
-    """Return the name of each world's cluster, [n], from its columns; None if all worlds are independent.
+    """Name of each world's cluster, [n]; None if all worlds are independent.
 
-    Worlds of one recording depend on each other; its name stands before the last ": " of a cell. A world without a
-    recording is a cluster of its own.
+    Worlds of one recording, named before the last ": " of a cell, depend on each other. A world without a recording is
+    a cluster of its own.
     """
     if RECORDING not in columns:
         return None

@@ -17,8 +17,6 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 class Key(NamedTuple):
-    """A key of a scenario file."""
-
     name: str
     example: str  # of its value, in YAML
     about: str
@@ -26,7 +24,6 @@ class Key(NamedTuple):
 
 
 def listed_keys() -> list[Key]:
-    """Return every key of a scenario file, in the order of the file."""
     keys, others = [], {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}
     for name, field in Scenario.model_fields.items():
         about, rule = str(field.description), RULES.get(name)
@@ -37,7 +34,7 @@ def listed_keys() -> list[Key]:
 
 
 def sentences(scenario: Scenario) -> Iterator[str]:
-    """Yield sentences about a scenario: its line, its roles, and what every key of its file says and means."""
+    """Sentences about the line, the roles, and every key of the file."""
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
     there = {each.has_obstacle for each in scenario.members or (scenario,)}
     obstacle = f"{'an' if any(there) else 'no'} obstacle ahead{'' if len(there) == 1 else ' in some worlds'}"
@@ -79,7 +76,6 @@ _EXAMPLES = {
 
 
 def check_file_name(kind: str, name: str) -> None:
-    """Raise ``InvalidInput`` unless ``name`` can name a scenario or recipe (``kind``) and its file."""
     if re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(
             f"{kind} name {name!r}: must be 1 to 64 lower case letters, digits, - and _, beginning with a letter or"
@@ -88,7 +84,7 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: str = "") -> str:
-    """Return the commented text of a new scenario file with every key, and the values of the file ``based_on``.
+    """Commented text of a new scenario file with the values of ``based_on``.
 
     A key that is not used stands in a comment, with an example. ``rows_file`` names a copy of the table's CSV file.
     """
@@ -110,7 +106,6 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: s
 
 
 def scenario_json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of a scenario file, with which editors complete and check YAML."""
     schema = Scenario.model_json_schema(schema_generator=FileSchema)
     for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
         for key in properties.keys() & RULES.keys():

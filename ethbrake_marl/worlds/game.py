@@ -25,14 +25,14 @@ AT_ONCE = 1024  # training worlds that are drawn together: drawing one alone cos
 
 
 class Pool:
-    """The training worlds of a scenario, drawn many at a time. A world is the same however it is drawn."""
+    """The training worlds of a scenario, drawn many at a time."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario, self.seed, self.first = scenario, -1, 0
         self.worlds: State | None = None
 
     def __call__(self, n: int, seed: int, first: int) -> State:
-        """Return worlds ``first`` to ``first + n - 1`` of the seed, in memory of their own."""
+        """Worlds ``first`` to ``first + n - 1`` of the seed, in memory of their own."""
         worlds = self.worlds
         if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
             worlds = self.scenario.sample(max(4 * n, AT_ONCE), seed, first=first, channel="training")
@@ -47,7 +47,9 @@ def game_of(
     observation: Any = None,
     reward_vector: Any = None,
 ) -> tuple[Scenario, Game]:
-    """Return a scenario, with the observation, and its game. ``names.open_game`` also finds both by names.
+    """The scenario, with the observation, and its game. ``names.open_game`` also finds both by names.
+
+    Warns (``FreeImpacts``) of a learner's objective in which an impact costs nothing.
 
     Args:
         scenario: of the worlds.
@@ -55,8 +57,6 @@ def game_of(
         reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``.
         observation: features of all vehicles, or vehicle -> features; None: the scenario's.
         reward_vector: components of a vector reward (``episode.terms``).
-
-    Warns (``FreeImpacts``) of a learner's objective in which an impact costs nothing.
 
     """
     if observation is not None:
@@ -80,7 +80,6 @@ def game_of(
 
 
 def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
-    """Warn of an impact that costs a learner nothing."""
     objectives = objectives_of(declared, scenario.vehicles)
     for body in scenario.learners:
         pairs = free_pairs(objectives[body - 1], body - 1, scenario.vehicles, obstacle=scenario.has_obstacle)
@@ -96,15 +95,15 @@ def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
 
 @cache
 def _warn_once(message: str) -> None:
-    """Warn. A training opens its game several times, and Python forgets what it has shown."""
+    """Warn once of each message: a training opens its game several times, and Python forgets what it has shown."""
     warnings.warn(message, FreeImpacts, stacklevel=2)
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:
-    """Return what each vehicle observes, front to rear.
+    """What each vehicle observes, front to rear.
 
-    By default a vehicle observes itself and one neighbour on each side; where there may be an obstacle, also its place
-    in the line and the obstacle.
+    Default: itself and one neighbour on each side; where there may be an obstacle, also its place in the line and the
+    obstacle.
     """
     usual = View(["own", "front_1", "rear_1", *(["role", "obstacle"] if scenario.has_obstacle else [])])
     listed = scenario.observation

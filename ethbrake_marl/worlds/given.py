@@ -1,4 +1,4 @@
-"""Worlds that the user gives: one state, columns of a table, or a CSV file. What is fixed comes from the scenario."""
+"""Worlds of the user: one state, columns of a table, or a CSV file; the scenario fixes the rest."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from ethbrake_marl.worlds.table import CsvFile
 
 
 def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> State:
-    """Return one world from ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; one number is for all vehicles.
+    """One world from ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; one number is for all vehicles.
 
-    What has no key has the scenario's value, which must be fixed. Raises ``InvalidInput`` with key and index.
+    A key that is left out has the scenario's value, which must be fixed. Raises ``InvalidInput`` with key and index.
     """
     where = "initial_state"
     if not isinstance(initial_state, Mapping):
@@ -42,11 +42,11 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
 
 
 def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
-    """Return worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
+    """Worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
-    ``columns`` may also be a pandas or polars data frame, or a pyarrow table. Rows are paired by position. What has no
-    column (``given_columns``) has the scenario's value, which must be fixed. Raises ``InvalidInput`` with column and
-    row (from 0).
+    ``columns`` may also be a pandas or polars data frame, or a pyarrow table. Rows are paired by position. A quantity
+    without a column (``given_columns``) has the scenario's value, which must be fixed. Raises ``InvalidInput`` with
+    column and row (from 0).
     """
     scenario, where = load_scenario(scenario), "initial states"
     names = getattr(columns, "column_names", None) or getattr(columns, "columns", columns)  # of pyarrow, or a frame
@@ -71,10 +71,7 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
 
 
 def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
-    """Return the worlds of a CSV file with a header, with the columns of ``worlds_from_table``.
-
-    Raises ``InvalidInput`` with file, line and column.
-    """
+    """Worlds of a CSV file with the columns of ``worlds_from_table``; ``InvalidInput`` names file, line and column."""
     scenario, file = load_scenario(scenario), CsvFile.read(Path(path).expanduser())
     entries = _entries(file.header, scenario, f"{file.path}, line 1")
     table = np.array(file.cells(file.header), np.float64)
@@ -83,13 +80,13 @@ def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
 
 
 def given_keys(scenario: Scenario) -> tuple[str, ...]:
-    """Return the quantities that worlds of this scenario have: ``gaps_m`` and so on."""
+    """Quantities of the worlds of this scenario: ``gaps_m`` and so on."""
     there = {"obstacle_gap_m": scenario.has_obstacle}
     return USUAL + tuple(key for key in OPTIONAL if there.get(key, key in scenario.sources))
 
 
 def given_columns(scenario: Scenario) -> dict[str, Entry]:
-    """Return the possible columns of a table of worlds: ``{"gap_1_m": ("gaps_m", 0), ...}``."""
+    """Possible columns of a table of worlds: ``{"gap_1_m": ("gaps_m", 0), ...}``."""
     return table_columns(given_keys(scenario), scenario.vehicles)
 
 
@@ -99,7 +96,6 @@ def _check_known(what: str, name: str, known: Sequence[str]) -> None:
 
 
 def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entry]:
-    """Return what the columns of a header mean. Raises ``InvalidInput`` for unknown and repeated columns."""
     known = given_columns(scenario)
     for name in header:
         if header.count(name) > 1:
@@ -111,7 +107,7 @@ def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entr
 def _worlds(
     scenario: Scenario, given: Mapping[Entry, Floats], where: str, row_text: Callable[[int], str] | None = None
 ) -> State:
-    """Return worlds of the columns ``given``, each [n], filled in with what the scenario fixes, and checked.
+    """Checked worlds of the columns ``given``, each [n], filled in with what the scenario fixes.
 
     ``row_text`` names a row in error messages; None: there is one world, whose values are named by their keys.
     """
@@ -132,7 +128,6 @@ def _worlds(
         return np.where(low == high, low, np.nan)[np.newaxis]
 
     def settle(key: str, known: Floats) -> Floats:
-        """Return the values given for ``key``, else those known from the scenario, [n, entries]."""
         rule, whole = RULES[key], np.empty((n, known.shape[1]))
         for i in range(whole.shape[1]):
             column = whole[:, i] = given.get((key, i), known[:, i])
@@ -165,7 +160,7 @@ def _worlds(
 
 
 def _numbers(what: str, value: Any) -> Floats:
-    """Return numbers as float64. Raises ``InvalidInput`` for what numpy would convert: booleans, masks, texts."""
+    """Refuse what numpy would convert: booleans, masks, texts."""
     try:
         cells = np.asarray(value)
         kinds = {type(cell) for cell in np.asarray(value, object).flat} if isinstance(value, list | tuple) else set()

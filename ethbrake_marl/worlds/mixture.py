@@ -22,7 +22,7 @@ _SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them if all
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the content of a scenario file with other values; a new way to declare gaps replaces the old way.
+    """Content of a scenario file with other values; a new way to declare gaps replaces the old way.
 
     A key that becomes None is left out.
     """
@@ -34,10 +34,9 @@ def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> d
 
 
 def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str, Any]:
-    """Return the content of a mixture with a ``Scenario`` for each member, and with what all members share.
+    """Content of a mixture with a ``Scenario`` for each member, and with what all members share.
 
-    Keys beside ``mixture`` replace the same keys of every member. A list that is not well formed is left to the schema.
-    Refuses, in a pydantic validator, a bad member, and members that cannot be drawn together.
+    Keys beside ``mixture`` replace the same keys of every member. A malformed list is left to the schema.
     """
     listed = content["mixture"]
     if (

@@ -1,4 +1,4 @@
-"""Physics other than exact impacts, which the key ``physics`` of a scenario names."""
+"""Physics other than exact impacts, by the key ``physics`` of a scenario."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Physics(Protocol):
         """Refuse (``files.model.refuse``) a scenario that this physics cannot play."""
 
     def game(self, game: Game) -> Game:
-        """Return the game with this physics: a subclass with its own ``follow``."""
+        """The game with this physics: a subclass with its own ``follow``."""
 
 
 def register_physics(name: str, physics: Physics) -> None:

@@ -34,13 +34,13 @@ PositiveEnds = Annotated[tuple[Positive, Positive], Field(strict=False), AfterVa
 
 
 def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
-    """Return for each ``u`` the first index whose cumulative share of the ``weights`` is above it."""
+    """For each ``u``, the first index whose cumulative share of the ``weights`` is above it."""
     cumulative = np.cumsum(np.asarray(weights, np.float64))
     return np.searchsorted(cumulative / cumulative[-1], u, side="right")
 
 
 class Part(FileModel):
-    """Base class of the parts of a scenario file. A key without a value is an error."""
+    """Part of a scenario file; a key without a value is an error."""
 
     @field_validator("*", mode="before")
     @classmethod
@@ -50,11 +50,10 @@ class Part(FileModel):
 
 
 class Distribution(Part):
-    """Base class of the distributions. The first field has the distribution's name, and its shape."""
+    """A distribution; its first field has its name, and its shape."""
 
     @property
     def support(self) -> tuple[float, float]:
-        """Smallest and largest value."""
         shape = getattr(self, next(iter(type(self).model_fields)))
         return (min(shape), max(shape)) if isinstance(shape, tuple) else (shape.low, shape.high)
 
@@ -65,7 +64,7 @@ class Uniform(Distribution):
     uniform: Ends = Field(description="[low, high]")
 
     def value(self, u: Floats) -> Floats:
-        """Return the values; none is above high, because u is at most 1 - 2^-53."""
+        """No value is above high, because u is at most 1 - 2^-53."""
         low, high = self.uniform
         return low + (high - low) * u
 
@@ -94,12 +93,12 @@ class NormalShape(Part):
         return self
 
     def shares(self) -> tuple[float, float]:
-        """Return the probabilities of a value below ``low`` and below ``high`` before truncation."""
+        """Probabilities of a value below ``low`` and below ``high`` before truncation."""
         low, high = (normal_probability((end - self.mean) / self.sd) for end in (self.low, self.high))
         return low, high
 
     def value(self, u: Floats) -> Floats:
-        """Return ``mean + sd Q(p_low + (p_high - p_low) u)`` with the standard normal quantile function Q."""
+        """``mean + sd Q(p_low + (p_high - p_low) u)`` with the standard normal quantile function Q."""
         below, above = self.shares()
         return np.clip(self.mean + self.sd * normal_quantile_each(below + (above - below) * u), self.low, self.high)
 
@@ -127,7 +126,6 @@ class LogNormalShape(Part):
         return self
 
     def of_logarithm(self) -> NormalShape:
-        """Return the shape of the normal distribution of the logarithm."""
         low, high = log(self.low), log(self.high)
         return NormalShape.model_construct(mean=log(self.median), sd=self.sigma, low=low, high=high)
 
@@ -145,7 +143,7 @@ class LogNormal(Distribution):
     lognormal: LogNormalShape
 
     def value(self, u: Floats) -> Floats:
-        """Return ``exp(x)`` with x from a normal distribution truncated to [log(low), log(high)]."""
+        """``exp(x)`` with x from a normal distribution truncated to [log(low), log(high)]."""
         return np.clip(exp_each(self.lognormal.of_logarithm().value(u)), *self.support)
 
 
@@ -171,7 +169,7 @@ DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")
 
 
 def _tag(value: object) -> str | None:
-    """Return the tag of the class that checks a value from a file; None if no class can."""
+    """Tag of the class that checks a value from a file; None if no class can."""
     if isinstance(value, Distribution):
         return f"#{next(iter(type(value).model_fields))}"
     if isinstance(value, dict):
@@ -200,7 +198,7 @@ PerVehicle = Annotated[
 
 
 def support(quantity: Any) -> tuple[float, float]:
-    """Return the smallest and the largest value that a quantity can have."""
+    """Smallest and largest value of a number or distribution."""
     if isinstance(quantity, float):
         return quantity, quantity
     low, high = quantity.support
@@ -208,5 +206,5 @@ def support(quantity: Any) -> tuple[float, float]:
 
 
 def values(quantity: Any, u: Floats) -> Floats:
-    """Return the values of a number or distribution for uniform numbers ``u`` [n]."""
+    """Values of a number or distribution for uniform numbers ``u`` [n]."""
     return np.full(u.shape, quantity) if isinstance(quantity, float) else quantity.value(u)

@@ -1,8 +1,4 @@
-"""Roles: which vehicles learn, and what the others do.
-
-A scenario knows four roles: ``learner``, and the scripts ``full_brake``, ``coast`` and ``constant:a``, which hold one
-command. Every other role is the name of an agent, which is made later.
-"""
+"""Roles: ``learner``, the scripts ``full_brake``, ``coast`` and ``constant:a``, or the name of an agent."""
 
 from __future__ import annotations
 
@@ -25,22 +21,18 @@ _FORM = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 
 
 def names_of(vehicles: int) -> tuple[str, ...]:
-    """Return ``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
+    """``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
     return tuple(f"vehicle_{i + 1}" for i in range(vehicles))
 
 
 def check_vehicle(name: str, vehicles: int, at: YamlPath, value: Any) -> None:
-    """Raise, in a pydantic validator, the error for a vehicle that is not in the line."""
     close = "" if name.startswith("vehicle_") else suggestion(name, names_of(vehicles))
     hint = close or f"this scenario has vehicle_1 ... vehicle_{vehicles}"
     require(name in names_of(vehicles), at, value, f"unknown vehicle; {hint}")
 
 
 def check_role(role: str) -> str:
-    """Return ``role``. Raises ``InvalidInput`` unless it has the form ``name[:argument]`` and names no Python file.
-
-    Loading somebody else's scenario must not run code.
-    """
+    """Refuse a role that is not ``name[:argument]``, or names a Python file: a scenario must not run code."""
     match = _FORM.fullmatch(role)
     if match is None:
         raise InvalidInput(
@@ -64,13 +56,13 @@ def check_role(role: str) -> str:
 
 
 def deceleration_of(role: str) -> float | None:
-    """Return the deceleration a of a role ``constant:a`` (m/s2, negative: drives); None for another role."""
+    """Deceleration a of a role ``constant:a`` (m/s2, negative: drives); None for another role."""
     name, _, argument = role.partition(":")
     return parse_numeral(argument) if name == "constant" else None
 
 
 def first_command(role: str, braking_capacity: Floats) -> Floats:
-    """Return the command (m/s2) that a role holds, or until its agent decides, for capacities [n]."""
+    """Command (m/s2) that a role holds, or until its agent decides, for capacities [n]."""
     deceleration = deceleration_of(role)
     if deceleration is not None:
         return np.full(braking_capacity.shape, 0.0 - deceleration)
@@ -78,7 +70,7 @@ def first_command(role: str, braking_capacity: Floats) -> Floats:
 
 
 class Roles(dict[str, str]):
-    """Vehicle -> role, which nobody changes."""
+    """Vehicle -> role; read-only."""
 
     def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
         raise InvalidInput(
@@ -94,5 +86,5 @@ class Roles(dict[str, str]):
 
     @classmethod
     def complete(cls, given: Mapping[str, str], vehicles: int) -> Roles:
-        """Return the role of each vehicle; one without a role brakes fully."""
+        """Role of each vehicle; one without a role brakes fully."""
         return cls({name: given.get(name, "full_brake") for name in names_of(vehicles)})

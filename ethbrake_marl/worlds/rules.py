@@ -47,7 +47,7 @@ class Rule(NamedTuple):
 
     @property
     def interval(self) -> str:
-        """Allowed range for error messages: ``finite and in (0, 1000] t (tonnes)``."""
+        """Allowed range for messages: ``finite and in (0, 1000] t (tonnes)``."""
         symbol = {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
         unit = f" {symbol} ({UNITS[self.unit]})" if self.unit else ""
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
@@ -60,29 +60,28 @@ class Rule(NamedTuple):
         return {**limits, "properties": dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), inside)}
 
     def allows(self, low: float, high: float) -> bool:
-        """Return whether all values from ``low`` to ``high`` are allowed; False for NaN."""
+        """Whether all values from ``low`` to ``high`` are allowed; False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
     def check(self, quantity: Any, at: YamlPath = ()) -> None:
-        """Raise, in a pydantic validator, the error for a number or distribution out of range."""
         low, high = support(quantity)
         overlap = "; a negative gap means overlapping vehicles" if self.per == "pair" and low < 0.0 else ""
         require(self.allows(low, high), at, quantity, f"must be {self.interval}{overlap}")
 
     def count(self, vehicles: int) -> int:
-        """Return how many values the quantity has in a world."""
+        """Number of values in a world."""
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Return which random number draws the value of vehicle or pair ``index``."""
+        """Which random number draws the value of vehicle or pair ``index``."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
-        """Return the name of the column of vehicle or pair ``index``: ``gap_1_m``."""
+        """Column of vehicle or pair ``index``: ``gap_1_m``."""
         return self.column.format(index + 1)
 
     def owner(self, index: int) -> str:
-        """Return ``vehicle_1``, or ``vehicle_1 to vehicle_2`` for a pair, or an empty text for the world."""
+        """``vehicle_1``, or ``vehicle_1 to vehicle_2`` for a pair, or an empty text for the world."""
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
 
@@ -195,17 +194,16 @@ CAR_ROWS = {
 
 
 def width_of(stream: tuple[int, ...], vehicles: int) -> int:
-    """Return how many numbers a world has in a stream of quantities."""
+    """How many numbers a world has in a stream of quantities."""
     return BLOCK * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 
 def check_count(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
-    """Raise, in a pydantic validator, the error for a list that does not have ``count`` entries."""
     right = f"must have {count}, one per {per}, or be a single entry for all"
     holds = not isinstance(value, tuple) or len(value) == count
     require(holds, at, UNSHOWN, f"has {len(value) if isinstance(value, tuple) else 1} entries; {right}")
 
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, Entry]:
-    """Return the columns of a table with these quantities: ``{"gap_1_m": ("gaps_m", 0), ...}``."""
+    """Columns of a table with these quantities: ``{"gap_1_m": ("gaps_m", 0), ...}``."""
     return {RULES[key].column_of(i): (key, i) for key in keys for i in range(RULES[key].count(vehicles))}

@@ -44,7 +44,7 @@ Texts = NDArray[np.str_]
 
 
 class Drawn(NamedTuple):
-    """Worlds at the alert, and what was drawn that a state does not say."""
+    """Worlds at the alert, and what was drawn that their state does not contain."""
 
     worlds: State
     friction: Floats  # [n] of the road; NaN where it has none
@@ -55,13 +55,12 @@ class Drawn(NamedTuple):
 
     @classmethod
     def given(cls, worlds: State) -> Drawn:
-        """Return worlds of which only the state is known."""
         n = worlds.n
         return cls(worlds, np.full(n, np.nan), np.full((n, worlds.vehicles), ""), np.full(n, ""), np.full(n, ""))
 
 
 def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) -> Drawn:
-    """Return worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
+    """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
 
     World k of a mixture is world k of the member that is chosen for it. Raises ``InvalidInput`` for bad arguments, and
     for a world that is rejected in ``MOST_ATTEMPTS`` draws.
@@ -77,13 +76,13 @@ def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) ->
 
 
 def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel = "list") -> Ints:
-    """Return from which member of a mixture the worlds ``index`` [n], ascending, are drawn: its number from 0, [n]."""
+    """Member, from 0, from which each of the worlds ``index`` [n], ascending, is drawn, [n]."""
     u = numbers_of(seed, channel, 0, index)(OF_WORLD, MIXTURE)[:, 0]
     return pick([member.weight for member in scenario.mixture or ()], u)
 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
-    """Return the worlds of these random numbers, early impacts included. The scenario is no mixture."""
+    """Worlds of these random numbers, early impacts included; the scenario is no mixture."""
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
     if line is not None:
@@ -102,7 +101,7 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
 
 
 def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, load: Floats) -> Callable[[str], Floats]:
-    """Return a function: key -> values of a declared quantity, [n, entries]. ``kind`` and ``load`` are [n, N]."""
+    """Function: key -> values of a declared quantity, [n, entries]. ``kind`` and ``load`` are [n, N]."""
 
     def declared(key: str) -> Floats:
         entries = scenario.sources[key]
@@ -123,10 +122,7 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
 
 
 def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools, index: Ints) -> State:
-    """Return worlds at the alert from all their quantities, and the random numbers of their links.
-
-    With the channel of the paper a vehicle knows everything once its own latency is over.
-    """
+    """Worlds at the alert from all their quantities, and the random numbers of their links."""
     n, N = whole["speeds_mps"].shape
     line, car = np.zeros((n, layout.LINE_ROWS, N + 1)), np.zeros((n, layout.CAR_ROWS, N + 1))
     know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))
@@ -154,7 +150,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
 
 
 def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn:
-    """Return the worlds ``index``; draw those with an early impact again, if the scenario rejects them."""
+    """The worlds ``index``; if the scenario rejects early impacts, such worlds are drawn again."""
     drawn = draw_once(scenario, numbers_of(seed, channel, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn
@@ -178,14 +174,14 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
 
 
 def has_early_impact(scenario: Scenario, alert: State) -> Bools:
-    """Return whether an impact happens no later than the first learner can act, [n]: nobody can prevent it."""
+    """Whether an impact happens no later than the first learner can act, [n]: nobody can prevent it."""
     deciders = np.array(scenario.learners, np.int64)
     state = first_decision(alert, deciders, scenario.time_step_s, scenario.horizon_s)
     return np.asarray(state.line[:, COUNT].any(axis=1))
 
 
 def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
-    """Return the worlds of all parts in one, with row i of them in row ``place[i]``."""
+    """The worlds of all parts in one, with row i of them in row ``place[i]``."""
     order = np.argsort(place)
 
     def of_parts(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

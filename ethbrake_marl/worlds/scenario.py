@@ -67,7 +67,6 @@ class Member(Part):
 
 
 def _quantity(key: str, default: Any = None, **more: Any) -> Any:
-    """Return the field of a quantity."""
     return Field(default=default, description=RULES[key].meaning, **more)
 
 
@@ -164,7 +163,7 @@ class Scenario(Part):
 
     @classmethod
     def from_document(cls, document: Document) -> Self:
-        """Build a scenario from a parsed file, whose name and lines then stand in error messages."""
+        """Build a scenario from a parsed file, so that error messages show its name and lines."""
         scenario = cls.__new__(cls)
         scenario._build(document)
         return scenario
@@ -192,7 +191,6 @@ class Scenario(Part):
     @field_validator(*RULES)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        """Refuse values out of range, and a list that has not one entry per vehicle or pair."""
         rule = RULES[str(info.field_name)]
         if "vehicles" in info.data:
             check_count(value, rule.count(info.data["vehicles"]), rule.per)
@@ -226,7 +224,7 @@ class Scenario(Part):
     # ---- its worlds
 
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> State:
-        """Return worlds ``first`` to ``first + n - 1`` of the endless list of the seed, at the alert.
+        """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed, at the alert.
 
         World k is always the same, bit for bit. A seed has two independent lists: ``channel="list"`` for evaluation,
         ``"training"`` for training. Raises ``InvalidInput`` for bad arguments, and if ``early_impacts: reject`` leaves
@@ -235,7 +233,7 @@ class Scenario(Part):
         return self.draw(n, seed, first=first, channel=channel).worlds
 
     def draw(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Drawn:
-        """Return the worlds of ``sample``, their types, members and recordings, and the number of rejected draws."""
+        """The worlds of ``sample`` with types, members, recordings and the number of rejected draws."""
         return draw(self, n, seed, first, channel)
 
     # ---- who is in the line
@@ -257,12 +255,12 @@ class Scenario(Part):
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether there is an obstacle ahead of Vehicle 1, in some of the worlds at least."""
+        """Whether some of the worlds have an obstacle ahead of Vehicle 1."""
         own = not {"obstacle_gap_m", "obstacle_margin_m"}.isdisjoint(self.sources)
         return own or any(member.has_obstacle for member in self.members)
 
     def unheard(self, types: Ints | None = None) -> Bools:
-        """Return whether i never gets a message of j, [n, N, N], by the equipment of vehicles of these types [n, N].
+        """Whether i never gets a message of j, [n, N, N], by the equipment of vehicles of these types [n, N].
 
         Without types: [1, N, N], whether i may never get a message of j.
         """
@@ -274,20 +272,20 @@ class Scenario(Part):
 
     @cached_property
     def types_of_line(self) -> TypesOfLine | None:
-        """The vehicle types at each place of the line; None without types."""
+        """Vehicle types at each place of the line; None without types."""
         return None if self.vehicle_types is None else TypesOfLine(self.vehicle_types, self.types, self.vehicles)
 
     @property
     def columns(self) -> dict[str, TableColumn]:
-        """Columns of the table by name, ``recording`` among them; empty without a table."""
+        """Columns of the table by name, ``recording`` among them."""
         return {} if self.table is None else self.table.by_name
 
     @cached_property
     def sources(self) -> dict[str, list[dict[int, Any]]]:
-        """Where the values of each declared quantity come from, for each vehicle, pair or world.
+        """Sources of each declared quantity, for each vehicle, pair or world.
 
         ``sources["mass_t"]`` may be ``[{0: 2.0, 1: 9.5}, ...]``: vehicle type (0 without types) -> number, distribution
-        or column of the table. A quantity that nobody declares has no entry.
+        or column of the table.
         """
         sources = {}
         for key, rule in RULES.items():
@@ -304,7 +302,7 @@ class Scenario(Part):
         return sources
 
     def bounds(self, key: str) -> tuple[tuple[float, float], ...]:
-        """Return smallest and largest value of a quantity that every world has, for each vehicle, pair or world.
+        """Smallest and largest value of a quantity that every world has, for each vehicle, pair or world.
 
         Capacities are those on the road. A rate that nobody declares is the largest that can be declared.
         """
@@ -314,33 +312,33 @@ class Scenario(Part):
         return tuple(zip(lows.tolist(), highs.tolist(), strict=True))
 
     def ends(self, key: str) -> Floats:
-        """Return smallest and largest value of a declared quantity, [2, entries]."""
+        """Smallest and largest value of a declared quantity, [2, entries]."""
         supports = [np.array([support(quantity) for quantity in entry.values()]) for entry in self.sources[key]]
         return np.array([(ends[:, 0].min(), ends[:, 1].max()) for ends in supports]).T
 
     # ---- its content, and scenarios like it
 
     def declared(self) -> dict[str, Any]:
-        """Return what is declared as plain data: ``Scenario(**scenario.declared())`` equals the scenario."""
+        """What is declared, as plain data: ``Scenario(**scenario.declared())`` equals the scenario."""
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
-        """Return every value, defaults too, as plain data, except the keys ``without``; of members without words."""
+        """Every value, defaults too, as plain data, except the keys ``without``; of members without words."""
         without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*WORDS}}}}
         return self.model_dump(mode="json", exclude=without_words | dict.fromkeys(without, True))
 
     def replace(self, **changes: Any) -> Scenario:
-        """Return the scenario with other values: ``replace(mass_t=2.0)``, in each member if it is a mixture.
+        """The scenario with other values: ``replace(mass_t=2.0)``, in each member if it is a mixture.
 
-        A new way to declare gaps, speeds or an obstacle (``time_gaps_s``) takes the place of the old one (``gaps_m``).
-        A key that becomes None has its default again.
+        A new way to declare gaps, speeds or an obstacle (``time_gaps_s``) replaces the old one (``gaps_m``). A key that
+        becomes None has its default again.
         """
         return Scenario(**changed_content(self.declared(), changes))
 
     def with_learners(self, learners: Iterable[str]) -> Scenario:
-        """Return the scenario with exactly these learners, such as ``["vehicle_2"]``.
+        """The scenario with exactly these learners, such as ``["vehicle_2"]``; a learner left out brakes fully.
 
-        A learner that is not listed brakes fully. Raises ``InvalidInput`` for an unknown vehicle.
+        Raises ``InvalidInput`` for an unknown vehicle.
         """
         if isinstance(learners, str) or not isinstance(learners, Iterable):
             raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
@@ -349,7 +347,7 @@ class Scenario(Part):
 
 
 def plain(value: Any) -> Any:
-    """Return what a user gives as dict, list and Python numbers: any mapping or sequence, arrays, models, a View."""
+    """Plain dict, list and numbers of any mapping or sequence, array, model or View."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     if isinstance(value, View):

@@ -77,7 +77,6 @@ class Table(Part):
         return self
 
     def check_cells(self, known: Mapping[str, Entry]) -> None:
-        """Raise, in a pydantic validator, the error for a column that is not ``known``, or a bad cell."""
         hint = f"known: {', '.join((*known, RECORDING))}"
         for c, name in enumerate(self.columns):
             unknown = f"unknown column; {suggestion(name, known) or hint}"
@@ -93,7 +92,6 @@ class Table(Part):
 
     @cached_property
     def by_name(self) -> dict[str, TableColumn]:
-        """The columns by name, ``recording`` among them."""
         columns = zip(self.columns, zip(*(self.rows or ()), strict=True), strict=True)
         return {name: TableColumn(np.array(column)) for name, column in columns}
 
@@ -107,7 +105,6 @@ class CsvFile(NamedTuple):
 
     @classmethod
     def read(cls, path: Path) -> CsvFile:
-        """Read a file. Raises ``InvalidInput`` if it is no CSV file, or has no header or no row."""
         rows, line = dict[int, list[str]](), 1
         data = read_plain(path, SIZE_LIMIT)
         try:
@@ -123,7 +120,7 @@ class CsvFile(NamedTuple):
         return cls(path, [name.strip() for name in rows.pop(first)], rows)
 
     def cells(self, columns: Sequence[str]) -> list[list[float | str]]:
-        """Return the ``columns`` of each row: numbers, and texts in the column ``recording``."""
+        """The ``columns`` of each row: numbers, and texts in the column ``recording``."""
         cells: list[list[Any]] = []
         for line, row in self.rows.items():
             if len(row) != len(self.header):
@@ -139,7 +136,7 @@ class CsvFile(NamedTuple):
 
 
 def read_rows(path: Path, columns: object) -> list[list[float | str]]:
-    """Return these columns of a CSV file, which are named as in the key ``table`` of a scenario, not checked yet."""
+    """Unchecked cells of the ``columns``, which are named as in the key ``table`` of a scenario."""
     file = CsvFile.read(path)
     known = f"the columns of this file are {', '.join(file.header)}"
     if not isinstance(columns, list | tuple):

@@ -36,7 +36,7 @@ class WithLoad(Part):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Return the values of vehicles with a ``load`` in [0, 1]; ``u`` draws the spread."""
+        """Values for a ``load`` in [0, 1]; ``u`` draws the spread."""
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
         return moved if self.spread == 0.0 else moved + values(self.spread, u)
@@ -50,7 +50,6 @@ TypeQuantity = Annotated[Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, 
 
 
 def _own(key: str) -> Any:
-    """Return the field of a quantity that a type may declare."""
     return Field(default=None, exclude_if=None if key in USUAL else not_, description=RULES[key].meaning)
 
 
@@ -102,7 +101,6 @@ Types = Annotated[
 
 
 def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: int) -> None:
-    """Raise, in a pydantic validator, the error for an entry of the key ``types`` that names no declared type."""
     right = "can be used only with the key vehicle_types, which declares the types"
     require(kinds is not None, ("types",), types, right)
     check_count(types, vehicles, "vehicle", ("types",))
@@ -126,7 +124,7 @@ class TypesOfLine:
         self.possible: Bools = self.weights > 0.0  # [N, types]
 
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
-        """Return type and load of every vehicle, [n, N] each, for uniform numbers ``u`` [n, N, PER_TYPE]."""
+        """Type and load of every vehicle, [n, N] each, for uniform numbers ``u`` [n, N, PER_TYPE]."""
         types, load = np.zeros(u.shape[:2], np.int64), np.zeros(u.shape[:2])
         for i, weights in enumerate(self.weights):
             types[:, i] = pick(weights, u[:, i, 0])
@@ -136,7 +134,6 @@ class TypesOfLine:
         return types, load
 
     def unheard(self, types: Ints | None) -> Bools:
-        """Return ``Scenario.unheard``."""
         each = [kind.v2x or Equipage() for kind in self.kinds]
         silent = np.array([not one.sends for one in each])
         hears = np.array([("all", "front", "none").index(one.hears) for one in each])
