@@ -19,7 +19,6 @@ class Ppo(Algorithm):
     """PPO of Stable-Baselines3. Actor and critic are separate networks."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
-        """Return a new model; the scheme decides whose policies it has."""
         recipe = training.recipe
         assert isinstance(recipe, PpoRecipe)
         shape = recipe.network
@@ -52,5 +51,4 @@ class Ppo(Algorithm):
         return PPO("MlpPolicy", environment, policy_kwargs=network, **settings)
 
     def actors(self, model: BaseAlgorithm) -> list[BasePolicy]:
-        """Return the policy of all learners, or of each independent one."""
         return [*model.policy.policies] if isinstance(model, IndependentPPO) else [model.policy]

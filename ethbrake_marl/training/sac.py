@@ -14,7 +14,6 @@ class Sac(Algorithm):
     """SAC of Stable-Baselines3."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> SAC:
-        """Return a new model."""
         recipe = training.recipe
         assert isinstance(recipe, SacRecipe)
         shape, learned = recipe.network, recipe.ent_coef == "auto"
