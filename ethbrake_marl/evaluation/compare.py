@@ -38,13 +38,11 @@ class Comparison:
     changed: Mapping[str, tuple[Any, Any]]  # setting, package, policy or digest -> its values, where they differ
 
     def sheet(self) -> Sheet:
-        """Return the table, with the notes below it."""
         rows = [(agent, *harms.values()) for agent, harms in self.differences.items()]
         heads = [Column("First-impact harm", HARMS[0]), Column("Total harm", HARMS[1])]
         return Sheet("", ["Agent", *heads], rows, "\n".join(self.notes()))
 
     def notes(self) -> Iterator[str]:
-        """Yield what to say below the table."""
         how = "paired by world"
         if self.unpaired_because:
             how = f"NOT paired by world, so wider than paired intervals: {self.unpaired_because}"
@@ -57,7 +55,6 @@ class Comparison:
             yield f"Note: {name}: {_shown(one)} in the first result, {_shown(other)} in the second."
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain data."""
         return {
             "intervals": "unpaired" if self.unpaired_because else "paired",
             "unpaired_because": self.unpaired_because or None,

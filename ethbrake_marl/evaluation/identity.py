@@ -1,6 +1,6 @@
 """Identity of a result: digests of worlds, scenario, physics and policies, and versions of software.
 
-Results can be compared if their worlds and scenarios are the same. Other physics or versions are reported.
+Results can be compared if worlds and scenarios are the same. Other physics or versions are reported.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def worlds_sha256(worlds: State) -> str:
 
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
-    """Return what a result should say of a ``Scenario``, and of the seed of its worlds; for ``evaluate(about=...)``."""
+    """Return what a result should say of a scenario and the seed of its worlds; for ``evaluate(about=...)``."""
     content = json.dumps(scenario.content(without=WORDS), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
     about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
@@ -41,7 +41,7 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python and of every package that affects a result, those of extensions included.
+    """Return name -> version of Python and of every package that affects a result, those of extensions included.
 
     With them the SHA-256 of each Python file of the user that this process ran.
     """
@@ -50,6 +50,6 @@ def versions() -> dict[str, str]:
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Return the SHA-256 of the manifest of each vehicle's policy; vehicles without a policy of ours are left out."""
+    """Return vehicle -> SHA-256 of its policy's manifest, for policies of this package."""
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
     return {f"vehicle_{body}": each.manifest_sha256 for body, each in manifests.items() if each is not None}

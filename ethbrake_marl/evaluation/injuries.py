@@ -25,7 +25,6 @@ class Injuries:
         self.curve, self.changes = curve, np.zeros((alert.n, 2, alert.vehicles))
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Look at the impacts between two states."""
         self.changes = np.maximum(self.changes, speed_changes(before, after))
 
     def result(self, last: State) -> Given:
