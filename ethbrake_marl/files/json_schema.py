@@ -14,24 +14,22 @@ class FileSchema(GenerateJsonSchema):
     """JSON Schema generator for files in which no value may be ``null``: a key without a value is left out."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
-        """Return the JSON schema of an optional value, without ``null``. Pydantic calls this method."""
         return self.generate_inner(schema["schema"])
 
     def default_schema(self, schema: WithDefaultSchema) -> JsonSchemaValue:
-        """Return the JSON schema of a value with a default, without ``"default": null``. Pydantic calls this method."""
         described = super().default_schema(schema)
         return {key: value for key, value in described.items() if key != "default" or value is not None}
 
     @staticmethod
     def publish(schema: dict[str, Any]) -> dict[str, Any]:
-        """Return a copy of ``schema`` that begins with the version of the JSON Schema language (``$schema``)."""
+        """Return a schema that begins with ``$schema``."""
         return {"$schema": DIALECT, **schema}
 
 
 def schema_lines(kind: str, command: str) -> str:
-    """Return comment lines for a new YAML file that name its JSON schema and the command that prints this schema.
+    """Return comment lines for a new YAML file that name its schema and the command that prints it.
 
-    ``kind`` is ``scenario`` or ``recipe``; ``command`` is a subcommand of ``ethbrake`` such as ``scenario schema``.
+    ``kind`` is ``scenario`` or ``recipe``; ``command`` is a subcommand such as ``scenario schema``.
     """
     return (
         f"# yaml-language-server: $schema={kind}.schema.json\n"

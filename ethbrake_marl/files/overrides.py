@@ -1,4 +1,4 @@
-"""Settings ``key.path=value`` from the command line: parse the values as YAML, and insert them into plain data."""
+"""Settings ``key.path=value`` from the command line, with values in YAML."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ethbrake_marl.files.yaml import flow_text, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """A setting from the command line, such as ``reward.harm=0.5``, split into path and value."""
+    """A setting such as ``reward.harm=0.5``, split into path and value."""
 
     text: str  # the setting as written
     path: tuple[str, ...]  # keys that lead to the value, the outermost first; indices (from 0) inside lists
@@ -21,16 +21,16 @@ class Override:
 
     @property
     def top(self) -> str:
-        """The first key of the setting's path: ``reward`` for ``reward.harm=0.5``."""
+        """First key: ``reward``."""
         return self.path[0]
 
     @property
     def key(self) -> str:
-        """The path of the setting, with dots between the keys: ``reward.harm`` for ``reward.harm=0.5``."""
+        """Whole path: ``reward.harm``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """Return the setting without the first key of its path: ``harm=0.5`` for ``reward.harm=0.5``."""
+        """Return the setting without its first key: ``harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
@@ -67,9 +67,9 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Return a copy of ``part`` (a mapping, list or other value) in which ``path`` has the value of ``override``.
+    """Return a copy of ``part`` with the value of ``override`` at ``path``, the end of ``override.path``.
 
-    ``path`` is the end of ``override.path``, counted from ``part``. Missing mappings along the path are created.
+    Missing mappings along the path are created.
     """
     if not path:
         return override.value
