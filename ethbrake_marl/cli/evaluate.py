@@ -93,7 +93,6 @@ def evaluate_command(
 def _compared(
     out: Out, scenario: str, chosen: Settings, agents: str, episodes: int, seed: int, jobs: int | None
 ) -> Compared:
-    """Return what the agents do in one scenario."""
     from ethbrake_marl.evaluation.compared import Compared
     from ethbrake_marl.names import teams_of
 

@@ -1,4 +1,4 @@
-"""Registry of the functions that draw pages and pictures for commands; extensions register their functions here."""
+"""Registry of the functions with which extensions draw pages and pictures for commands."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ethbrake_marl.registry import Registry
 def register_page(shows: str, write: Callable[..., None]) -> None:
     """Register the function that a command calls to write its page (a report) or its picture.
 
-    An installed package registers its function with an entry point of the group ``ethbrake_marl.pages``.
+    Entry points: ``ethbrake_marl.pages``.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``), ``"worlds"`` (``scenario sample``) or
@@ -29,10 +29,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_of(shows: str, option: str) -> Callable[..., None]:
-    """Return the registered function that writes the page about ``shows``.
-
-    Raises ``InvalidInput``, whose message begins with the command's ``option``, if no such function is registered.
-    """
+    """Return the function that writes a page. Without one, raise ``InvalidInput``, which begins with ``option``."""
     if shows not in PAGES:
         raise InvalidInput(f"{option}: the extension that draws this page ({shows}) is not installed")
     return PAGES[shows]

@@ -19,15 +19,12 @@ NO_SETTING = {"name", "title", "description", "source"}  # words, which cannot b
 
 
 class Settings(NamedTuple):
-    """Settings of a command, by their owner."""
-
     texts: tuple[str, ...]  # as written
     scenario: list[Override]
     recipe: list[Override]
     command: Mapping[str, Any]  # such as harm_count: total
 
     def change_scenario(self, name_or_path: str) -> Scenario:
-        """Return the scenario with these settings."""
         scenario = load_scenario(name_or_path)
         if not self.scenario:
             return scenario
@@ -35,7 +32,6 @@ class Settings(NamedTuple):
         return scenario.replace(**Override.put(content, self.scenario))
 
     def change_recipe(self, recipe: TrainingRecipe) -> TrainingRecipe:
-        """Return the recipe with these settings."""
         return recipe.replace(**Override.put(recipe.model_dump(mode="json"), self.recipe)) if self.recipe else recipe
 
 
