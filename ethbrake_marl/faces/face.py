@@ -35,7 +35,6 @@ class Face:
             raise InvalidInput(f"scenario {self.scenario.name!r} has no learner; pass learners=['vehicle_2']")
 
     def _begin(self, n: int, seed: int | None, options: Any) -> State:
-        """Start episodes in n worlds."""
         self.episode = self.stream.reset(n, seed, options)
         self.renderer.began(self.episode)
         return self.episode
@@ -71,13 +70,12 @@ class Face:
         return self.stream.describe(self._begun("describe_worlds"))
 
     def describe_world(self) -> dict[str, Any]:
-        """Return what was drawn for the first running world: a name such as ``gap_1_m`` or ``scenario`` -> value."""
+        """Return the values of ``describe_worlds`` for the first world."""
         return {name: column[0].item() for name, column in self.describe_worlds().items()}
 
     def render(self) -> Any:
-        """Return a picture, as the render mode has it; a tuple of many worlds."""
+        """Return what the render mode promises."""
         return self.renderer.render()
 
     def close(self, **kwargs: Any) -> None:
-        """Give back what the render mode holds."""
         self.renderer.close()

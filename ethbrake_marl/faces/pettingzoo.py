@@ -93,11 +93,9 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return self.possible_agents[:] if running else []
 
     def observation_space(self, agent: str) -> Any:
-        """Return the space of an agent's observations."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Any:
-        """Return the space of an agent's actions."""
         return self.action_spaces[agent]
 
     def reward_space(self, agent: str) -> Any:

@@ -16,7 +16,7 @@ ENTRIES: dict[str, Any] = {
 
 
 def register_environments() -> None:
-    """Register the environments' ids. Further calls have no effect. Raises ``MissingExtra`` for an old PettingZoo."""
+    """Register the environments' ids, once. Raises ``MissingExtra`` for an old PettingZoo."""
     import gymnasium  # imported here, because the import takes time
     import pettingzoo
 
