@@ -130,8 +130,6 @@ def compare(harm, known):
 
 
 class Memory(NamedTuple):
-    """What the agent decided at the alert."""
-
     command: Floats  # [n] m/s2
     predicted_harm: Floats  # [n] m2/s2
 
@@ -169,7 +167,6 @@ class EV2XBM:
         return Memory(command, last_if_held(alert, self.rules).harm(self.count))
 
     def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
-        """Return the command, and the memory as it was."""
         return memory.command, memory
 
 
@@ -184,7 +181,6 @@ class EV2XBMPairwise:
         return Memory(-deceleration, harm)
 
     def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
-        """Return the command, and the memory as it was."""
         return memory.command, memory
 
 

@@ -1,4 +1,4 @@
-"""Models of other libraries: how each kind is asked, and what it brings that is applied or refused.
+"""Models of other libraries: how to ask each kind, and what it brings along, which is applied or refused.
 
 Nothing here imports torch or Stable-Baselines3; onnxruntime is imported to open a file.
 """
@@ -39,10 +39,10 @@ INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """Return how a policy without a memory is asked.
+    """Return how to ask a policy without a memory.
 
-    Raises ``InvalidInput``, which begins with ``who``, for another kind, and for a model that would not act alike in
-    every batch.
+    Raises ``InvalidInput``, which begins with ``who``, for another kind, and for a model whose actions would depend on
+    chance or on the batch.
     """
     if isinstance(policy, bytes) or (hasattr(policy, "run") and hasattr(policy, "get_inputs")):
         return ask_onnx
@@ -62,7 +62,6 @@ def ask_of(policy: Any, who: str) -> Ask:
 
 
 def ask_function(function: Any, seen: Observations) -> Any:
-    """Return what a function answers."""
     return function(seen)
 
 
@@ -85,7 +84,6 @@ def ask_model(model: Any, seen: Observations) -> Any:
 
 
 def ask_torch(module: Any, seen: Observations) -> Any:
-    """Return what a torch module answers, without gradients."""
     torch = sys.modules["torch"]
     parameter = next(iter(module.parameters()), None)
     with torch.no_grad():
@@ -100,7 +98,7 @@ def ask_onnx(session: Any, seen: Observations) -> Any:
 
 
 def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
-    """Return the content of an ``.onnx`` file, which is an ONNX model that can be pickled."""
+    """Return the content of an ``.onnx`` file, which can be pickled."""
     file = Path(path).expanduser()
     if file.suffix != ".onnx":
         raise InvalidInput(
@@ -111,7 +109,7 @@ def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
 
 
 def session_of(given: Any) -> Any:
-    """Return the session of the content of an ONNX file, or the one that is given."""
+    """Return the session of the content of an ONNX file, or ``given`` if it is one."""
     return _opened(given) if isinstance(given, bytes) else given
 
 
@@ -138,7 +136,7 @@ def _refuse_training_mode(module: Any, who: str) -> None:
 
 
 def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
-    """Return the names of the features that a model was trained on, where it brings them; None: it does not."""
+    """Return the names of the features that a model was trained on, or None if it does not bring them."""
     if ask is ask_onnx:
         listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(listed.split(",")) if listed else None
@@ -168,15 +166,14 @@ def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
 
 
 def statistics_of(model: Any) -> Any:
-    """Return the ``VecNormalize`` of a model of Stable-Baselines3; None: it has none."""
+    """Return the ``VecNormalize`` of a model of Stable-Baselines3, or None."""
     return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
 def check_wrappers(policy: Any, who: str) -> None:
     """Raise ``InvalidInput`` if a model was trained under a wrapper that may change what it sees or does.
 
-    The wrapper of its environment is named. A model from a file may show that it has lost the statistics of its
-    ``VecNormalize``.
+    A model from a file may show that it has lost the statistics of its ``VecNormalize``.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else layers_of(env):

@@ -18,11 +18,9 @@ class Held(NamedTuple):
     knows: str = SENSORS
 
     def begin(self, alert: State, body: int) -> Floats:
-        """Return the command, [n] m/s2."""
         return first_command(self.name, alert.car[:, BRAKING, body])
 
     def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
-        """Return the command, which is the memory."""
         return memory, memory
 
 
