@@ -1,7 +1,7 @@
 """The paper's hybrid (Algorithm 1): at the alert, a policy or E-V2X-BM gets the whole episode, whoever does less harm.
 
-The policy is played from the alert on; its harm is compared with H*, the harm of E-V2X-BM's constant deceleration. With
-the coupled H*, which is the price of this deceleration, the harm of the episode is the smaller of both numbers, to the
+The harm of the policy, played from the alert on, is compared with H*, the harm of E-V2X-BM's constant deceleration.
+With the coupled H*, which is the price of this deceleration, the harm of the episode is the smaller of both, to the
 last bit, if the policy drives again as it was played (a policy with random actions does not). With the paper's own
 pairwise H* nothing is bounded: it is about half of the harm that this deceleration does.
 """
@@ -31,8 +31,6 @@ ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the a
 
 
 class Memory(NamedTuple):
-    """What the shield remembers of n episodes with one learner."""
-
     chosen: Bools  # [n] whether the policy drives
     policy_harm: Floats  # [n] harm of the policy's play (m2/s2)
     bound_harm: Floats  # [n] H* (m2/s2)
@@ -97,7 +95,7 @@ class EpisodeShield:
         )
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Return what users may want to know: name -> [n] or [n, N]."""
+        """Return name -> [n] or [n, N]."""
         memory: Memory = state.memories["shield"]
         return {
             "chosen_policy": memory.chosen,

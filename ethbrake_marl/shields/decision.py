@@ -1,4 +1,4 @@
-"""What every shield reports of its last decision, and the term of a reward that counts replaced actions."""
+"""What every shield reports of its last decision, and the reward term that counts replaced actions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ShieldReason(IntEnum):
 
     @property
     def text(self) -> str:
-        """Reason in words, such as "no certificate"."""
+        """Such as "no certificate"."""
         return self.name.lower().replace("_", " ")
 
 
@@ -56,7 +56,6 @@ def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:
 
 
 def check_harm_count(count: str) -> None:
-    """Raise ``InvalidInput`` for an unknown count of harm."""
     check_count("shield: harm_count", count)
 
 
