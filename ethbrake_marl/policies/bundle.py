@@ -64,7 +64,6 @@ def _read(file: Path) -> bytes:
 
 
 def _bundle_in(path: Path) -> Path:
-    """Return the folder of the bundle: ``path``, or its folder ``policy``."""
     folders = [folder for folder in (path, path / "policy") if os.path.isdir(folder)]  # no errors
     for folder in folders:
         if LIMITS_BYTES.keys() & set(os.listdir(folder)):
@@ -83,7 +82,7 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def load_shipped(name: str) -> Policy:
-    """Return the shipped policy ``name``, such as ``universal``. Raises ``UnknownName``."""
+    """Return a shipped policy, such as ``universal``. Raises ``UnknownName``."""
     folders = shipped_policies()
     if name not in folders:
         raise unknown_name("shipped policy", name, folders)

@@ -56,7 +56,6 @@ class FeatureDefinition(Finite):
 
     @classmethod
     def of_own(cls, name: str, own: Own) -> Self:
-        """Return what a file says of a feature."""
         feature = own.feature
         return cls(
             name=name, of=own.of, unit=feature.unit, scale=feature.scale, low=feature.low, high=feature.high,
@@ -75,7 +74,6 @@ class ObservationSchema(Finite):
 
     @classmethod
     def of(cls, view: View) -> Self:
-        """Return what a file says of an observation."""
         scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in view.features]
         split = [name.rpartition(".") for name in view.names]
         sides = [side_of(name.partition(".")[0]) or 0 for name in view.names]
@@ -122,12 +120,12 @@ class ObservationSchema(Finite):
 
 
 def _is_ours(own: Own) -> bool:
-    """Return whether a feature belongs to this package, which changes it knowingly only."""
+    """Return whether this package has the feature, which then never changes by accident."""
     return str(getattr(own.function, "__module__", "")).startswith("ethbrake_marl.")
 
 
 def _tried(own: Own) -> tuple[float, ...]:
-    """Return what vehicles of a line observe of a feature, in one world if it belongs to this package, or in three."""
+    """Return what vehicles of a line observe of a feature: in one world if this package has it, or in three."""
     state = _trial_worlds()
     if _is_ours(own):
         state = state.take(slice(1))

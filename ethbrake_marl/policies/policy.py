@@ -55,12 +55,10 @@ class Policy:
 
     @cached_property
     def actor(self) -> Actor:
-        """What computes the actions."""
         return Actor(self.manifest.network, self.tensors)
 
     @cached_property
     def observation(self) -> View:
-        """What the policy observes."""
         return View(self.manifest.observation.features)
 
     def __call__(self, observations: Float32s) -> Float32s:
@@ -109,12 +107,11 @@ def _own_sha256(manifest: Manifest) -> str:
 
 
 def serialised(tensors: Mapping[str, Float32s]) -> bytes:
-    """Return the file of these tensors."""
     return safetensors.numpy.save({name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()})
 
 
 def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
-    """Return the tensors of a file, read-only, by name.
+    """Return name -> read-only tensor of a file.
 
     Raises ``ValueError`` for a tensor whose name or shape is not the network's, or an entry that is not finite.
     """
