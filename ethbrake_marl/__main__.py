@@ -1,4 +1,4 @@
-"""Entry point of ``python -m ethbrake_marl``, which runs the same command line as the script ``ethbrake``."""
+"""``python -m ethbrake_marl``: the same as the command ``ethbrake``."""
 
 from ethbrake_marl.cli.app import main
 

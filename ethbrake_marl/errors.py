@@ -19,11 +19,10 @@ _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """Return ``text`` with unprintable characters written as Python escapes, safe to show in a terminal.
+    """Return ``text`` with unprintable characters as Python escapes, except the space and the characters in ``keep``.
 
-    Control characters, separators and characters that set the direction of text are escaped, except the space and the
-    characters in ``keep``. Without these escapes, names and paths from files could move the cursor or print a line
-    backwards.
+    Control characters, separators and characters that set the direction of text are escaped: names and paths from files
+    could otherwise move the cursor or print a line backwards.
     """
     if text.isprintable():
         return text
@@ -31,7 +30,7 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str) -> str:
-    """Return ``text`` as one line of ``plain_text``; text longer than ``LINE_LIMIT`` is shortened in the middle.
+    """Return one line of ``plain_text``; a text longer than ``LINE_LIMIT`` is shortened in the middle.
 
     The beginning (what is wrong, and where) and the end (what would be right) are kept.
     """
@@ -43,15 +42,15 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Return a number and its noun (``thing``, in the singular) as text, such as ``1 world`` or ``10,000 worlds``."""
+    """Return a number and its noun (``thing``, in the singular), such as ``1 world`` or ``10,000 worlds``."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
-    """Describe an exception from the user's code in a few words, with the number of the line of code that raised it.
+    """Describe an exception from the user's code in a few words, with the line that raised it.
 
-    The last line of the user's file ``path`` in the traceback is reported; if ``path`` is None, the innermost line. If
-    the exception is an error of this package, the description is only its message.
+    That is the last line of the user's file ``path`` in the traceback; None: the innermost line. An error of this
+    package is described by its message only.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -81,7 +80,6 @@ class EthBrakeError(Exception):
     """
 
     def __str__(self) -> str:
-        """Return the message, shortened by ``one_line``."""
         return one_line(super().__str__())
 
 
@@ -94,11 +92,11 @@ class UnknownName(InvalidInput):
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
-    """A file or a registered name exists already. With ``force`` (``--force``) an existing file is overwritten."""
+    """A file or a registered name exists already. ``force`` (``--force``) overwrites a file."""
 
 
 class CorruptBundle(EthBrakeError, ValueError):
-    """A policy bundle is damaged, or the file is not a policy bundle; nothing was loaded from it."""
+    """A policy bundle is damaged, or is none; nothing was loaded from it."""
 
 
 _EXTRA_OF = {
@@ -126,7 +124,7 @@ class MissingExtra(EthBrakeError, ImportError):
 
 @contextmanager
 def naming_extras() -> Iterator[None]:
-    """Context manager: raise ``MissingExtra`` if an import in the block fails because an optional extra is missing.
+    """Raise ``MissingExtra`` if an import in the block fails because an optional extra is missing.
 
     Any other import error is raised unchanged.
     """
@@ -140,7 +138,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` if ``package``, a package of an optional extra, is not installed; do not import it."""
+    """Raise ``MissingExtra`` unless ``package``, of an optional extra, is installed; do not import it."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -153,8 +151,8 @@ def _missing(package: str) -> MissingExtra:
 class PhysicsError(EthBrakeError, ArithmeticError):
     """Some worlds of a batch could not be simulated. The cause is a defect of the physics kernel, never of the input.
 
-    A caller may compute the batch again without the failed worlds, which do not affect the others. ``worlds`` maps the
-    number of each failed world in its list (a world that the caller has made: its row in the batch) to the reason.
+    A caller may compute the batch again without the failed worlds, which do not affect the others. ``worlds``: number
+    of each failed world in its list (or its row in the batch, if the caller made it) -> reason.
     """
 
     def __init__(self, worlds: Mapping[int, str]) -> None:
@@ -170,8 +168,8 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 class AgentFailed(InvalidInput):
     """An agent of the user raised an exception or returned no valid actions; the message names agent, world and step.
 
-    ``row`` is the row of the world in the batch; None if it is unknown. ``reason`` says what the agent did wrong, and
-    at which step.
+    ``row``: row of the world in the batch; None if it is unknown. ``reason``: what the agent did wrong, and at which
+    step.
     """
 
     def __init__(self, agent: str, row: int | None, reason: str) -> None:
@@ -185,7 +183,7 @@ class AgentFailed(InvalidInput):
     @staticmethod
     @contextmanager
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
-        """Context manager: if the block raises ``AgentFailed``, replace the agent's name in the error by ``name``.
+        """If the block raises ``AgentFailed``, replace the agent's name in the error by ``name``.
 
         ``others`` are the names of the other vehicles' agents, which stay in their errors.
         """
@@ -198,18 +196,18 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """Warning: a trained policy or a table of best known harm is from other worlds or other physics."""
+    """A trained policy or a table of best known harm is from other worlds or other physics."""
 
 
 class FreeImpacts(UserWarning):
-    """Warning: an objective gives an impact no weight, so that to cause the impact costs nothing."""
+    """An objective gives an impact no weight, so that causing it costs nothing."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
     """Return the error for an unknown name; its message shows a similar name, or all known names.
 
-    ``kind`` says what the name should denote, for example ``scenario``. ``may_be_own`` means that users can register
-    names of this kind; the message then says that such a name must first be registered or installed.
+    ``kind`` says what the name should denote, such as ``scenario``. ``may_be_own``: users can register names of this
+    kind; the message then says that such a name must first be registered or installed.
     """
     names = sorted({*known})
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
@@ -219,10 +217,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit).
-
-    The error message begins with ``what``, the name of the value.
-    """
+    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]. Messages call it ``what``."""
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
@@ -230,7 +225,7 @@ def check_whole_number(what: str, value: object, least: int, most: int | None = 
 
 
 def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
-    """Raise ``InvalidInput``, whose message ends with ``advice``, unless the scenario has exactly one learner."""
+    """Raise ``InvalidInput``, which ends with ``advice``, unless there is exactly one learner."""
     if len(learners) != 1:
         raise InvalidInput(
             f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"

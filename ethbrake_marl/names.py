@@ -68,8 +68,6 @@ class AgentSettings:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of a table."""
-
     make: Callable[..., Any]  # (argument, settings) -> agent or team; of a wrapper: (team, argument, settings) -> team
     about: str
     knows: str
@@ -159,14 +157,14 @@ def wrapped(team: Team, wrapper: str, settings: AgentSettings) -> Team:
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
-    """Return a team for all learners of a scenario. A single agent drives each of them, with memories of their own."""
+    """Return a team for all learners of a scenario. A single agent drives each of them, with separate memories."""
     if isinstance(driver, Team):
         return driver
     return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Return the teams that names stand for, spec -> team. A text may list several, with commas; groups are resolved.
+    """Return spec -> team. A text may list several specs, with commas; groups are resolved.
 
     Raises the errors of ``make_agent``, and ``InvalidInput`` for a spec that is listed twice.
     """
@@ -180,7 +178,7 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
 
 
 def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Return name -> team of whatever stands for agents: names, or a mapping of names to agents.
+    """Return name -> team of whatever stands for agents.
 
     ``agents`` is a text or list as in ``make_teams``; or a mapping from names of your own to specs, agents, teams, or
     mappings from vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises
@@ -233,7 +231,6 @@ def split_specs(text: str) -> list[str]:
 
 
 def _path_exists(text: str) -> bool:
-    """Return whether a spec ends with a path that exists."""
     core = text
     while core.rpartition("+")[2].partition(":")[0] in WRAPPERS:
         core = core.rpartition("+")[0]
@@ -306,7 +303,6 @@ def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | Non
 
 
 def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any]:
-    """Return the function of a Python file that makes an agent."""
     function = load_from_file(match["file"], match["name"], reads=settings.policy)
     if not callable(function):
         raise InvalidInput(
@@ -357,7 +353,7 @@ def open_game(
 
 
 def check_learners(scenario: Scenario) -> None:
-    """Raise ``InvalidInput`` if no vehicle learns, so that agents could drive nobody."""
+    """Raise ``InvalidInput`` if no vehicle learns."""
     if not scenario.learners:
         raise InvalidInput(
             f"scenario {scenario.name!r} has no learner that the agents could drive; choose the scenario that the"
@@ -367,7 +363,7 @@ def check_learners(scenario: Scenario) -> None:
 
 
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
-    """Return the scripts of a scenario that look at the state, body -> agent."""
+    """Return body -> agent of the scripts that look at the state."""
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
         if role.partition(":")[0] not in (LEARNER, *HELD):

@@ -27,13 +27,13 @@ class WorkerLost(EthBrakeError):
 
 
 def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
-    """Run function calls in parallel and yield their results in the order of the calls.
+    """Run function calls in parallel; yield their results in the order of the calls.
 
     Inside ``joblib.parallel_config(backend=...)`` the calls run where this says, for instance on a cluster of Ray.
 
     Args:
-        calls: tuples (function, argument, ...) with module-level functions. From a generator, each tuple is taken
-            shortly before the call starts.
+        calls: tuples (function, argument, ...) with module-level functions. A generator's tuples are taken shortly
+            before their calls start.
         jobs: number of calls that run at once; None or 1: one after the other, in this process.
 
     Raises the error that a call raised, ``WorkerLost`` if a process is killed, ``InvalidInput`` if a call cannot be
@@ -81,7 +81,7 @@ def _pickled(call: Call) -> bytes:
 
 
 def _answer(call: bytes) -> Any:
-    """Run a pickled call in a worker and return its result; printed text goes to stderr."""
+    """Run a pickled call in a worker; printed text goes to stderr."""
     _end_with_parent()
     with redirect_stdout(sys.stderr):
         function, *arguments = pickle.loads(call)
