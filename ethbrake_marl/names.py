@@ -338,13 +338,7 @@ def open_game(
 ) -> tuple[Scenario, Game]:
     """Return a scenario and its game, in which roles that name agents are played by these.
 
-    Args:
-        scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
-        learners: names of the vehicles that learn; None: the scenario's.
-        reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: features of all vehicles, or vehicle -> features; None: the scenario's.
-        reward_vector: components of a vector reward (``episode.terms``).
-
+    Arguments are those of ``EthBrakeParallelEnv``.
     """
     loaded = load_scenario(scenario)
     if learners is not None:

@@ -59,8 +59,8 @@ def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) 
 def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
     """Return the best decelerations and their harms under this count and the one that decides ties, [n, 3].
 
-    All decelerations of a world are split into equal parts, then again and again the parts that may hold a better one.
-    A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
+    All decelerations of a world are split into equal parts, then again and again those parts that may hold a better
+    one. A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
     """
     best = np.full((alert.n, 3), np.inf)
     rows, step = np.arange(alert.n), alert.car[:, BRAKING, body] / FIRST_PARTS
@@ -137,7 +137,7 @@ class Memory(NamedTuple):
 class EV2XBM:
     """Brakes with the choice of ``coupled``; assumes that the other learners brake fully.
 
-    The harm that it predicts is, to the last bit, the harm of the episode in which they do.
+    If they do, the harm that it predicts is, to the last bit, the harm of the episode.
 
     Args:
         rules: of the episodes.

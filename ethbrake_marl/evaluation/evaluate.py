@@ -117,13 +117,13 @@ def evaluate(
         worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State``, whose recordings are not known.
         agents: name in tables -> team, which drives all learners of the game.
         game: game of the worlds' scenario.
-        measures: measures beside the usual ones, for instance ``measures_called("pushed_m,injury")``.
+        measures: beside the usual ones, for instance ``measures_called("pushed_m,injury")``.
         jobs: number of processes.
         about: what else tables and files should say (``identity.about_scenario``).
         on_done: called with the number of worlds that all teams have driven so far.
 
-    Raises ``InvalidInput`` for worlds that are not at the alert or have another number of vehicles, for a team that
-    does not fit, and for bad commands of an agent; ``PhysicsError`` if a check of the physics fails.
+    Raises ``InvalidInput`` for worlds that are not at the alert or do not fit the game, for a team that does not fit,
+    for measures whose names clash, and for bad commands of an agent; ``PhysicsError`` if a check of the physics fails.
 
     """
     if jobs is not None:

@@ -143,7 +143,7 @@ def resume(
         directory: folder of the run.
         measure: as in ``train``.
         on_progress: as in ``train``.
-        other_versions: accept a checkpoint that other versions of packages, or another physics, have written.
+        other_versions: accept a checkpoint of other versions of packages, or of another physics.
 
     Raises ``InvalidInput`` if the folder has no training or a finished one, if another process is training in it, if
     ``config.json`` has changed since the checkpoint, or for other versions.
