@@ -33,10 +33,10 @@ TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
     """Return the constant deceleration of vehicle ``body`` that does the least harm, in every world, and this harm.
 
-    All others hold ``alert.wanted``. ``count``: what is minimised (``episode.counts``). If the choice
-    of the closed form does no harm, it is the result. If several do equally little, the least harm of the other count
-    decides, then the middle one. As a function of the deceleration the harm has kinks and jumps: it is not proven that
-    no deceleration between two samples does less.
+    All others hold ``alert.wanted``. ``count``: what is minimised (``episode.counts``). If the choice of the closed
+    form does no harm, it is the result. If several do equally little, the least harm of the other count decides, then
+    the middle one. As a function of the deceleration the harm has kinks and jumps: it is not proven that no
+    deceleration between two samples does less.
     """
     braking = np.maximum(-alert.wanted, 0.0)
     braking[:, body] = alert.car[:, BRAKING, body]

@@ -1,4 +1,4 @@
-"""Agents that drive with policies: of our bundles, and of any other library."""
+"""Agents that drive with policies of this package, or of any other library."""
 
 from __future__ import annotations
 
@@ -168,7 +168,6 @@ class PolicyAgent:
 
 
 def to_array(value: Any) -> NDArray[Any]:
-    """Return an array, tensor or sequence as an array."""
     try:
         return np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
     except ValueError:  # lists of different lengths, or a tuple of arrays
