@@ -1,8 +1,8 @@
 """Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
 Importing the package registers ``EthBrake-v1`` with Gymnasium and ``ethbrake/ethbrake-v1`` with PettingZoo. Each public
-name is imported from the block ``if TYPE_CHECKING`` when it is first used, so torch and matplotlib are loaded only if
-they are needed.
+name is imported when it is first used, so torch and matplotlib are loaded only if they are needed. The block under
+``if TYPE_CHECKING`` lists every public name once, for type checkers and for the import at run time.
 """
 
 from __future__ import annotations
@@ -97,13 +97,13 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "t
 
 
 def _usable() -> list[str]:
-    """Public names that can be imported with the packages that are installed."""
+    """Return the public names whose packages are installed. Importing another one raises ``MissingExtra``."""
     missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
     return [name for name in _HOMES if name not in missing]
 
 
 def _import_public(name: str) -> Any:
-    """Import the public name ``name`` on first use."""
+    """The package's ``__getattr__``."""
     if name == "__all__":
         return ["__version__", *_usable()]
     if name not in _HOMES:

@@ -1,4 +1,4 @@
-"""Run the command line: ``python -m ethbrake_marl``."""
+"""``python -m ethbrake_marl``: the same as the command ``ethbrake``."""
 
 from ethbrake_marl.cli.app import main
 

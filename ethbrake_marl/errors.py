@@ -19,9 +19,10 @@ _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """Text with unprintable characters written as Python escapes, except the space and those in ``keep``.
+    """Return ``text`` with unprintable characters as Python escapes, except the space and the characters in ``keep``.
 
-    Otherwise names and paths from files could move the cursor of a terminal or print a line backwards.
+    Control characters, separators and characters that set the direction of text are escaped: names and paths from files
+    could otherwise move the cursor or print a line backwards.
     """
     if text.isprintable():
         return text
@@ -29,7 +30,7 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str) -> str:
-    """One line of ``plain_text``, shortened in the middle to ``LINE_LIMIT``.
+    """Return one line of ``plain_text``; a text longer than ``LINE_LIMIT`` is shortened in the middle.
 
     The beginning (what is wrong, and where) and the end (what would be right) are kept.
     """
@@ -41,15 +42,15 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Number and noun, such as ``1 world`` or ``10,000 worlds``."""
+    """Return a number and its noun (``thing``, in the singular), such as ``1 world`` or ``10,000 worlds``."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
-    """Exception from the user's code in a few words, with the number of the line of code that raised it.
+    """Describe an exception from the user's code in a few words, with the line that raised it.
 
-    It is the last line of the user's file ``path`` in the traceback; if ``path`` is None, the innermost line. An error
-    of this package is described by its message only.
+    That is the last line of the user's file ``path`` in the traceback; None: the innermost line. An error of this
+    package is described by its message only.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -90,7 +91,7 @@ class UnknownName(InvalidInput):
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
-    """A file or a registered name exists already. With ``force`` (``--force``) a file is overwritten."""
+    """A file or a registered name exists already. ``force`` (``--force``) overwrites a file."""
 
 
 class CorruptBundle(EthBrakeError, ValueError):
@@ -121,7 +122,10 @@ class MissingExtra(EthBrakeError, ImportError):
 
 @contextmanager
 def naming_extras() -> Iterator[None]:
-    """Raise ``MissingExtra`` if an import in the block fails because an optional extra is missing."""
+    """Raise ``MissingExtra`` if an import in the block fails because an optional extra is missing.
+
+    Any other import error is raised unchanged.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
@@ -132,7 +136,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` if ``package`` is not installed; do not import it."""
+    """Raise ``MissingExtra`` unless ``package``, of an optional extra, is installed; do not import it."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -145,8 +149,8 @@ def _missing(package: str) -> MissingExtra:
 class PhysicsError(EthBrakeError, ArithmeticError):
     """Some worlds of a batch could not be simulated. The cause is a defect of the physics kernel, never of the input.
 
-    A caller may compute the batch again without the failed worlds, which do not affect the others. ``worlds`` maps the
-    number of each failed world in its list (a world that the caller has made: its row in the batch) to the reason.
+    A caller may compute the batch again without the failed worlds, which do not affect the others. ``worlds``: number
+    of each failed world in its list (or its row in the batch, if the caller made it) -> reason.
     """
 
     def __init__(self, worlds: Mapping[int, str]) -> None:
@@ -162,8 +166,8 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 class AgentFailed(InvalidInput):
     """An agent of the user raised an exception or returned no valid actions.
 
-    ``row`` is the row of the world in the batch; None if it is unknown. ``reason`` says what the agent did wrong, and
-    at which step.
+    ``row``: row of the world in the batch; None if it is unknown. ``reason``: what the agent did wrong, and at which
+    step.
     """
 
     def __init__(self, agent: str, row: int | None, reason: str) -> None:
@@ -194,14 +198,14 @@ class Unfamiliar(UserWarning):
 
 
 class FreeImpacts(UserWarning):
-    """An objective gives an impact no weight, so that to cause the impact costs nothing."""
+    """An objective gives an impact no weight, so that causing it costs nothing."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
     """Error for an unknown name, which shows a similar name, or all known names.
 
-    ``kind`` says what the name should denote, for example ``scenario``. ``may_be_own``: users can register names of
-    this kind.
+    ``kind`` says what the name should denote, such as ``scenario``. ``may_be_own``: users can register names of this
+    kind; the message then says that such a name must first be registered or installed.
     """
     names = sorted({*known})
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
@@ -211,7 +215,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number from ``least`` to ``most`` (None: no upper limit)."""
+    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]. Messages call it ``what``."""
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"

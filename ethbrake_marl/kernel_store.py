@@ -1,4 +1,4 @@
-"""Find the cache folder of compiled kernels, and call functions before the first compilation; imports no numba."""
+"""The cache folder of compiled kernels, and calls before the first compilation; imports no numba."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def home_folder() -> Path | None:
 
 @cache
 def cache_folder() -> Path:
-    """Folder of the compiled kernels: ``home_folder``, or a temporary folder.
+    """Return the folder of the compiled kernels.
 
-    It is temporary if the folder cannot be written, its disk is full, or it belongs to somebody else.
+    It is temporary if ``home_folder`` cannot be written, its disk is full, or it belongs to somebody else.
     """
     folder = home_folder()
     try:
@@ -50,16 +50,18 @@ def can_be_trusted(folder: Path) -> bool:
 
 
 def is_temporary(folder: Path) -> bool:
-    """Whether ``folder``, a result of ``cache_folder``, is deleted when this process ends."""
+    """Return whether ``folder`` is deleted when this process ends."""
     return folder.name.startswith(_TEMPORARY)
 
 
 def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
-    """Call ``tell(folder, is_empty)`` once, just before this process compiles its first kernel."""
+    """Call ``tell(folder, is_empty)`` once, just before this process compiles its first kernel.
+
+    ``is_empty``: the cache ``folder`` has no compiled kernel yet.
+    """
     _tellers.append(tell)
 
 
 def tell_compilation() -> None:
-    """Call the callbacks of ``on_first_compilation``, each once."""
     while _tellers:
         _tellers.pop()(cache_folder(), not any(cache_folder().rglob("*.nbi")))

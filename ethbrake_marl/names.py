@@ -68,8 +68,6 @@ class AgentSettings:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of a table."""
-
     make: Callable[..., Any]  # (argument, settings) -> agent or team; of a wrapper: (team, argument, settings) -> team
     about: str
     knows: str
@@ -158,14 +156,14 @@ def wrapped(team: Team, wrapper: str, settings: AgentSettings) -> Team:
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
-    """Team for all learners of a scenario. A single agent drives each of them, with memories of their own."""
+    """Return a team for all learners of a scenario. A single agent drives each of them, with separate memories."""
     if isinstance(driver, Team):
         return driver
     return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Teams of names, spec -> team. A text may list several, with commas; groups are resolved.
+    """Return spec -> team. A text may list several specs, with commas; groups are resolved.
 
     Raises the errors of ``make_agent``, and ``InvalidInput`` for a spec that is listed twice.
     """
@@ -179,7 +177,7 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
 
 
 def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Teams by name, of names or a mapping.
+    """Return name -> team of whatever stands for agents.
 
     ``agents`` is a text or list as in ``make_teams``; or a mapping from names of your own to specs, agents, teams, or
     mappings from vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises
@@ -336,13 +334,7 @@ def open_game(
 ) -> tuple[Scenario, Game]:
     """Scenario and game; agents play the roles that name them.
 
-    Args:
-        scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
-        learners: names of the vehicles that learn; None: the scenario's.
-        reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: features of all vehicles, or vehicle -> features; None: the scenario's.
-        reward_vector: components of a vector reward (``episode.terms``).
-
+    Arguments are those of ``EthBrakeParallelEnv``.
     """
     loaded = load_scenario(scenario)
     if learners is not None:
@@ -361,7 +353,7 @@ def check_learners(scenario: Scenario) -> None:
 
 
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
-    """Scripts of a scenario that look at the state, body -> agent."""
+    """Return body -> agent of the scripts that look at the state."""
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
         if role.partition(":")[0] not in (LEARNER, *HELD):

@@ -27,13 +27,13 @@ class WorkerLost(EthBrakeError):
 
 
 def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
-    """Run function calls in parallel and yield their results in the order of the calls.
+    """Run function calls in parallel; yield their results in the order of the calls.
 
     Inside ``joblib.parallel_config(backend=...)`` the calls run there, for instance on a cluster of Ray.
 
     Args:
-        calls: tuples (function, argument, ...) with module-level functions. From a generator, each tuple is taken
-            shortly before the call starts.
+        calls: tuples (function, argument, ...) with module-level functions. A generator's tuples are taken shortly
+            before their calls start.
         jobs: number of calls that run at once; None or 1: one after the other, in this process.
 
     Raises the error that a call raised, ``WorkerLost`` if a process is killed, ``InvalidInput`` if a call cannot be

@@ -17,10 +17,9 @@ EVERY_S = 10.0  # time between two lines of progress (s) if stderr is not a term
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress of a long computation: ``done`` of ``total`` units of work are done; ``name`` says what is computed.
+    """Progress of a long computation: ``done`` of ``total`` units of work; ``name`` says what is computed.
 
-    In training, a unit of work is one decision of a learner, and ``total`` is rounded up to a whole number of policy
-    updates.
+    In training, a unit is one decision of a learner, and ``total`` is rounded up to whole updates.
 
     >>> import ethbrake_marl as eb
     >>> eb.Progress("full_brake", 500, 1000)
@@ -38,7 +37,7 @@ class Progress:
 
     @property
     def harm(self) -> str:
-        """Harm in the last evaluation as text, such as ``total harm 24.19``; empty without one."""
+        """Harm in the last evaluation, such as ``total harm 24.19``; empty before the first."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm", "honest_cost": "honest cost"}
@@ -47,7 +46,10 @@ class Progress:
 
     @staticmethod
     def listener(told: Told) -> OnProgress | None:
-        """Function to call with each ``Progress``: ``told``, or a printer on stderr for ``"show"``, or None."""
+        """Return the function to call with each ``Progress``, or None.
+
+        ``told`` is this function, ``"show"`` to print progress on stderr, or None. Without stderr nothing is printed.
+        """
         if told == "show":
             return None if sys.stderr is None else ShownProgress()
         return told

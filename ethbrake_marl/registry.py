@@ -1,12 +1,12 @@
 """Registries of agents, shields, measures, features, objectives, algorithms and commands, by name.
 
-A running program adds an object with a ``register_...`` function; an installed package with an entry point in its
+A running program adds an object with a ``register_...`` function, an installed package with an entry point in its
 ``pyproject.toml``, as this package does for its extensions:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function. An
+When the name is first used, the entry point is loaded and its value passed to the ``register_...`` function. An
 object that is not used is never imported, so it cannot break anything.
 """
 
@@ -39,8 +39,8 @@ T = TypeVar("T")
 class Part:
     """Value of an entry point: all arguments of a ``register_...`` function except the name.
 
-    In the group ``ethbrake_marl.measures``, ``part`` below has the same effect as
-    ``register_measure(name, closing, unit="m/s")``.
+    In the group ``ethbrake_marl.measures`` the ``part`` below has the same effect as
+    ``register_measure(name, closing, unit="m/s")``, where ``name`` is the name of the entry point.
 
     >>> import ethbrake_marl as eb
     >>> def closing(game, alert, last):
@@ -54,9 +54,9 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Entry points of a group by name, this package's first; several packages may define the same name.
+    """Return name -> entry points of a group such as ``agents``; several packages may define the same name.
 
-    ``group`` is written without the prefix ``ethbrake_marl.``, for example ``agents``.
+    Names of this package come first.
     """
     by_name: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
@@ -66,26 +66,25 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def giver(point: EntryPoint) -> str:
-    """Installed package that defines an entry point; ``?`` if it is unknown."""
+    """Return the package that defines an entry point; ``?`` if it is unknown."""
     return "?" if point.dist is None else point.dist.name
 
 
 def versions_used() -> dict[str, str]:
-    """Name -> version of the other packages of which this process has loaded an entry point."""
+    """Return name -> version of the other packages whose entry points this process has loaded."""
     return dict(sorted(_VERSIONS.items()))
 
 
 class Registry(Mapping[str, T]):
-    """Mapping name -> object for all objects of one kind. An object is loaded when its name is first looked up.
+    """Name -> object, for all objects of one kind. An object is loaded when its name is first looked up.
 
-    Looking up a name raises ``UnknownName`` if the registry has no object of this name, ``InvalidInput`` if the object
-    cannot be loaded or if two installed packages define it, and ``MissingExtra`` if a package of an extra is missing.
+    Testing whether a name exists, and iterating, load nothing. Looking up a name raises ``UnknownName``, or
+    ``InvalidInput`` if the object cannot be loaded or two installed packages define it, or ``MissingExtra``.
 
     Args:
-        kind: noun for one object of the registry in messages, for example ``agent``.
+        kind: noun for one object in messages, for example ``agent``.
         group: group of the entry points, without the prefix ``ethbrake_marl.``.
-        register: function that is called with the name and value of an entry point; it must call the method ``add`` of
-            this registry.
+        register: is called with the name and value of an entry point; it must call ``add`` of this registry.
         built_in: name -> object, for objects that are defined in code rather than by entry points.
 
     """
@@ -118,9 +117,9 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load the object called ``name`` if needed; return all names that its entry point defines.
+        """Load an object if needed; return all names that its entry point defines.
 
-        An entry point defines several objects if its value is a dictionary. Raises the errors of looking up the name.
+        These are several if its value is a dictionary. Raises the errors of looking up a name.
         """
         candidates = points(self.group).get(name, [])
         if (name in self._built_in) + len(candidates) > 1:
@@ -162,9 +161,9 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add ``part`` under ``name``; raise ``AlreadyExists`` if another object has the name.
+        """Add an object. Raises ``AlreadyExists`` if another one has the name.
 
-        ``is_same`` returns whether the object under ``name`` equals ``part``, which is then not added again.
+        ``is_same`` says whether an object equals ``part``, which is then not added again.
         """
         names_others = False  # whether an entry point of this name defines parts with other names
         if name not in self.loaded and name in self and name not in self._loading:
@@ -177,11 +176,11 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """All objects that can be loaded: name -> object."""
+        """Load all objects; return name -> object of those that could be loaded."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Why the object called ``name`` cannot be loaded; None if it can."""
+        """Load an object; return the error message if this fails."""
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:
@@ -189,10 +188,7 @@ class Registry(Mapping[str, T]):
         return None
 
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
-        """Error for a ``name`` that is not in this registry.
-
-        ``known`` has the names to suggest or list; None: all names of this registry.
-        """
+        """Return the error for an unknown name. ``known``: the names to suggest or list; None: all."""
         if not points("agents"):
             return UnknownName(
                 f"unknown {self.kind} {name!r}: no entry points of the package {OURS} are installed; install the"

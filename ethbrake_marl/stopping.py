@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM set a flag instead of raising an exception; a long computation checks the flag between steps."""
+"""Ctrl-C and SIGTERM set a flag instead of raising an exception; a long computation checks it between steps."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Context manager: yield a function that returns whether Ctrl-C was pressed or SIGTERM was received in the block.
+    """Yield a function that returns whether Ctrl-C was pressed or SIGTERM was received in the block.
 
-    A second Ctrl-C or SIGTERM has its usual effect. Outside the main thread, where Python delivers no signals, the
-    yielded function always returns False.
+    A second one has its usual effect. Outside the main thread, where Python delivers no signals, the function always
+    returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():

@@ -41,7 +41,6 @@ class Agent(Script, Protocol):
     ...         return -0.5 * state.braking_capacity_mps2[:, body - 1], memory
     >>> eb.evaluate("paper-random", {"half": Half()}, episodes=2)["half"]["total_harm"].round(1)
     array([43.5, 54.7])
-
     """
 
     @property
@@ -111,9 +110,8 @@ def check_knows(knows: Any, where: str) -> None:
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:
     """Let a team drive these worlds from the alert to the end: yield every state, and the step that led to it.
 
-    The first pair is ``None`` and the state at the first decision, when agents are first asked. Commands are applied as
-    they are, without a detour by actions. Under a shield the shield asks the agents. ``donate``: a state is worthless
-    once the next one is asked for.
+    The first pair is ``None`` and the state at the first decision. The agents' commands are applied as they are, not as
+    actions. Under a shield the shield asks them. ``donate``: a state is worthless once the next one is asked for.
     """
     game = team.game(game)
     if game.shield is None:
@@ -147,12 +145,12 @@ def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, A
 
 
 def to_command(state: State, body: int, actions: Floats) -> Floats:
-    """Turn actions [n], from -1 (full braking) to 1 (full driving), into commands of vehicle ``body``, [n] m/s2."""
+    """Turn actions [n], from -1 (full braking) to 1 (full driving), into commands, [n] m/s2."""
     return np.where(actions < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body]) * actions
 
 
 def to_action(state: State, body: int, commands: Floats) -> Floats:
-    """Turn commands [n] of vehicle ``body`` (m/s2) into actions; one beyond a capacity becomes -1 or 1."""
+    """Turn commands [n] (m/s2) into actions; one beyond a capacity becomes -1 or 1."""
     capacity = np.where(commands < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body])
     share = np.divide(commands, capacity, out=np.zeros_like(capacity), where=capacity > 0.0)
     return np.clip(share, -1.0, 1.0)

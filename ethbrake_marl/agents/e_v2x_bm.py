@@ -33,9 +33,10 @@ TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
     """Constant deceleration of vehicle ``body`` that does the least harm, in every world, and this harm.
 
-    All others hold ``alert.wanted``. If the choice of the closed form does no harm, it is the result. If several do
-    equally little, the least harm of the other count decides, then the middle one. As a function of the deceleration
-    the harm has kinks and jumps: it is not proven that no deceleration between two samples does less.
+    All others hold ``alert.wanted``. ``count``: what is minimised (``episode.counts``). If the choice of the closed
+    form does no harm, it is the result. If several do equally little, the least harm of the other count decides, then
+    the middle one. As a function of the deceleration the harm has kinks and jumps: it is not proven that no
+    deceleration between two samples does less.
     """
     braking = np.maximum(-alert.wanted, 0.0)
     braking[:, body] = alert.car[:, BRAKING, body]
@@ -58,8 +59,8 @@ def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) 
 def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
     """Best decelerations and their harms under this count and the one that decides ties, [n, 3].
 
-    All decelerations of a world are split into equal parts, then again and again the parts that may hold a better one.
-    A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
+    All decelerations of a world are split into equal parts, then again and again those parts that may hold a better
+    one. A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
     """
     best = np.full((alert.n, 3), np.inf)
     rows, step = np.arange(alert.n), alert.car[:, BRAKING, body] / FIRST_PARTS
@@ -128,8 +129,6 @@ def compare(harm, known):
 
 
 class Memory(NamedTuple):
-    """What the agent decided at the alert."""
-
     command: Floats  # [n] m/s2
     predicted_harm: Floats  # [n] m2/s2
 
@@ -137,7 +136,7 @@ class Memory(NamedTuple):
 class EV2XBM:
     """Brakes with the choice of ``coupled``; assumes that the other learners brake fully.
 
-    The harm that it predicts is, to the last bit, the harm of the episode in which they do.
+    If they do, the harm that it predicts is, to the last bit, the harm of the episode.
 
     Args:
         rules: of the episodes.

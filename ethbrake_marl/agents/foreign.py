@@ -1,4 +1,7 @@
-"""Models of other libraries: how each kind is called, and what it brings that is applied or refused."""
+"""Models of other libraries: how to ask each kind, and what it brings along, which is applied or refused.
+
+Nothing here imports torch or Stable-Baselines3; onnxruntime is imported to open a file.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +39,10 @@ INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """How a policy without a memory is called.
+    """Return how to ask a policy without a memory.
 
-    Raises ``InvalidInput``, which begins with ``who``, for another kind, and for a model that would not act alike in
-    every batch.
+    Raises ``InvalidInput``, which begins with ``who``, for another kind, and for a model whose actions would depend on
+    chance or on the batch.
     """
     if isinstance(policy, bytes) or (hasattr(policy, "run") and hasattr(policy, "get_inputs")):
         return ask_onnx
@@ -92,7 +95,7 @@ def ask_onnx(session: Any, seen: Observations) -> Any:
 
 
 def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
-    """Content of an ``.onnx`` file: an ONNX model that can be pickled."""
+    """Return the content of an ``.onnx`` file, which can be pickled."""
     file = Path(path).expanduser()
     if file.suffix != ".onnx":
         raise InvalidInput(
@@ -103,6 +106,7 @@ def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
 
 
 def session_of(given: Any) -> Any:
+    """Return the session of the content of an ONNX file, or ``given`` if it is one."""
     return _opened(given) if isinstance(given, bytes) else given
 
 
@@ -129,7 +133,7 @@ def _refuse_training_mode(module: Any, who: str) -> None:
 
 
 def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
-    """Names of the features that a model was trained on; None if it does not bring them."""
+    """Return the names of the features that a model was trained on, or None if it does not bring them."""
     if ask is ask_onnx:
         listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(listed.split(",")) if listed else None
@@ -159,7 +163,7 @@ def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
 
 
 def statistics_of(model: Any) -> Any:
-    """``VecNormalize`` of a model of Stable-Baselines3; None: it has none."""
+    """Return the ``VecNormalize`` of a model of Stable-Baselines3, or None."""
     return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
@@ -198,7 +202,7 @@ def layers_of(env: Any) -> Iterator[Any]:
 def _was_normalised(model: Any) -> bool:
     """Whether the last observation that a model has stored was normalised.
 
-    Then it is also stored as it was before, as off-policy algorithms always do, or it lies outside its space.
+    The model then stores the original, too (off-policy algorithms always do), or the observation lies outside its space.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

@@ -89,8 +89,8 @@ def predicted_harm(line, braking, wait, body, a):
 def find_candidates(line, braking, wait, body, at):
     """Write the decelerations of vehicle ``body`` at which H may be least to ``at`` [CANDIDATES] (m/s2), in one world.
 
-    They belong to the state at its onset: gap d, own speed v and the neighbour's u, closing speed w, and the time s for
-    which the neighbour still coasts before it brakes with b. Some are not in [0, capacity], or not a number.
+    Formulas use the state at its onset: gap d, own speed v and the neighbour's u, closing speed w, and the time s for
+    which the neighbour still coasts before it brakes with b. Some results are not in [0, capacity], or not a number.
     """
     gap, speed, onset = line[GAP], line[SPEED], wait[body]
     at[:] = 0.0

@@ -1,4 +1,4 @@
-"""Agents that drive with policies: of our bundles, and of any other library."""
+"""Agents that drive with policies of this package, or of any other library."""
 
 from __future__ import annotations
 
@@ -40,12 +40,11 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 @dataclass(frozen=True)
 class LearnedAgent:
-    """Drives with the deterministic actions of a policy of ours.
+    """Drives with the deterministic actions of a policy of this package.
 
     >>> import ethbrake_marl as eb
     >>> eb.LearnedAgent(eb.load_shipped("ppo"), name="mine").name
     'mine'
-
     """
 
     policy: Policy
@@ -80,10 +79,10 @@ class LearnedAgent:
             )
 
     def begin(self, alert: State, body: int) -> None:
-        """No memory."""
+        """There is no memory."""
 
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
-        """Commands of vehicle ``body``, [n] m/s2."""
+        """Return commands, [n] m/s2."""
         policy = self.policy
         view = self.observation or policy.observation
         seen = view.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
@@ -119,7 +118,7 @@ class PolicyAgent:
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Commands of vehicle ``body``, [n] m/s2, and the policy's new memory.
+        """Return commands, [n] m/s2, and the policy's new memory.
 
         Raises ``AgentFailed`` for actions of a wrong shape, or one that is not in its range.
         """
@@ -145,7 +144,7 @@ class PolicyAgent:
         return mapped(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
-        """Actions [n] in [-1, 1] for the policy's answer."""
+        """Return the actions [n] in [-1, 1] for the policy's answer."""
         given, n, last = to_array(answer), state.n, (self.actions or 0) - 1
         kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
         if self.actions is not None:
@@ -239,7 +238,7 @@ def policy_agent(
 
 
 def _view(given: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
-    """View that is ``given``, or that the policy brings, or of the learners of the scenario."""
+    """Return what a policy observes: ``given``, what it brings, or what the learners of a scenario observe."""
     if given is not None:
         view = given if isinstance(given, View) else View(given)
         if trained_on not in (None, view.names):

@@ -15,7 +15,7 @@ ANY = ("policy", "team")  # names that stand for whatever algorithm has trained 
 
 
 def make_trained(argument: str | None, settings: Any) -> Agent | Team:
-    """Agent of a run or bundle, or of a shipped policy if the name has no path.
+    """Return the agent or team of a run or bundle, or of a shipped policy if the name has no path.
 
     ``argument`` is the algorithm that should have trained it, if the name does not say. A run whose learners have
     policies of their own gives a team, or the agent of the only vehicle that it is asked for. Raises ``InvalidInput``

@@ -1,4 +1,4 @@
-"""The program ``ethbrake`` with all its commands: set up streams, run the command, and turn errors into messages."""
+"""The program ``ethbrake`` with all its commands: set up streams, run the command, turn errors into messages."""
 
 from __future__ import annotations
 
@@ -60,7 +60,6 @@ def _about(
 
 
 def main() -> None:
-    """Run the command line of this process, and exit with its status."""
     gc.set_threshold(20_000)  # Python's default of 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
     sys.exit(run_command(sys.argv[1:]))
@@ -69,9 +68,9 @@ def main() -> None:
 def run_command(arguments: Sequence[str]) -> int:
     """Run a command line (the arguments after ``ethbrake``) and return its exit status.
 
-    It is 0 for success, 2 for invalid input, wrong usage or a file error (with the reason in one line on stderr), and 1
-    if the reader of the output has closed the pipe; a command may set another one, such as 130 after Ctrl-C. Other
-    errors are defects of the program and are raised.
+    0: success. 2: invalid input, wrong usage or a file error, with the reason in one line on stderr. 1: the reader of
+    the output has closed the pipe. A command may set another one, such as 130 after Ctrl-C. Other errors are defects
+    of the program and are raised.
     """
     asked = _shell_asks(os.environ)
     try:
@@ -108,7 +107,7 @@ def run_command(arguments: Sequence[str]) -> int:
 def _shell_asks(environment: Mapping[str, str]) -> bool:
     """Whether a shell runs this command in order to complete a command line (see ``--show-completion``).
 
-    All variables of the completion script must be set, so that a stray one does not make a command fail.
+    A stray variable that requests a completion is ignored if the completion script's other variables are missing.
     """
     if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
@@ -117,6 +116,7 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 
 def _refuse(reason: str) -> int:
+    """Print the reason in one line on stderr; return the exit status, 2."""
     Out().note(f"ethbrake: error: {reason}")
     return 2
 
@@ -124,8 +124,9 @@ def _refuse(reason: str) -> int:
 def prepare_streams() -> None:
     """Set up stdout, stderr and warnings for the command line.
 
-    A character that the encoding of stdout lacks is printed as ``?``. Output that bypasses Python's stdout, such as
-    that of a library or child process, goes to stderr. Warnings of this package are printed in one line.
+    A character that the encoding of stdout does not have (m², lines of boxes) is printed as ``?``. Output that bypasses
+    Python's stdout, such as that of a library or child process, goes to stderr. Warnings of this package are printed in
+    one line. A message is printed before the first compilation of kernels.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller: nobody reads it
@@ -149,7 +150,7 @@ def prepare_streams() -> None:
 
 
 def tell_compilation(folder: Path, empty: bool) -> None:
-    """Announce that kernels are being compiled. ``empty``: this process has loaded none from ``folder``."""
+    """Announce that kernels are being compiled. ``empty``: ``folder``, which stores them, had none to load."""
     if is_temporary(folder):
         what = (
             "the physics; no folder for compiled kernels is writable, so every command compiles it again (for help:"
@@ -188,6 +189,7 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
 
 def _names() -> list[str]:
+    """Return the names of the core's commands and groups."""
     return [
         *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
         *(str(group.name) for group in app.registered_groups),
@@ -199,7 +201,7 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 
 
 class Installed(TyperCommand):
-    """A command of an extension or installed package, which is imported only when the command is called.
+    """A command of an extension or installed package, which is imported only when it is called.
 
     ``entry`` is the name of the entry point, ``NAME`` or ``GROUP.NAME``.
     """
@@ -219,15 +221,12 @@ class Installed(TyperCommand):
         return self.command().make_context(*arguments, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
-        """Short description for the list of commands, of at most ``limit`` characters.
-
-        For another package's command it is the name of the package, so that the package need not be imported.
-        """
+        """Return the short description; for another package's command its package, which need not be imported."""
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """Add the commands of the entry points ``NAME.COMMAND`` to the command group ``name``."""
+    """Add the commands of the entry points ``NAME.COMMAND`` to the group ``name``; return the group."""
     for entry in points(COMMANDS.group):
         of, _, own = entry.rpartition(".")
         if of == name:
@@ -236,7 +235,7 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """All commands as a Typer (click) group: of the core, of extensions and packages, and those of ``add_command``.
+    """Return all commands: of the core, of extensions and installed packages, and of ``add_command``.
 
     Raises ``AlreadyExists`` if two commands have the same name.
     """

@@ -54,10 +54,9 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on s
 
 
 def schema_option(module: str, function: str, kind: str) -> Any:
-    """Type of a Typer option ``--schema``, which prints the JSON Schema of a kind of file and exits.
+    """Return the type of an option ``--schema``, which prints the JSON Schema of a ``kind`` of file and exits.
 
-    ``module``, with the ``function`` that returns the schema, is imported only when the option is used. ``kind`` names
-    the kind of file in the help text.
+    The ``module`` of the ``function`` that returns the schema is imported only when the option is used.
     """
 
     def show_schema(asked: bool) -> None:
@@ -80,10 +79,10 @@ def say(text: str) -> None:
 
 
 class Out:
-    """Output of a command of ``ethbrake``, used as ``with Out() as out``.
+    """Output of a command, used as ``with Out() as out``.
 
-    Inside the block only results go to stdout; all other output, for instance of a user's agent, goes to stderr. Ctrl-C
-    ends the command with exit status 130 and one line, which ends with ``remains``: which files remain.
+    Inside the block only results go to stdout; all else, for instance of a user's agent, goes to stderr. Ctrl-C ends
+    the command with one line and exit status 130; the line ends with ``remains``, a text about the files that remain.
     """
 
     def __init__(self, *, as_json: bool = False, force: bool = False, remains: str = "nothing was written") -> None:
@@ -93,6 +92,7 @@ class Out:
         self._turned = redirect_stdout(sys.stderr)
 
     def __enter__(self) -> Self:
+        """Redirect stdout to stderr, and register the environments for the user's code."""
         self._turned.__enter__()
         register_environments()
         return self
@@ -100,26 +100,26 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Restore stdout; after Ctrl-C print a message and exit with status 130."""
+        """Stop redirecting stdout; after Ctrl-C, print a message and exit with status 130."""
         self._turned.__exit__(kind, error, trace)
         self.show_progress.end()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.remains}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
-        """Print the result on stdout: as JSON the plain data ``content``, otherwise ``shown``."""
+        """Print the result: the plain data ``content`` as JSON, or else ``shown``."""
         if self.as_json:
             self.print_json(content)
         else:
             self.show(*shown, end=end)
 
     def print_json(self, content: Any) -> None:
-        """Print ``content`` (plain data) as JSON on stdout, even without ``--json``."""
+        """Print plain data as JSON, even without ``--json``."""
         self.show_progress.end()
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
     def show(self, *shown: RenderableType, end: str = "\n") -> None:
-        """Print texts, each followed by ``end``, and tables (of rich) on stdout.
+        """Print texts, each followed by ``end``, and tables of rich.
 
         Control characters in texts are escaped, except line ends and tabs.
         """
@@ -136,10 +136,9 @@ class Out:
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput`` or ``AlreadyExists`` if a file cannot be written; for use before any work.
+        """Raise ``InvalidInput`` or ``AlreadyExists``, before any work, if a file cannot be written. None is no file.
 
-        ``endings`` are the allowed endings of the file's name, such as ``.csv``; without them every ending is allowed.
-        ``what`` names the file's content in the error message. If ``path`` is None, nothing is checked.
+        ``endings`` are the allowed endings of its name, such as ``.csv``; none: all. Messages call it ``what``.
         """
         if path is None:
             return
@@ -150,7 +149,7 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write ``content`` to a file, completely or not at all; with ``what``, print ``WHAT: PATH`` on stderr."""
+        """Write a file, whole or not at all; with ``what``, print ``WHAT: PATH`` on stderr."""
         from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
@@ -158,7 +157,7 @@ class Out:
             self.note(f"{what}: {path}")
 
     def interrupted(self, text: str) -> NoReturn:
-        """Print ``text`` as one line on stderr, and end the command with status 130, the status after Ctrl-C."""
+        """Print one line on stderr, and exit with status 130, as after Ctrl-C."""
         self.note(text)
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
@@ -168,7 +167,10 @@ class Out:
 
 
 class _PlainConsole(Console):
-    """Console of rich that prints texts literally, without markup, and escapes control characters."""
+    """Console of rich that prints texts literally, without markup, and escapes control characters.
+
+    ``width`` in characters; None: as wide as the terminal.
+    """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)

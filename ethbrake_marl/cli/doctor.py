@@ -1,4 +1,4 @@
-"""The command ``doctor``: check versions, folders, and the physics on known results."""
+"""The command ``doctor``: check this installation's versions and folders, and its physics on known results."""
 
 from __future__ import annotations
 
@@ -54,15 +54,13 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one check of the installation."""
-
     name: str  # name of the checked item, such as a package
     ok: bool  # whether the check succeeded
     detail: str  # version, folder or error, for the user
 
 
 def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """Results of all checks, in the order in which the user should solve problems.
+    """Return the results of all checks, in the order in which the user should solve problems.
 
     With ``compile_all``, also compile the kernels (``compile_ahead``).
     """
@@ -89,10 +87,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """One check per dependency, which succeeds if a required version is installed.
-
-    If a missing package is needed only by an extra, its check does not fail.
-    """
+    """Yield a check per dependency: whether the required version is installed. Packages of extras may be missing."""
     from packaging.requirements import Requirement
 
     wanted = [Requirement(line) for line in requires("ethbrake-marl") or []]
@@ -168,8 +163,8 @@ def _golden_baseline() -> tuple[bool, str]:
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
     """Compile and store the kernels that the usual commands use, by calling these commands on a few worlds.
 
-    With ``training``, also call ``ethbrake run``, which needs torch. With ``run_alone``, call only the single command
-    that compiles nearly all kernels of ``ethbrake run``. Returns whether all commands succeeded, and a message.
+    With ``training``, also call ``ethbrake run``, which needs torch. With ``run_alone``, call only the one command that
+    compiles nearly all kernels of ``ethbrake run``. Returns whether all succeeded, and a message.
     """
     if is_temporary(cache_folder()):
         return False, "no folder for compiled kernels is writable; set NUMBA_CACHE_DIR to a writable folder"

@@ -1,4 +1,4 @@
-"""Registry of functions that draw pages and pictures for commands."""
+"""Registry of the functions with which extensions draw pages and pictures for commands."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from ethbrake_marl.registry import Registry
 
 
 def register_page(shows: str, write: Callable[..., None]) -> None:
-    """Register the function that writes a command's page (a report) or picture. Entry points: ``ethbrake_marl.pages``.
+    """Register the function that a command calls to write its page (a report) or its picture.
+
+    Entry points: ``ethbrake_marl.pages``.
 
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``), ``"worlds"`` (``scenario sample``) or
@@ -27,7 +29,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_of(shows: str, option: str) -> Callable[..., None]:
-    """Registered function that writes the page about ``shows``; ``InvalidInput`` begins with ``option``."""
+    """Return the function that writes a page. Without one, raise ``InvalidInput``, which begins with ``option``."""
     if shows not in PAGES:
         raise InvalidInput(f"{option}: the extension that draws this page ({shows}) is not installed")
     return PAGES[shows]

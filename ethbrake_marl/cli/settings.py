@@ -19,8 +19,6 @@ NO_SETTING = {"name", "title", "description", "source"}  # words, which cannot b
 
 
 class Settings(NamedTuple):
-    """Settings of a command, by their owner."""
-
     texts: tuple[str, ...]  # as written
     scenario: list[Override]
     recipe: list[Override]

@@ -52,7 +52,7 @@ def caption(parameters: Mapping[str, Any]) -> str:
 
 
 def by_recording(recordings: int) -> str:
-    """Part of a caption about intervals that count recordings; "" without recordings."""
+    """Return how intervals count recordings; "" without recordings."""
     if recordings == 1:
         return "; no 95 % intervals: all worlds come from one recording"
     return f"; 95 % intervals by {recordings:,} recordings" if recordings else ""

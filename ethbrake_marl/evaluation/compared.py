@@ -1,4 +1,4 @@
-"""Teams that drove the same list of worlds, for pages about them."""
+"""Teams in the same worlds, with everything that a page about them needs."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 class Compared(NamedTuple):
-    """A scenario, the teams, and what they did in the worlds of an evaluation list."""
-
     scenario: Scenario
     teams: Mapping[str, Team]
     result: Result
@@ -33,7 +31,7 @@ class Compared(NamedTuple):
         measures: Iterable[str] | str = (),
         **more: Any,
     ) -> Compared:
-        """Let the teams drive; the other arguments are those of ``evaluate``. The honest count also shows the push."""
+        """Let the teams drive; ``more``: as in ``evaluate``. The honest count also shows the push."""
         names = measures.split(",") if isinstance(measures, str) and measures else [*measures]
         if harm_count == "honest":
             names.insert(0, "pushed_mps")
@@ -41,6 +39,6 @@ class Compared(NamedTuple):
         return cls(scenario, teams, result, summarise(result), harm_count)
 
     def worlds(self, rows: Iterable[int] | Ints) -> State:
-        """Worlds of some rows, at the alert."""
+        """Return some worlds at the alert."""
         numbers, seed = self.result.worlds["world"], self.result.about["seed"]
         return State.join([self.scenario.sample(1, seed, first=int(numbers[row])) for row in rows])

@@ -1,7 +1,6 @@
-"""Evaluate teams: every team drives every world once, from the alert to the end; measures turn episodes into columns.
+"""Evaluate teams: every team drives every world once; measures turn episodes into columns.
 
-The worlds are fixed in advance: if the episodes that finish first were counted, short ones would count too often, and
-many short ones are crashes.
+The worlds are fixed in advance. Counting the episodes that finish first would favour short ones, often crashes.
 """
 
 from __future__ import annotations
@@ -64,7 +63,6 @@ class Result:
         return f"Result({self.about['scenario']!r}, {count_of(self.n, 'world')}: {', '.join(self.columns):.200})"
 
     def measure_of(self, column: str) -> Measure:
-        """Measure that a column belongs to."""
         mine = [each for each in self.measures if column == each.name or column.startswith(f"{each.name}_")]
         return max(mine, key=lambda measure: len(measure.name))
 
@@ -119,14 +117,13 @@ def evaluate(
         worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State``, whose recordings are not known.
         agents: name in tables -> team, which drives all learners of the game.
         game: game of the worlds' scenario.
-        measures: measures beside the usual ones, for instance ``measures_called("pushed_m,injury")``.
+        measures: beside the usual ones, for instance ``measures_called("pushed_m,injury")``.
         jobs: number of processes.
         about: what else tables and files should say (``identity.about_scenario``).
         on_done: called with the number of worlds that all teams have driven so far.
 
-    Raises ``InvalidInput`` for worlds that are not at the alert or have another number of vehicles, for a team that
-    does not fit, and for bad commands of an agent; ``PhysicsError`` if a check of the
-    physics fails.
+    Raises ``InvalidInput`` for worlds that are not at the alert or do not fit the game, for a team that does not fit,
+    for measures whose names clash, and for bad commands of an agent; ``PhysicsError`` if a check of the physics fails.
 
     """
     if jobs is not None:
@@ -216,7 +213,7 @@ def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    """Columns of all chunks; one that is missing in a chunk is missing."""
+    """Join the columns of all chunks; one that is missing in a chunk is missing."""
     return {
         name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
     }
@@ -225,7 +222,7 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 def hidden_from(alert: State, game: Game) -> Bools:
     """Whether the V2X channel hides something from a learner at its first decision, [n].
 
-    The learner does not know all of a vehicle, or that one reacts later than its messages say, because it waits itself.
+    It does not know all of a vehicle, or that one reacts later than its messages say, because it waits itself.
     """
     late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
     for i in game.rules.learners.tolist():

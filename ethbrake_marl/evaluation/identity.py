@@ -1,6 +1,6 @@
 """Identity of a result: digests of worlds, scenario, physics and policies, and versions of software.
 
-Results can be compared if their worlds and scenarios are the same. Other physics or versions are reported.
+Results can be compared if worlds and scenarios are the same. Other physics or versions are reported.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def worlds_sha256(worlds: State) -> str:
 
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
-    """Description of a ``Scenario`` and the seed of its worlds, for ``evaluate(about=...)``."""
+    """Return what a result should say of a scenario and the seed of its worlds; for ``evaluate(about=...)``."""
     content = json.dumps(scenario.content(without=WORDS), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
     about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
@@ -41,14 +41,15 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of every package that affects a result, and the SHA-256 of each Python file of the user
-    that this process ran.
+    """Return name -> version of Python and of every package that affects a result, those of extensions included.
+
+    With them the SHA-256 of each Python file of the user that this process ran.
     """
     own = {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
     return own | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """SHA-256 of the manifest of each vehicle's policy; vehicles without a policy of ours are left out."""
+    """Return vehicle -> SHA-256 of its policy's manifest, for policies of this package."""
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
     return {f"vehicle_{body}": each.manifest_sha256 for body, each in manifests.items() if each is not None}

@@ -52,7 +52,7 @@ AT_REST, HORIZON = "at_rest", "horizon"  # how an episode ended
 
 
 class Watch(Protocol):
-    """Measures episodes while they run."""
+    """A measure that sees every state of the episodes."""
 
     def see(self, before: State, step: Step | None, after: State) -> None:
         """Look at two successive states; ``step`` None: between the alert and the first decision."""
@@ -75,8 +75,6 @@ class Statistic(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """A function of the last states, or a watch of all states."""
-
     name: str
     of: Callable[[Game, State, State], Given] | None = None
     meaning: str = ""
@@ -207,7 +205,7 @@ DEFAULT = (
 
 @contextmanager
 def naming(measure: Measure) -> Iterator[None]:
-    """Raise ``InvalidInput``, which names the measure, if its function fails."""
+    """If the block fails, raise ``InvalidInput``, which names the measure."""
     try:
         yield
     except EthBrakeError:

@@ -67,7 +67,7 @@ def _checked(
     shown: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> Measure:
-    """Measure that the arguments of ``register_measure`` describe. Raises the same errors."""
+    """Return the measure that ``register_measure`` describes. Raises the same errors."""
     right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
     if not isinstance(name, str) or re.fullmatch(right, name) is None:
         raise InvalidInput(
@@ -118,6 +118,7 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
 
 
 def _in_full(name: str, measure: Measure) -> Measure:
+    """Call a measure of a file by its full name ``FILE.py:NAME``."""
     file = name.removesuffix(f":{measure.name}")
     if file == name:
         return measure
@@ -171,7 +172,7 @@ def _summed(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """The term, which is 0 for a team without a shield, so that a table can compare both. Rewards refuse it."""
+    """The term where it is 0 without a shield, so that a table can compare both. Rewards refuse it."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)

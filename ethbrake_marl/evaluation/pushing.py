@@ -28,7 +28,7 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 def with_post(state: State) -> Floats:
-    """Copy of the lines, with a far post where there is no obstacle, whose gap shows Vehicle 1's way."""
+    """Return a copy of the lines. Where there is no obstacle it has a far post, whose gap shows Vehicle 1's way."""
     line = state.line.copy()
     line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
     return line
@@ -45,7 +45,7 @@ class PushedAway:
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the way of Vehicle 1: with a post where there is no obstacle, the step is driven again."""
+        """Add the way of Vehicle 1. Where there is no obstacle, the step is driven again with a post."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         times = np.ascontiguousarray(before.time_s), np.ascontiguousarray(after.time_s)
@@ -82,7 +82,7 @@ def pushed_mps(game: Game, alert: State, last: State) -> Given:
 
 
 class DroveTowards:
-    """Keeps, until the first impact of each line, the time and how long a positive command was in force."""
+    """Keeps the time until the first impact of each line, and how long a positive command was in force."""
 
     def __init__(self, game: Game, alert: State) -> None:
         self.learners, self.time_s = game.rules.learners, np.zeros(alert.n)
@@ -96,7 +96,6 @@ class DroveTowards:
         self.hard |= hard[:, self.learners - 1].any(axis=1)
 
     def result(self, last: State) -> Given:
-        """Shares of the time, and whether a learner drove hard."""
         share = self.driving_s / np.where(self.time_s > 0.0, self.time_s, 1.0)[:, np.newaxis]
         each = {f"{i + 1}": column for i, column in enumerate(share.T)}
         return {"": share[:, self.learners - 1].max(axis=1, initial=0.0), **each, "hard": self.hard}

@@ -1,6 +1,6 @@
 """Record one episode with closely spaced samples, for figures and viewers.
 
-Between two decisions the motion is computed again, from the state at the first one.
+The motion between two decisions is computed again, from the state at the first one.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class EpisodeRecord:
 
     @property
     def last(self) -> State:
-        """State at the end, with the harm of the episode."""
+        """The state at the end."""
         return self.states[-1]
 
     def __repr__(self) -> str:
@@ -109,7 +109,7 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
 
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
-    """Record some worlds that a team drives together, each as ``record_episode`` does."""
+    """Record each of several worlds, which a team drives together; see ``record_episode``."""
     check_exact(worlds, "a record of the motion between decisions")
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_recorded([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
@@ -137,9 +137,9 @@ def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> E
 
 
 def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
-    """Pieces of the motion between two states: times [k, 2], lines [k, 2, ...], and commands [k, N + 1].
+    """Return k pieces of the motion: times [k, 2], lines [k, 2, ...] at both ends, commands [k, N + 1].
 
-    Lines are those at the beginning and the end of a piece; without an obstacle, a post measures Vehicle 1's way.
+    Without an obstacle, a post measures Vehicle 1's way.
     """
     start, end = float(before.time_s[0]), float(after.time_s[0])
     count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
@@ -153,7 +153,7 @@ def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floa
 
 
 def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
-    """Impacts; pieces of the motion with impacts are driven again, for the times of the first."""
+    """Return the impacts. Pieces of the motion with impacts are driven again, for the time of the first."""
     rows = [FIRST, TOTAL, COUNT]
     made = lines[:, 1, rows] - lines[:, 0, rows]
     piece, pair = np.nonzero(made[:, 2])

@@ -1,4 +1,4 @@
-"""Results in files: ``results.json``, one object per team, and beside it a table with one row per team and world."""
+"""Results in files: ``results.json``, one object per team, and a table with one row per team and world."""
 
 from __future__ import annotations
 
@@ -38,11 +38,10 @@ class Saved(NamedTuple):
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """Values of the first team that are the same for all."""
+        """What is the same for all teams, from the object of the first."""
         return next(iter(self.agents.values()))
 
     def estimate(self, agent: str, key: str) -> Estimate:
-        """Mean with its interval and its standard error."""
         own = self.agents[agent]
         ends = own[f"{key}_interval"]
         return Estimate(own[key], ends and (ends[0], ends[1]), own[f"{key}_error"], own[f"{key}_freedom"])
@@ -108,7 +107,7 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
 def read_result(path: str | Path) -> Saved:
     """Read ``results.json`` and the rows beside it, if there are any.
 
-    Raises ``InvalidInput``, in one line, for another file, and for one that was edited or damaged.
+    Raises ``InvalidInput`` for another file, and for one that was edited or damaged.
     """
     file = Path(path).expanduser()
     data = read_plain(file, MOST_BYTES)

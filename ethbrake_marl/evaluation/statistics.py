@@ -78,9 +78,9 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
     """Share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
 
     The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width
-    ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds that
-    would have the same standard error, ``1 + p (1 - p) / error^2``, at most the number of worlds, times ``(z / t)^2``
-    (Korn and Graubard 1998). If all worlds are alike, it is ``1 / sum h_g^2`` times ``(z / t)^2``.
+    ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds
+    that would have the same standard error, ``1 + p (1 - p) / error^2``, at most the number of worlds, times
+    ``(z / t)^2`` (Korn and Graubard 1998). If all worlds are alike, it is ``1 / sum h_g^2`` times ``(z / t)^2``.
     """
     share, n = int(np.count_nonzero(truths)) / len(truths), float(len(truths))
     error: float | None = sqrt(share * (1.0 - share) / n)
@@ -98,7 +98,7 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
 
 
 def wilson(share: float, count: float) -> tuple[float, float]:
-    """Ends of Wilson's interval for a share of ``count`` independent draws; both may be no whole numbers."""
+    """Return Wilson's interval for a share of ``count`` independent draws, neither of which need be whole numbers."""
     shrink = 1.0 + Z * Z / count
     centre = (share + Z * Z / (2.0 * count)) / shrink
     half = Z / shrink * sqrt(share * (1.0 - share) / count + Z * Z / (4.0 * count * count))
@@ -106,7 +106,7 @@ def wilson(share: float, count: float) -> tuple[float, float]:
 
 
 def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
-    """Difference of two means of other worlds with Welch's interval, from their standard errors.
+    """Return the difference of two means over different worlds, with Welch's interval.
 
     Its square error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. No interval if one
     of the standard errors is not known.
@@ -147,7 +147,7 @@ def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters
 
 
 def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Both sums over each cluster, [G]."""
+    """Return the sums over each cluster, [G]."""
     which = np.unique(clusters, return_inverse=True)[1]
     return np.bincount(which, residuals).astype(np.float64), np.bincount(which, weights).astype(np.float64)
 

@@ -1,4 +1,4 @@
-"""The table of results: one row per team, with means, rates and comparisons, for terminals, documents and notebooks."""
+"""The table of results: one row per team, with means, rates and comparisons."""
 
 from __future__ import annotations
 
@@ -38,13 +38,12 @@ HEAD = {
 
 
 class SummaryTable(list[SummaryRow]):
-    """The rows of a table of results, which ``print`` and notebooks show.
+    """The table of results, which ``print`` and notebooks show.
 
     >>> import ethbrake_marl as eb
     >>> table = eb.summarise(eb.evaluate("paper-random", "full_brake,coast", episodes=3))
     >>> [row.agent for row in table], table.parameters["scenario"], table.to_json()[0]["collisions"]
     (['full_brake', 'coast'], 'paper-random', 2)
-
     """
 
     def __init__(
@@ -79,7 +78,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
-        """Table for a terminal: intervals of the first columns below their values, of others nowhere."""
+        """Return the table for a terminal: the first columns with intervals below their values, the others without."""
         sheet, agent = self.sheet(), Column("Agent,\nwhat it knows", text=True)
         columns = [
             replace(each, interval="below" if each.name in FIRST_COLUMNS else "hidden")
@@ -91,7 +90,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
-        """Table of named measures without a column of their own; None without any."""
+        """Return the table of measures that have no column of their own, or None."""
         asked = {
             key: f"{key} ({measure.unit})" if measure.unit and each.kind != "decrease" else key
             for key, (measure, each) in self.shown.items()
@@ -127,7 +126,7 @@ class SummaryTable(list[SummaryRow]):
         return notes
 
     def meanings(self) -> dict[str, str]:
-        """Meanings of the columns: heading -> text."""
+        """Return heading -> what the column means."""
         own = {each.heading: measure.meaning for measure, each in self.shown.values() if each.heading}
         return HEAD | {name: text for name, text in own.items() if not name.startswith("Decrease")}
 
@@ -139,7 +138,7 @@ class SummaryTable(list[SummaryRow]):
         return self.sheet().latex()
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Plain data: one object per team, with the digests, versions and ``parameters`` of the result."""
+        """Return one object per team, with the digests, versions and ``parameters`` of the result."""
         identity = {key: self.parameters[key] for key in IDENTITY if key in self.parameters}
         parameters = {key: value for key, value in self.parameters.items() if key not in IDENTITY}
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
@@ -234,7 +233,7 @@ def _estimate(
 
 
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
-    """One table for each group of worlds, by its name, in alphabetical order.
+    """Return one table for each group of worlds, in alphabetical order.
 
     ``by``: ``scenario`` of a mixture, ``recording``, or a vehicle's type such as ``vehicle_2_type``. Raises
     ``InvalidInput`` if the worlds have no groups, ``UnknownName`` for another name.

@@ -1,4 +1,4 @@
-"""One row of a table of results: what one team did in all worlds."""
+"""What one team did in all worlds: a row of a table of results."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class SummaryRow:
         return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data: each estimate with interval, standard error and degrees of freedom, null if unknown."""
+        """Return each estimate with interval, standard error and degrees of freedom, null if unknown."""
         plain: dict[str, Any] = {
             "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
             "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,

@@ -1,1 +1,1 @@
-"""The game for other people's libraries: PettingZoo, Gymnasium, Gymnasium's vector environments, Stable-Baselines3."""
+"""The game for other libraries: PettingZoo, Gymnasium and its vector environments, Stable-Baselines3."""

@@ -13,7 +13,7 @@ from ethbrake_marl.motion.layout import Floats
 
 
 class Indices(Discrete):
-    """Indices of actions that are evenly spaced from -1 to 1; a model that stores its spaces shows it."""
+    """Indices of actions that are evenly spaced from -1 to 1. A model's stored spaces keep this class."""
 
     evenly_spaced = True
 

@@ -70,11 +70,11 @@ class Face:
         return self.stream.describe(self._begun("describe_worlds"))
 
     def describe_world(self) -> dict[str, Any]:
-        """Drawn values of the first running world."""
+        """Return the values of ``describe_worlds`` for the first world."""
         return {name: column[0].item() for name, column in self.describe_worlds().items()}
 
     def render(self) -> Any:
-        """Picture in the render mode; a tuple of many worlds."""
+        """Return what the render mode promises."""
         return self.renderer.render()
 
     def close(self, **kwargs: Any) -> None:

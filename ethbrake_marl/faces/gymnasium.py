@@ -20,11 +20,12 @@ from ethbrake_marl.worlds.game import AnyScenario
 
 
 class OneLearner(Face):
-    """What both of Gymnasium's interfaces share: a game with one learner, and its spaces."""
+    """A game with one learner, and its spaces, for both of Gymnasium's interfaces."""
 
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
     ) -> tuple[Any, Any]:
+        """Open the game; return the spaces of observations and actions."""
         self._open(open_game(*game), render_mode, most_steps)
         self.bodies, self.actions = self.game.rules.learners, actions
         names = [self.scenario.vehicle_names[i - 1] for i in self.bodies]
@@ -44,8 +45,8 @@ class OneLearner(Face):
 class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v1")``).
 
-    Action, end, infos and options of ``reset`` are those of ``EthBrakeParallelEnv``, as are the arguments: under
-    ``reward="honest"`` pushing hardly pays. There must be exactly one learner.
+    Arguments, actions, ends, infos and options of ``reset`` are those of ``EthBrakeParallelEnv``. There must be exactly
+    one learner.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -55,7 +56,6 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     >>> observation, reward, terminated, truncated, info = env.step([-1.0])
     >>> reward, terminated, truncated
     (0.0, False, False)
-
     """
 
     metadata: dict[str, Any] = render_metadata()  # as Gymnasium declares it

@@ -1,4 +1,4 @@
-"""Pictures of a running episode: an extension makes them, from states."""
+"""Pictures of a running episode, which extensions draw."""
 
 from __future__ import annotations
 
@@ -40,6 +40,7 @@ RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", registe
 
 
 def render_metadata() -> dict[str, Any]:
+    """Return the entries of an environment's ``metadata`` about pictures."""
     return {"render_modes": [*RENDERERS], "render_fps": FRAMES_PER_SECOND}
 
 

@@ -45,8 +45,7 @@ def make_sb3_vec_env(
 ) -> EthBrakeVecEnv:
     """``n_envs`` worlds for Stable-Baselines3, which are simulated together.
 
-    ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``; under
-    ``reward="honest"`` pushing hardly pays.
+    ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``.
 
     - ``seed``: of the stream of worlds; None: a random one.
     - ``horizon_is_end``: report an episode at the horizon as ended, not as truncated: the harm after the horizon is not
@@ -59,7 +58,6 @@ def make_sb3_vec_env(
     >>> import ethbrake_marl as eb
     >>> eb.make_sb3_vec_env("paper-random", 4, seed=7).reset().shape
     (4, 27)
-
     """
     check_whole_number("n_envs", n_envs, 1)
     opened = open_game(scenario, learners, reward, observation)
@@ -70,9 +68,8 @@ class EthBrakeVecEnv(Face, VecEnv):
     """Row ``k L + l`` is learner l of L (front to rear) in world k; the rows of a world share an episode.
 
     The last step of an episode has the infos ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return
-    ``r``, steps ``l``, and ``t``, always 0) and all others. The infos of the first moment of each running episode are
-    ``reset_infos``. All rows are simulated together, so they have one seed, one set of options and one set of
-    attributes.
+    ``r``, steps ``l``, and ``t``, always 0) and all others. ``reset_infos`` are those of each running episode's first
+    moment. All rows have the same seed, options and attributes.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -81,7 +78,6 @@ class EthBrakeVecEnv(Face, VecEnv):
     >>> observations, rewards, dones, infos = env.step(np.full((8, 1), -1.0))
     >>> rewards.shape
     (8,)
-
     """
 
     begins_again = True
@@ -142,7 +138,6 @@ class EthBrakeVecEnv(Face, VecEnv):
         return self._observe(state)
 
     def step_async(self, actions: Any) -> None:
-        """Keep the actions of the next step, [rows, 1]."""
         self._given = actions
 
     def step_wait(self) -> tuple[Observations, Any, Bools, list[dict[str, Any]]]:
@@ -202,7 +197,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return np.concatenate([rows, more], axis=1, dtype=np.float32)
 
     def snapshot(self) -> dict[str, Any]:
-        """Plain data from which ``restore`` goes on, between two steps."""
+        """Return all that ``restore`` needs, between two steps, as arrays and numbers."""
         stream = [self.stream.seed, self.stream.next]
         return copy.deepcopy({"stream": stream, **{name: getattr(self, name) for name in SAVED}})
 
@@ -221,20 +216,20 @@ class EthBrakeVecEnv(Face, VecEnv):
         return self.renderer.render() or []
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of this environment, once per row."""
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Set an attribute for all rows."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Call a method of this environment once; return its result once per row."""
+        """Call a method once; return its result once per row."""
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """False once per row: there are no environments of their own to wrap."""
+        """Return False once per row: there is nothing to wrap inside."""
         return [False for _ in self._get_indices(indices)]
 
     def _refuse_some_rows(self, what: str, indices: Any) -> None:

@@ -1,4 +1,4 @@
-"""One function puts a shield around an environment of any interface, or around a team."""
+"""Put a shield around an environment of any interface, or around a team."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, o
 
 
 def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
-    """Copy of an environment with a shield. A policy that is a name minimises ``harm_count``."""
+    """Return a shielded copy of an environment. A policy that is a name minimises ``harm_count``."""
     if isinstance(env, type) or not isinstance(base, Face):
         raise InvalidInput(
             f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"

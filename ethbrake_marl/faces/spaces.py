@@ -12,7 +12,7 @@ from ethbrake_marl.episode.features import Feature
 
 
 class FeatureBox(Box):
-    """A float32 box whose entries have names: ``features``, which travel with a model that stores its spaces."""
+    """A float32 box whose entries have names, ``features``, which a model stores with its spaces."""
 
     def __init__(self, features: Sequence[Feature]) -> None:
         self.features = tuple(feature.name for feature in features)

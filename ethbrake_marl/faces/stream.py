@@ -24,7 +24,7 @@ class UnknownResetOption(UserWarning):
 
 
 class Stream:
-    """The worlds of a game, row by row. World k of a seed is the same, in whatever row it comes."""
+    """The worlds of a game. World k of a seed is the same, in whatever row it comes."""
 
     def __init__(self, scenario: Scenario, game: Game) -> None:
         self.scenario, self.game = scenario, game
@@ -35,7 +35,7 @@ class Stream:
     def reset(self, n: int, seed: int | None, options: Any = None) -> State:
         """New episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
 
-        An error changes nothing. Raises ``InvalidInput`` for a bad seed or option; warns of unknown options.
+        Raises ``InvalidInput`` for a bad seed or option, and changes nothing then; warns of unknown options.
         """
         first = self.next if seed is None else 0
         seed = chosen_seed(self.seed if seed is None else seed)
@@ -62,7 +62,7 @@ class Stream:
         return {**columns, "world_seed": np.full(state.n, seed), "world": numbers}
 
     def _asked_for(self, n: int, options: Any) -> Drawn | None:
-        """Worlds of the options of a reset; None: it asks for none."""
+        """Return the worlds that the options of a reset ask for, or None."""
         if options is None:
             return None
         if not isinstance(options, Mapping):
@@ -94,7 +94,7 @@ class Stream:
 
 
 def chosen_seed(seed: int | None) -> int:
-    """The seed, or one of 63 bits from the operating system. Raises ``InvalidInput``."""
+    """Return the seed, or a random one of 63 bits from the operating system. Raises ``InvalidInput``."""
     if seed is None:
         return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:

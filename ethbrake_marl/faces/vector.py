@@ -97,12 +97,11 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         return self._observe(state), self._rewards(step)[:, 0], step.terminated, step.truncated, infos
 
     def render(self) -> Any:
-        """A picture of every world."""
         pictures = super().render()
         return None if pictures is None else tuple(pictures)
 
     def _columns(self, state: State, step: Step | None, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """Infos as Gymnasium's vector environments have them: values, and a mask of the rows that have one.
+        """Return infos in the form of Gymnasium's vector environments: values, and a mask of the rows that have one.
 
         The cost and the terms of rows that have not ``stepped`` are 0: the last step belongs to another episode.
         """

@@ -1,1 +1,1 @@
-"""Read files strictly; write files completely or not at all. All code for file formats is in this folder."""
+"""File formats: read files strictly, write them whole or not at all."""

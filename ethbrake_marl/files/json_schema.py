@@ -22,14 +22,14 @@ class FileSchema(GenerateJsonSchema):
 
     @staticmethod
     def publish(schema: dict[str, Any]) -> dict[str, Any]:
-        """Copy of ``schema`` that begins with the version of the JSON Schema language (``$schema``)."""
+        """Return a schema that begins with ``$schema``."""
         return {"$schema": DIALECT, **schema}
 
 
 def schema_lines(kind: str, command: str) -> str:
-    """Comment lines for a new YAML file: its JSON schema and the command that prints it.
+    """Return comment lines for a new YAML file that name its schema and the command that prints it.
 
-    ``kind`` is ``scenario`` or ``recipe``; ``command`` is a subcommand of ``ethbrake`` such as ``scenario schema``.
+    ``kind`` is ``scenario`` or ``recipe``; ``command`` is a subcommand such as ``scenario schema``.
     """
     return (
         f"# yaml-language-server: $schema={kind}.schema.json\n"

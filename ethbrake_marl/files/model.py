@@ -1,4 +1,4 @@
-"""Pydantic models of files, and the error for the first mistake: its place, the value, and what would be valid."""
+"""Pydantic models of files, and the error message for the first mistake in a file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 class FileModel(BaseModel):
-    """Immutable content of a file, with a field for each key; unknown keys and wrong types are errors."""
+    """Base class of the models of a file's content, which are immutable; unknown keys and wrong types are errors."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
@@ -64,16 +64,13 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 
 
 class Wording:
-    """Texts for error messages about one kind of file; an empty text says nothing.
-
-    The argument ``needed`` is the text for every missing key.
-    """
+    """Texts for error messages about one kind of file, which a subclass may override; an empty text says nothing."""
 
     def __init__(self, model: type[BaseModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Keys that are possible in place of the last key of ``path``."""
+        """Return the keys that are possible in place of the last key of ``path``."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -81,7 +78,7 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
-        """Advice on what to write for the missing key at ``path``."""
+        """Return advice on what to write for the missing key at ``path``."""
         return self._needed
 
     def instead(self, key: str) -> str:
@@ -98,7 +95,7 @@ class Wording:
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """The error for a document that does not match its model: an unknown key, or else the first mistake."""
+    """Return the error for the first mistake that pydantic found: an unknown key, if there is one."""
     # A default that depends on an invalid field is no mistake of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     shown = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
@@ -130,9 +127,9 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
-    """Content of a JSON file that a program wrote, as plain data and as an object of class ``model``.
+    """Return the content of a JSON file that a program wrote, as plain data and as a ``model``.
 
-    Raises ``ValueError`` with a one-line reason for invalid content.
+    Raises ``ValueError`` with a one-line reason.
     """
     content = parse_strict_json(data)  # refuses repeated keys and NaN
     try:
@@ -142,7 +139,7 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """The first mistake that pydantic found in data from a program; its ``str`` says where it is and what is valid."""
+    """A mistake in data from a program; its ``str`` says where it is and what is valid."""
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     given: Any  # the invalid value
@@ -153,7 +150,6 @@ class Mistake(NamedTuple):
 
 
 def first_mistake(error: ValidationError) -> Mistake:
-    """First mistake of a file that a program wrote, or of settings in code."""
     detail = error.errors(include_url=False)[0]
     right = {"missing": "is missing", "extra_forbidden": "is an unknown key"}.get(detail["type"])
     return Mistake(".".join(str(key) for key in path_of(detail)), detail["input"], right or _right(detail))
@@ -185,7 +181,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Invalid value as text, empty if the whole file is invalid. A float for a whole number keeps its decimal point."""
+    """Return the invalid value, or "" for a whole file. A float in place of a whole number keeps its decimal point."""
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:
         return ""
@@ -199,7 +195,7 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 
 def _unquote(detail: ErrorDetails) -> str:
-    """Advice for a number in quotes, which is a text in YAML; empty for any other mistake."""
+    """Return advice for a number in quotes, which is a text in YAML."""
     value = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(value, str) and parse_numeral(value) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""

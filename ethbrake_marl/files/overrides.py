@@ -1,4 +1,4 @@
-"""Settings ``key.path=value`` of the command line, whose values are YAML, for plain data."""
+"""Settings ``key.path=value`` from the command line, with values in YAML."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ class Override:
 
     @property
     def top(self) -> str:
-        """First key of the path: ``reward`` for ``reward.harm=0.5``."""
+        """First key: ``reward``."""
         return self.path[0]
 
     @property
     def key(self) -> str:
-        """Path with dots between the keys: ``reward.harm`` for ``reward.harm=0.5``."""
+        """Whole path: ``reward.harm``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """The setting without its first key: ``harm=0.5`` for ``reward.harm=0.5``."""
+        """Return the setting without its first key: ``harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
@@ -67,7 +67,7 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Copy of ``part`` in which ``path``, the end of ``override.path``, has the value of ``override``.
+    """Return a copy of ``part`` with the value of ``override`` at ``path``, the end of ``override.path``.
 
     Missing mappings along the path are created.
     """

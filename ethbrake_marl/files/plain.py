@@ -24,6 +24,7 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
+    """Return the content of a plain file. Raises ``refusal`` as ``open_plain`` does."""
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
         data = stream.read(limit_bytes + 1)  # files of /proc say that they are empty, and a file may grow
     if len(data) > limit_bytes:
@@ -39,11 +40,11 @@ def open_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> Iterator[BufferedReader]:
-    """Open a plain file of at most ``limit_bytes`` for reading.
+    """Open a plain file of at most ``limit_bytes``.
 
     Kind and size are checked before it is opened, so a pipe or device is not opened. Raises ``refusal`` with path and
-    reason if the file does not exist, is not a plain file (or is a symbolic link and ``follow_links`` is False), is too
-    large, or cannot be opened.
+    reason if it does not exist, is not a plain file (or a symbolic link where ``follow_links`` is False), is too large,
+    or cannot be opened.
     """
     file = Path(path)
     try:
@@ -71,7 +72,7 @@ def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> Et
 
 
 def parse_strict_json(data: bytes) -> Any:
-    """Parse UTF-8 JSON; raise ``ValueError`` with a one-line reason for repeated keys, NaN or invalid text."""
+    """Parse UTF-8 JSON. Raises ``ValueError`` with a one-line reason for repeated keys, NaN or invalid text."""
     try:
         return json.loads(
             data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_not_a_number, parse_float=_finite
@@ -81,7 +82,7 @@ def parse_strict_json(data: bytes) -> Any:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """JSON object in a file of a training run. Raises ``InvalidInput`` if the file is missing or damaged."""
+    """Return the JSON object in a file of a training run. Raises ``InvalidInput`` if it is missing or damaged."""
     data = read_plain(file, LARGEST_OBJECT_BYTES)
     try:
         content = parse_strict_json(data)

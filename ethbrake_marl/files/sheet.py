@@ -1,4 +1,4 @@
-"""A table of estimates and texts, for terminal, Markdown, HTML, CSV and JSON."""
+"""``Sheet``: a table of estimates and texts for terminal, Markdown, LaTeX, HTML, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -21,8 +21,6 @@ _AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """An estimated value and its confidence interval."""
-
     value: float
     interval: tuple[float, float] | None  # low and high end; None if it cannot be computed, as for one world
     # standard error, and its degrees of freedom; None where they are not known
@@ -31,11 +29,11 @@ class Estimate:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Low and high end of the interval; both equal the value if there is no interval."""
+        """Ends of the interval; both equal the value if there is none."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Estimate and interval as in a ``Column``: ``24.19 [23.85, 24.53]``."""
+        """Return estimate and interval as in a ``Column``: ``24.19 [23.85, 24.53]``."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
@@ -44,7 +42,7 @@ class Estimate:
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Estimates for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; null if unknown."""
+        """Return estimates for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; null if unknown."""
         cells: dict[str, Any] = {}
         for name, each in estimates.items():
             cells[name] = None if each is None else each.value
@@ -53,14 +51,13 @@ class Estimate:
 
 
 class Shown(NamedTuple):
-    """Text of a table cell: the value, and the interval if the cell is an estimate."""
+    """Text of a cell: the value, and the interval of an estimate."""
 
     value: str  # the number with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
 
     @property
     def in_words(self) -> str:
-        """Value and interval in one line: ``24.19 [23.85, 24.53]``."""
         return f"{self.value} [{self.interval}]" if self.interval else self.value
 
 
@@ -69,7 +66,7 @@ Cell = Estimate | Shown | float | int | str | None
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table, with the format of its numbers. Integers and texts are not changed."""
+    """A column, with the format of its numbers. Integers and texts are not changed."""
 
     heading: str  # heading in documents
     key: str = ""  # name in CSV and JSON; "": the heading
@@ -83,10 +80,11 @@ class Column:
 
     @property
     def name(self) -> str:
+        """Name in CSV and JSON."""
         return self.key or self.heading
 
     def show(self, cell: Cell) -> Shown:
-        """Format a cell of this column; None becomes a dash."""
+        """Format a cell; None becomes a dash."""
         if cell is None or isinstance(cell, Shown):
             return cell or Shown(DASH)
         if isinstance(cell, str | int):
@@ -97,7 +95,7 @@ class Column:
         return Shown(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
 
     def in_terminal(self, shown: Shown) -> str:
-        """Text of a cell in a terminal, whose lines after the first are less prominent."""
+        """Return the text of a cell in a terminal; lines after the first are dim."""
         if self.interval == "beside":
             return shown.in_words
         return shown.value + (f"\n{shown.interval}" if shown.interval and self.interval == "below" else "")
@@ -143,7 +141,7 @@ class Sheet:
         return [column.name for column in self._columns()]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
-        """Each row as a tuple of formatted cells, one per column, and each section as its name."""
+        """Yield each row as its formatted cells, and each section as its name."""
         columns = self._columns()
         for row in self.rows:
             if isinstance(row, str):
@@ -153,13 +151,13 @@ class Sheet:
                 yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """The table reduced to these columns (indices from 0)."""
+        """Return the table reduced to these columns (from 0)."""
         names = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Indices of the columns in which some row has a value; all indices if the table has no rows."""
+        """Return the indices of the columns in which some row has a value; all if there are no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
@@ -235,7 +233,7 @@ class Sheet:
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
     def latex(self) -> str:
-        """LaTeX ``tabular`` with the rules of ``booktabs``, without title and note."""
+        """Return a LaTeX ``tabular`` with the rules of ``booktabs``, without title and note."""
         columns = self._columns()
         lines = [" & ".join(_latex(column.heading) for column in columns) + r" \\", r"\midrule"]
         for row in self.shown():
@@ -245,9 +243,9 @@ class Sheet:
         return "\n".join([rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", *lines, r"\bottomrule", r"\end{tabular}"])
 
     def html(self) -> str:
-        """HTML for a notebook or a page, with the title above and the note below.
+        """Return the table as HTML, with the title above and the note below.
 
-        All content is escaped unless it has a method ``__html__``. The first cell of a row is the heading of the row.
+        All content is escaped unless it has a method ``__html__``. The first cell of a row is its heading.
         """
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
@@ -274,10 +272,7 @@ class Sheet:
         return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
-        """One mapping per row: name of a column -> cell; an estimate also has an entry for its interval.
-
-        Sections are omitted.
-        """
+        """Return a mapping per row, without sections: name of a column -> cell; an interval has its own entry."""
         rows = []
         for row in self.rows:
             if not isinstance(row, str):
@@ -288,7 +283,6 @@ class Sheet:
         return rows
 
     def csv(self) -> str:
-        """CSV text (``csv_text``), one line per row."""
         return csv_text(self.json())
 
 
@@ -315,10 +309,7 @@ def flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    """CSV text of ``flat`` rows with a header line: all columns, in order of appearance.
-
-    None and missing values are written as empty cells.
-    """
+    """Return ``flat`` rows as CSV with a header: all columns, in order of appearance. Missing values are empty."""
     lines = [flat(row) for row in rows]
     text = io.StringIO(newline="")
     names = dict.fromkeys(name for line in lines for name in line)
@@ -340,9 +331,6 @@ def _latex(text: str) -> str:
 
 
 def _html(value: object) -> str:
-    """Escape ``value`` for HTML, with control and direction characters as Python escapes.
-
-    An object with a method ``__html__`` gives its own HTML.
-    """
+    """Return ``value.__html__()``, or its text escaped for HTML, with control characters as Python escapes."""
     known: Callable[[], str] | None = getattr(value, "__html__", None)
     return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, which appear completely or not at all, even after a crash; and lock files."""
+"""Atomic writing of files and folders, which appear whole or not at all, even after a crash; and lock files."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ _HIDDEN, _UNFINISHED = ".ethbrake-", ".partial"
 
 
 def write_file(path: Path, data: bytes) -> None:
+    """Write or replace a file. A reader sees either the old or the new content."""
     with new_file(path) as partial:
         partial.write_bytes(data)
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Path of a temporary file, which is renamed to ``path`` if the block succeeds, else deleted."""
+    """Yield a temporary path, whose file is renamed to ``path`` if the block succeeds, else deleted."""
     partial = _temporary(path.parent)
     try:
         yield partial
@@ -40,8 +41,8 @@ def new_file(path: Path) -> Iterator[Path]:
 def check_target(path: str | Path, *, force: bool = False) -> Path:
     """Check, before a long computation, that a file can be written to ``path``.
 
-    Raises ``AlreadyExists`` if the file exists and ``force`` is False. Raises ``InvalidInput`` if the file cannot be
-    written, or if ``path`` is a folder, device, pipe or symbolic link, which ``force`` does not replace.
+    Raises ``AlreadyExists`` if it exists and ``force`` is False. Raises ``InvalidInput`` if it cannot be written, or is
+    a folder, device, pipe or symbolic link, which ``force`` does not replace.
     """
     target = Path(path)
     try:
@@ -67,10 +68,10 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
-    """Check that ``path``, which need not exist, can be used as a folder for results; it is not created.
+    """Check that ``path`` can be a folder for results. It need not exist and is not created.
 
-    Raises ``InvalidInput`` if the path is not a folder or is not writable. Raises ``AlreadyExists`` if the folder
-    contains one of the file names in ``files`` and ``force`` is False.
+    Raises ``InvalidInput`` if it is not a folder or not writable, and ``AlreadyExists`` if it has one of ``files`` and
+    ``force`` is False.
     """
     try:
         places = (path, *path.absolute().parents)
@@ -87,16 +88,16 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
 
 
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write ``data`` to ``path``; raises the errors of ``check_target``."""
+    """Write a file. Raises the errors of ``check_target``."""
     write_file(check_target(path, force=force), data)
 
 
 @contextmanager
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """A temporary folder, which is renamed to ``path`` if the block succeeds, else deleted.
+    """Yield a temporary folder, which is renamed to ``path`` if the block succeeds, else deleted.
 
-    With ``replace``, an existing folder is then deleted. Without it, ``AlreadyExists`` is raised if ``path`` exists
-    before or after the block.
+    With ``replace`` an existing ``path`` is deleted after the block; without, it raises ``AlreadyExists``, before the
+    block or after it.
     """
     if not replace:
         _refuse_existing(path)
@@ -118,14 +119,14 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete a folder; it is renamed first, so an interruption leaves no half-deleted ``path``."""
+    """Delete a folder. It is renamed first, so an interruption leaves no half-deleted ``path``."""
     aside = _temporary(path.parent)
     path.rename(aside)
     shutil.rmtree(aside)
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete temporary files that killed processes left in ``folder``; no other process may be writing there."""
+    """Delete temporary files of killed processes; no other process may be writing in ``folder``."""
     for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left)
@@ -135,10 +136,9 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def hold_lock(lock: Path, other: str) -> Iterator[None]:
-    """Hold the lock file ``lock`` while the block runs. The lock is also released if the process ends.
+    """Hold a lock file while the block runs. The end of the process releases it too.
 
-    Raises ``InvalidInput`` if another process holds the lock (with the message ``other``), or if the file cannot be
-    used as a lock.
+    Raises ``InvalidInput`` if another process holds it (message ``other``), or if it cannot be used as a lock.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:

@@ -20,7 +20,7 @@ _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def parse_numeral(text: str) -> float | None:
-    """Number that ``text`` represents (infinity if it is too large), or None if it is not a number."""
+    """Return the number in ``text``, infinity if it is too large; None if it is not a number."""
     return float(text) if _NUMERAL.fullmatch(text) else None
 
 
@@ -30,7 +30,7 @@ _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """Text in YAML's flow style; reading it gives an equal value.
+    """Return ``value`` in YAML's flow style; reading the text gives an equal value.
 
     ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null. For error
     messages, the text is cut off after ``longest`` characters.
@@ -92,9 +92,9 @@ class Document:
     lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
     def where(self, path: YamlPath) -> str:
-        """File and line number of the value at ``path``, such as ``my.yaml, line 7``.
+        """Return file and line number of a value, such as ``my.yaml, line 7``.
 
-        If the value does not exist, the line is that of the innermost mapping or list around the path.
+        If it does not exist: the line of the innermost mapping or list around the path.
         """
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
@@ -111,17 +111,14 @@ class Document:
 
 
 def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
-    """Read a YAML file of at most ``limit`` bytes.
-
-    Raises ``InvalidInput`` with file, line, column and reason if the file is not valid.
-    """
+    """Read a YAML file of at most ``limit`` bytes. Raises ``InvalidInput`` with file, line, column and reason."""
     return parse_yaml(read_plain(path, limit), str(Path(path)), limit)
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT) -> Document:
-    """Parse one YAML document (text or UTF-8 bytes) of at most ``limit`` bytes; ``file`` names it in error messages.
+    """Parse one YAML document of at most ``limit`` bytes; messages call it ``file``.
 
-    Raises ``InvalidInput`` with file, line, column and reason if the document is not valid.
+    Raises ``InvalidInput`` with file, line, column and reason.
     """
     data = text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text
     if len(data) > limit:
@@ -183,7 +180,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
-    """Value of a node; the line numbers of all its values are added to ``lines``."""
+    """Return the value of a node; add the line numbers of all its values to ``lines``."""
     lines.setdefault(path, node.start_mark.line + 1)
     if isinstance(node, yaml.ScalarNode):
         return _scalar(node)

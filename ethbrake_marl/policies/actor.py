@@ -1,4 +1,4 @@
-"""What a policy does: from observations to actions, without torch."""
+"""From observations to a policy's actions, without torch."""
 
 from __future__ import annotations
 

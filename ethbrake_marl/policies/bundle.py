@@ -82,7 +82,7 @@ def shipped_policies() -> dict[str, Path]:
 
 
 def load_shipped(name: str) -> Policy:
-    """Shipped policy ``name``, such as ``universal``. Raises ``UnknownName``."""
+    """Return a shipped policy, such as ``universal``. Raises ``UnknownName``."""
     folders = shipped_policies()
     if name not in folders:
         raise unknown_name("shipped policy", name, folders)

@@ -20,7 +20,7 @@ SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 
 
 def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers:
-    """Layers of the network whose tensors are called ``name.0.weight`` to ``name.output.bias``."""
+    """Return the layers whose tensors are called ``name.0.weight`` to ``name.output.bias``."""
     names = [f"{name}.{k}" for k in range(hidden)] + [f"{name}.output"]
     return [
         (np.ascontiguousarray(tensors[f"{each}.weight"]), np.ascontiguousarray(tensors[f"{each}.bias"]))

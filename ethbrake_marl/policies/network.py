@@ -81,7 +81,7 @@ class NetworkSpec(FileModel):
 
     @property
     def format_version(self) -> Literal[2, 3, 4, 5]:
-        """Version of the file format that has what this network needs."""
+        """Lowest version of the file format that has what this network needs."""
         if self.choices is not None:
             return 5 if self.among else 4
         return 2 if self.networks == 1 else 3

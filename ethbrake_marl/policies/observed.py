@@ -120,12 +120,12 @@ class ObservationSchema(Finite):
 
 
 def _is_ours(own: Own) -> bool:
-    """Whether a feature belongs to this package, which changes it knowingly only."""
+    """Return whether this package has the feature, which then never changes by accident."""
     return str(getattr(own.function, "__module__", "")).startswith("ethbrake_marl.")
 
 
 def _tried(own: Own) -> tuple[float, ...]:
-    """Observed values of a feature in one world if it belongs to this package, or in three."""
+    """Return what vehicles of a line observe of a feature: in one world if this package has it, or in three."""
     state = _trial_worlds()
     if _is_ours(own):
         state = state.take(slice(1))

@@ -111,7 +111,7 @@ def serialised(tensors: Mapping[str, Float32s]) -> bytes:
 
 
 def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
-    """Tensors of a file, read-only, by name.
+    """Return name -> read-only tensor of a file.
 
     Raises ``ValueError`` for a tensor whose name or shape is not the network's, or an entry that is not finite.
     """

@@ -1,10 +1,10 @@
 """The paper's hybrid (Algorithm 1): at the alert, the policy or E-V2X-BM gets the whole episode, whichever does less
 harm.
 
-The policy is played from the alert on; its harm is compared with H*, the harm of E-V2X-BM's constant deceleration. With
-the coupled H*, the harm of the episode is the smaller of both numbers, to the last bit, if the policy drives again as
-it was played (a policy with random actions does not). With the paper's own pairwise H* nothing is bounded: it is about
-half of the harm that this deceleration does.
+The harm of the policy, played from the alert on, is compared with H*, the harm of E-V2X-BM's constant deceleration.
+With the coupled H*, which is the price of this deceleration, the harm of the episode is the smaller of both, to the
+last bit, if the policy drives again as it was played (a policy with random actions does not). With the paper's own
+pairwise H* nothing is bounded: it is about half of the harm that this deceleration does.
 """
 
 from __future__ import annotations
@@ -32,8 +32,6 @@ ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the a
 
 
 class Memory(NamedTuple):
-    """Memory of n episodes with one learner."""
-
     chosen: Bools  # [n] whether the policy drives
     policy_harm: Floats  # [n] harm of the policy's play (m2/s2)
     bound_harm: Floats  # [n] H* (m2/s2)
@@ -98,6 +96,7 @@ class EpisodeShield:
         )
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
+        """Return name -> [n] or [n, N]."""
         memory: Memory = state.memories["shield"]
         return {
             "chosen_policy": memory.chosen,

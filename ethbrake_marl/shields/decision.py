@@ -1,4 +1,4 @@
-"""What every shield reports of its last decision, and a reward term that counts replaced actions."""
+"""What every shield reports of its last decision, and the reward term that counts replaced actions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ShieldReason(IntEnum):
 
     @property
     def text(self) -> str:
-        """Reason in words, such as "no certificate"."""
+        """Such as "no certificate"."""
         return self.name.lower().replace("_", " ")
 
 

@@ -1,6 +1,7 @@
 """Plans for a shield: what may follow an action, and what the learners do if nobody proposes anything.
 
-A plan [n, T, L] has the learners' actions at every decision. The shield prices each plan itself.
+A plan [n, T, L] has the learners' actions at every decision. Nothing here is trusted: the shield asks for the price
+of each plan.
 """
 
 from __future__ import annotations
@@ -54,9 +55,9 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
     """Best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
 
     Their harm is the largest over the states that a world may be in, which stand one after the other in ``states``.
-    Tried are the plan's next actions, all of them a little harder or softer: small changes mend deviations from a good
-    plan far more often than a fixed set of constants that spans all brakes. With several learners, also these actions
-    with another one of a single learner, from all of its brakes.
+    Tried are the plan's next actions, and all of them a little harder or softer: small changes mend deviations from a
+    good plan far more often than constants that span all brakes. With several learners, also these actions with
+    another one of a single learner, from all of its brakes.
     """
     learners, rows, each = game.rules.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]

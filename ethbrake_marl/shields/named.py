@@ -1,4 +1,4 @@
-"""Shields by name: after a ``+`` in an agent's name, and as the mode of ``eb.shield``."""
+"""Shields by name: what stands after a ``+`` in an agent's name, and the mode of ``eb.shield``."""
 
 from __future__ import annotations
 

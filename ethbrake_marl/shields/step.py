@@ -58,8 +58,6 @@ NO_DECISION, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER,
 
 
 class Memory(NamedTuple):
-    """Memory of n episodes with L learners."""
-
     plan: Floats  # [n, T, L] actions at every decision; only those from now on count
     price: Floats  # [n] harm of the episode under the plan (m2/s2)
     first: Floats  # [n] price at the alert (m2/s2)
@@ -133,14 +131,13 @@ class StepShield:
         return rollout(game, self.drivers, state, plans, self.count, most)
 
     def bound(self, memory: Memory) -> Floats:
-        """Bound on the harm of each episode, [n] m2/s2."""
         return np.maximum(memory.price, memory.first + self.allowance) if self.allowance else memory.price
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
         return self.first_memory(game, alert, state, state, self.agents_at(game, alert))
 
     def agents_at(self, game: Game, alert: State) -> dict[int, Any]:
-        """Memories of the shield's agents for new episodes, body -> memory."""
+        """Return body -> memory of the shield's agents for new episodes."""
         return {body: begin(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
@@ -148,7 +145,7 @@ class StepShield:
         return first_plans(game, alert, state, self.count)
 
     def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
-        """Memory at the first decision ``state``: the best constant actions, or the agents' own play."""
+        """Return the memory at the first decision: the best constant actions, or the agents' own play."""
         rows, plans = np.arange(state.n), self.plans(game, alert, state, states)
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         plan, harm = np.stack(plans)[prices.argmin(axis=0), rows], prices.min(axis=0)
@@ -207,7 +204,7 @@ class StepShield:
     def asked(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
         """Proposals, [n, L], NaN for none, and the state with the memories of the shield's agents.
 
-        They propose what nobody else does. If one remembers, they are asked at every decision.
+        The agents propose where nobody else does. If one has a memory, they are asked at every decision.
         """
         memories = {who: kept for who, kept in state.memories.items() if who != "shield"}
         own = dict(zip(self.drivers, state.memories["shield"].agents, strict=True))
@@ -258,6 +255,7 @@ class StepShield:
         return reason, least
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
+        """Return name -> [n] or [n, N]."""
         memory: Memory = state.memories["shield"]
         borne = {}
         if memory.caps is not None:

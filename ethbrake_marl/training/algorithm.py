@@ -1,4 +1,4 @@
-"""What a learning algorithm is: it builds a model of Stable-Baselines3."""
+"""What a learning algorithm is: it builds a model of Stable-Baselines3, which can then be trained."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Ta
 
 
 class Algorithm(ABC):
-    """Base class of learning algorithms. Only ``build`` must be written; PPO's and SAC's networks need no more.
+    """Base class of learning algorithms. Only ``build`` must be written if the networks are PPO's or SAC's.
 
-    Checkpoints save what Stable-Baselines3 itself saves of the model: the state of what its method
-    ``_get_torch_save_params`` names. A model with further memory names it there.
+    Checkpoints save the part of the model that its method ``_get_torch_save_params`` names; a model with further
+    memory names it there.
     """
 
     @abstractmethod
@@ -33,14 +33,11 @@ class Algorithm(ABC):
         """
 
     def actors(self, model: BaseAlgorithm) -> list[Any]:
-        """Policies inside the model that choose actions, one for each of ``training.groups``."""
+        """Return the policies that choose actions, one for each of ``training.groups``."""
         return [model.policy]
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Copy of an actor's weights: name in a policy file -> tensor.
-
-        The networks are PPO's if the action is clipped, else SAC's.
-        """
+        """Return a copy of the weights: name in a policy file -> tensor. If actions are clipped, they are PPO's."""
         if network.output != "clip":
             inner = actor.actor
             return tensors_of("policy", [*inner.latent_pi, inner.mu]) | _of_layer("policy.log_std", inner.log_std)
@@ -53,7 +50,7 @@ class Algorithm(ABC):
 
 
 def tensors_of(name: str, layers: Iterable[nn.Module]) -> dict[str, Float32s]:
-    """Weights of a perceptron's linear layers: ``name.0.weight``, ... ``name.output.bias``."""
+    """Return the weights of linear layers: ``name.0.weight``, ... ``name.output.bias``."""
     *hidden, output = (layer for layer in layers if isinstance(layer, nn.Linear))
     tensors: dict[str, Float32s] = {}
     for k, layer in enumerate(hidden):

@@ -1,7 +1,7 @@
-"""Checkpoints: everything on which the rest of a training depends, between two updates. Reading one runs no code.
+"""Checkpoints: everything on which the rest of a training depends, between two updates.
 
-A checkpoint is a file of ``torch.save`` with plain data and tensors only, read with ``weights_only=True``. The CRC-32
-of its parts, which torch writes and does not check, shows damage.
+A checkpoint is a file of ``torch.save`` with plain data and tensors only, read with ``weights_only=True``: no code
+runs. The CRC-32 of its parts, which torch writes and does not check, shows damage.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ LARGEST_BYTES = 1 << 36
 
 
 def capture(model: BaseAlgorithm) -> dict[str, Any]:
-    """State of a model, its environment and the global random generators, as plain data and arrays."""
+    """Return the state of a model, its environment and the global random generators."""
     environment: Any = model.env
     memory: Any = getattr(model, "replay_buffer", None)
     log = model.logger
@@ -56,10 +56,7 @@ def capture(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
-    """Let a new model of the same training, which has a logger, go on from what ``capture`` returned.
-
-    Raises an error of Python, NumPy or torch if it does not fit.
-    """
+    """Let a new model, which has a logger, go on from ``saved``. Errors of Python, NumPy or torch: it does not fit."""
     environment: Any = model.env
     model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs, np.bool_)
     new = capture(model)
@@ -121,12 +118,12 @@ def to_tensors(tree: Any) -> Any:
 
 
 def files_in(folder: Path) -> list[Path]:
-    """Checkpoints in a folder, newest first, unread."""
+    """Return the checkpoints, newest first."""
     return sorted(folder.glob("step_*.pt"), reverse=True)
 
 
 def write(folder: Path, saved: Mapping[str, Any]) -> None:
-    """Write a checkpoint, whole or not at all, and delete all but the newest two."""
+    """Write a checkpoint; delete all but the newest two."""
     data = io.BytesIO()
     torch.save(to_tensors(dict(saved)), data)
     folder.mkdir(exist_ok=True)
@@ -136,7 +133,7 @@ def write(folder: Path, saved: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint. Raises ``CorruptBundle`` if it is damaged or has other content."""
+    """Read a checkpoint. Raises ``CorruptBundle`` if it is damaged or something else."""
     with open_plain(path, LARGEST_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
         try:
             damaged = zipfile.ZipFile(stream).testzip()
@@ -150,7 +147,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def newest(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
-    """The newest whole checkpoint, or None, and why newer ones are not whole: these are deleted."""
+    """Return the newest checkpoint that is whole, or None, and what is wrong with newer ones, which are deleted."""
     reasons: list[str] = []
     for path in files_in(folder):
         try:

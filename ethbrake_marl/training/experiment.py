@@ -1,7 +1,4 @@
-"""The main experiment: train the learners, then evaluate them, their shield and the baselines on one list.
-
-A *report* is what an extension adds: it names measures, and gets the finished experiment.
-"""
+"""The main experiment: train, and compare what was learned, its shield and the baselines in the same worlds."""
 
 from __future__ import annotations
 
@@ -46,7 +43,7 @@ class Experiment(NamedTuple):
     def in_another(
         self, scenario: Scenario, episodes: int, baselines: Sequence[str], measures: Sequence[str]
     ) -> Compared:
-        """Evaluate the learned team, its shield and baselines on the list of another scenario."""
+        """Repeat the comparison in another scenario."""
         count = self.compared.harm_count
         teams = compared_teams(self.trained, scenario, count, baselines)
         seed = self.compared.result.about["seed"]
@@ -54,12 +51,12 @@ class Experiment(NamedTuple):
 
 
 class Report(Protocol):
-    """Writes something about an experiment into the run's folder."""
+    """Writes something about an experiment into the run's folder; extensions have their own."""
 
     measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Write it; return the tables to print, and a text that says where it is."""
+        """Return the tables to print, and a text that says where the report is."""
 
 
 class Tables:
@@ -87,10 +84,10 @@ def run_experiment(
 ) -> tuple[Experiment, Sequence[Any], str]:
     """Train, compare, and write ``results.json``, ``worlds.csv`` and a report into the run's folder.
 
-    All compared agents minimise the count of harm that is trained for (``reward.harm_count``). Ctrl-C stops the
-    training after the current update; what was learned so far is compared. A second Ctrl-C raises
-    ``KeyboardInterrupt``; the folder keeps the policy. ``run.json`` records how the run ended. The other arguments are
-    those of ``train`` and ``evaluate``, and so are the errors.
+    Agents that optimise minimise the count of harm that is trained for (``reward.harm_count``). Ctrl-C stops the
+    training after the current update, and what was learned so far is compared; a second Ctrl-C raises
+    ``KeyboardInterrupt``. ``run.json`` records how the run ended. Other arguments and errors: as in ``train`` and
+    ``evaluate``.
 
     Returns the experiment, and the tables and the text of the report. Raises ``InvalidInput``, before any work, for a
     scenario without exact impacts, which shields and reports need.
@@ -130,7 +127,7 @@ def run_experiment(
 
 
 def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
-    """Names that can be used; why others cannot is reported as progress. Raises what full braking raises."""
+    """Return the names that can be used, and report why others cannot. Raises what ``use`` raises for full braking."""
     found = []
     for number, name in enumerate(names):
         try:
@@ -146,9 +143,9 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 def compared_teams(
     trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
-    """Teams to compare, by name: baselines, then the learned team, without and with a shield.
+    """Return the teams to compare: baselines, then what was learned, without and with a shield.
 
-    With several learners there is also the team ``all but vehicle_i`` for each learner, which then brakes fully.
+    With several learners there is also a team for each learner in which this one brakes fully.
     """
     agents: dict[str, Any] = {name: name for name in baselines}
     if len(trained.policies) == 1:
@@ -162,5 +159,4 @@ def compared_teams(
 
 
 def without(vehicle: str) -> str:
-    """Name of the trained team in which ``vehicle`` brakes fully."""
     return f"all but {vehicle}"

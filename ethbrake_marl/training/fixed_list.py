@@ -25,7 +25,7 @@ OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Function that measures policies on the fixed list of worlds of the recipe's key ``evaluation``.
+    """Return the function that measures policies on the recipe's fixed list of worlds (key ``evaluation``).
 
     Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (of exact impacts only),
     ``collision_rate``, ``horizon_rate`` (a vehicle still moves at the horizon) and, where a learner's objective is not
@@ -60,10 +60,9 @@ def metrics_of(training: Training, last: State) -> dict[str, float]:
 
 
 def mean(values: Floats) -> float:
-    """Exactly rounded mean."""
     return math.fsum(values) / len(values)
 
 
 def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
-    """The metric that is smallest for the best policies; NaN if it was not measured."""
+    """Return the metric that the best policies minimise; NaN if it was not measured."""
     return metrics.get(OBJECTIVE, metrics.get(COLUMN[harm_count], np.nan))

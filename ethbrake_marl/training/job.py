@@ -1,4 +1,4 @@
-"""A training in a folder in which it may have begun already, for sweeps and studies of many trainings."""
+"""One training of many, as sweeps and studies run them: it is begun, resumed or read, whichever is left to do."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ MEASURED = (*COLUMN.values(), "collision_rate")
 
 @contextmanager
 def folder_of_many(folder: Path, *results: str) -> Iterator[None]:
-    """Create the folder of many trainings; no other process can work in it. The files ``results`` may be replaced.
+    """Create the folder of many trainings and lock it. The files ``results`` may be replaced.
 
-    Raises ``InvalidInput`` if one does, or if the folder cannot be used.
+    Raises ``InvalidInput`` if another process works in it, or if it cannot be used.
     """
     check_folder(folder, results, force=True)
     folder.mkdir(parents=True, exist_ok=True)
@@ -39,8 +39,9 @@ class Job(NamedTuple):
     settings: tuple[str, ...] = ()  # ``KEY=VALUE``, by which it differs from files, for ``config.json``
 
     def finish(self, on_progress: OnProgress | None = None) -> bool:
-        """Do what is left of the training; False if Ctrl-C stopped it. Raises the errors of ``train``, and
-        ``InvalidInput`` if the folder has another training, or something else.
+        """Do what is left of the training; return False if Ctrl-C stopped it.
+
+        Raises the errors of ``train``, and ``InvalidInput`` if the folder has something else.
         """
         recipe, scenario = self.training.recipe, self.training.scenario
         if not self.folder.exists():
@@ -55,7 +56,7 @@ class Job(NamedTuple):
         return resume(self.folder, on_progress=on_progress).status == "finished"
 
     def attempt(self) -> str:
-        """Do what is left of the training; return why it failed, or nothing. Raises ``KeyboardInterrupt``."""
+        """Do what is left of the training; return why it failed, or an empty text."""
         try:
             if not self.finish():
                 raise KeyboardInterrupt
@@ -64,7 +65,7 @@ class Job(NamedTuple):
         return ""
 
     def result(self) -> dict[str, float]:
-        """Measurement of the saved policy of a finished training: ``steps``, ``harm`` (which decides), and more."""
+        """Return the measurement of a finished training's policy: ``steps``, ``harm`` (which is minimised), ..."""
         count = self.training.recipe.reward.harm_count
         evaluations = read_object(RunFolder(self.folder).status)["evaluations"]
         best = min(evaluations, key=lambda each: deciding(each, count))

@@ -1,4 +1,4 @@
-"""Save the actors of a training loop of one's own, so that ``policy@FOLDER`` or ``team@FOLDER`` drives with them."""
+"""Save the actors of your own training loop, for ``policy@FOLDER`` or ``team@FOLDER``."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def save_team(
     Args:
         folder: new folder, or one without policies.
         actors: the actor of each learner of ``env``, by the vehicle's name.
-        env: in which they have learned. Its scenario, observations and reward are recorded.
+        env: environment of the training. Its scenario, observations and reward are recorded.
         seed: of the training.
         steps: number of decisions of the training.
 
@@ -67,7 +67,7 @@ def save_team(
 
 
 def network_of(name: str, actor: Any) -> NetworkSpec:
-    """Network of an actor. Raises ``InvalidInput`` for an actor that breaks the contract."""
+    """Return the network of an actor. Raises ``InvalidInput`` for another kind of actor."""
     mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
     layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
     linear, between = layers[::2], layers[1::2]

@@ -51,5 +51,4 @@ class Ppo(Algorithm):
         return PPO("MlpPolicy", environment, policy_kwargs=network, **settings)
 
     def actors(self, model: BaseAlgorithm) -> list[BasePolicy]:
-        """The policy of all learners, or of each independent one."""
         return [*model.policy.policies] if isinstance(model, IndependentPPO) else [model.policy]

@@ -1,4 +1,4 @@
-"""``TrainingRecipe``: the settings of a training, read from a YAML file. PPO's and SAC's stand here too."""
+"""``TrainingRecipe``: the settings of a training, read from a YAML file, and those of PPO and SAC."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class LearningRate(FileModel):
     )
 
     def at(self, remaining: float) -> float:
-        """Learning rate ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
+        """Return ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
 
         ``remaining`` is the fraction (1 to 0) of the training's steps that is not yet done.
         """
@@ -80,14 +80,13 @@ class EvaluationPlan(FileModel):
 class TrainingRecipe(FileModel):
     """Settings that all algorithms have; each algorithm has a subclass with more.
 
-    An *update* is one round of collecting decisions and learning from them. The text in ``Field(description=...)``
-    explains a key in new recipe files, in the JSON Schema and in the documentation.
+    An *update* collects decisions and learns from them. The text in ``Field(description=...)`` explains a key in new
+    recipe files, in the JSON Schema and in the documentation.
 
     >>> import ethbrake_marl as eb
     >>> recipe = eb.load_recipe("ppo").replace(seed=3, total_steps=100_000)
     >>> recipe.algorithm, recipe.seed, recipe.total_steps
     ('ppo', 3, 100000)
-
     """
 
     schemes: ClassVar[tuple[Scheme, ...]] = ("single", "shared")  # schemes that the algorithm supports
@@ -149,19 +148,16 @@ class TrainingRecipe(FileModel):
 
     @property
     def rounds(self) -> int:
-        """Number of decisions of each learner in each world between two updates: the key ``n_steps``."""
+        """Decisions of each learner in each world between two updates: the key ``n_steps``."""
         return int(vars(self)["n_steps"])
 
     @property
     def updates_per_row(self) -> int:
-        """Number of updates between two rows of ``progress.csv``."""
+        """Updates between two rows of ``progress.csv``."""
         return 1
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Networks of a policy that observes ``observation_size`` features, as policy files describe them.
-
-        An algorithm whose actor is not PPO's, one action that is clipped to [-1, 1], overrides this method.
-        """
+        """Return the networks of a policy. Override it if the actor is not PPO's: one action, clipped to [-1, 1]."""
         shape = vars(self)["network"]
         return NetworkSpec(
             observation_size=observation_size,
@@ -258,26 +254,26 @@ class SacRecipe(TrainingRecipe):
         return self.log_every_updates
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """The actor's network; the critics, which also see the action, are not part of a policy."""
+        """Return the actor's network; critics are not part of a policy."""
         return super().network_spec(observation_size).model_copy(update={"value_hidden": (), "output": "tanh"})
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Files of all recipes that come with the package, by name; an extension's stand in its own folder."""
+    """Return name -> file of all recipes in the package, those of extensions included."""
     files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
     return {file.stem: file for file in files}
 
 
 def usable_recipes() -> dict[str, Path]:
-    """Files of all shipped recipes whose algorithm is installed, by name."""
+    """Return name -> file of shipped recipes whose algorithm is installed."""
     return {name: file for name, file in shipped_recipes().items() if _algorithm_in(read_yaml(file)) in ALGORITHMS}
 
 
 def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> TrainingRecipe:
     """Load a recipe by name, by the path of its file, or from the content of such a file.
 
-    What ends in ``.yaml`` or has a path separator is a path. Raises ``UnknownName`` for an unknown name, and
-    ``InvalidInput`` with file, line, key, value and what would be right for bad content.
+    What ends in ``.yaml`` or has a path separator is a path; ``~`` is the user's home. Raises ``UnknownName`` for an
+    unknown name, and ``InvalidInput`` with file, line, key, value and what would be right for bad content.
     """
     if isinstance(recipe, TrainingRecipe):
         return recipe
@@ -292,12 +288,10 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> Trai
 
 
 def _algorithm_in(document: Document) -> object:
-    """Value of ``algorithm``; ``ppo`` if the key is missing."""
     return document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
 
 
 def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
-    """The recipe of a document; ``shipped`` is its file if it comes with the package."""
     name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
         right = f"must be one of {', '.join(ALGORITHMS)}"
@@ -325,7 +319,7 @@ def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[
 
     Args:
         name: 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
-        recipe: class of the algorithm's recipes, a subclass of ``TrainingRecipe``, which also checks their YAML files.
+        recipe: class of the algorithm's recipes, which checks their YAML files.
         algorithm: a subclass of ``training.algorithm.Algorithm``, or the text ``"module:class"``, whose module (and
             torch, which takes seconds) is imported only when a training begins.
 
@@ -365,10 +359,7 @@ VARIANTS: Registry[type[Any]] = Registry(
 
 
 def algorithm_of(recipe: TrainingRecipe) -> Any:
-    """New object of the recipe's learning algorithm, a ``training.algorithm.Algorithm``.
-
-    Raises ``InvalidInput`` if the algorithm has no variant for the recipe's device.
-    """
+    """Return a new ``Algorithm``. Raises ``InvalidInput`` if it has no variant for the recipe's device."""
     if recipe.device == "cpu":
         algorithm = ALGORITHMS[recipe.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()

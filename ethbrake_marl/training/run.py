@@ -1,4 +1,4 @@
-"""``RunFolder``: the folder of a training run, whose files are each written whole or not at all, and its logs."""
+"""The folder of a training run and its logs. Each file is written whole or not at all."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class RunFolder:
         self.checkpoints = self.path / "checkpoints"  # until the training has finished
 
     def create(self, config: Mapping[str, Any], *, force: bool = False) -> None:
-        """Create the folder, so that the run can be resumed. With ``force`` another run in its place goes.
+        """Create the folder. With ``force`` it replaces another run.
 
         Raises ``AlreadyExists`` for any other path that exists, ``InvalidInput`` if a process trains in that run.
         """
@@ -56,11 +56,11 @@ class RunFolder:
             new.write_status("running")
 
     def held(self) -> AbstractContextManager[None]:
-        """Context in which no other process can train here; raises ``InvalidInput`` if one does."""
+        """Lock the folder for this process. Entering raises ``InvalidInput`` if another process trains here."""
         return hold_lock(self.path / "run.lock", "another process is training in this folder")
 
     def write_status(self, status: Status, **more: Any) -> None:
-        """Change keys of ``run.json``: the status, times, and ``more``."""
+        """Change keys of ``run.json``."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
         before = read_object(self.status) if self.status.exists() else {"format": FORMAT, "format_version": 1}
         times = {"started_utc": before.get("started_utc", now), "ended_utc": None if status == "running" else now}
@@ -68,7 +68,7 @@ class RunFolder:
 
     @contextmanager
     def stage(self, name: str, status: Status) -> Iterator[None]:
-        """Record in ``run.json`` what happens after the training: the stage, how it ends, and the files it has written.
+        """Record a stage after the training in ``run.json``: its name, how it ends, and the files it has written.
 
         ``status``: of the training, if nothing goes wrong.
         """
@@ -112,7 +112,7 @@ class RunFolder:
             raise InvalidInput(f"{self.config}: {error}") from None
 
     def clear(self) -> None:
-        """Delete what killed processes have left half-written, and the results of the training so far."""
+        """Delete half-written files of killed processes, and the results so far."""
         for folder in (self.path, self.checkpoints):
             remove_unfinished(folder)
         written = read_object(self.status).get("written", ())
@@ -123,7 +123,7 @@ class RunFolder:
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
         """Writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
 
-        ``steps``: those before the first row to come, of a training that goes on; None: the events begin anew.
+        ``steps``: number of steps before the next row if a training goes on; None: the events begin anew.
         """
         self.progress.unlink(missing_ok=True)  # it may be a link, whose target must not be overwritten
         if steps is None:

@@ -1,8 +1,7 @@
 """Several learners with PPO: a policy for each of them (independent), or one with a critic that sees the whole line.
 
-Independent learners drive in the same worlds. Decisions are collected for all of them together; then each learns from
-its own rows, with Stable-Baselines3's ``PPO.train``. The last entry of an observation is the number of the learner,
-from 0 (``appended="number"``).
+Independent learners drive in the same worlds and learn each from its own rows, with Stable-Baselines3's
+``PPO.train``. The last entry of an observation is the number of the learner, from 0 (``appended="number"``).
 """
 
 from __future__ import annotations
@@ -24,10 +23,7 @@ from ethbrake_marl.training.training import Training
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
-    """PPO policy whose actor sees the first ``own`` entries of an observation, and whose critic sees all of it.
-
-    The other arguments are those of Stable-Baselines3's ``ActorCriticPolicy``.
-    """
+    """PPO policy whose actor sees the first ``own`` entries of an observation, and whose critic sees all of it."""
 
     def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
         self.own = own  # set before ``super().__init__``, which builds the networks
@@ -46,7 +42,6 @@ class _OwnPartForTheActor(MlpExtractor):
         self.own = own
 
     def forward_actor(self, features: Tensor) -> Tensor:
-        """Output of the actor's last hidden layer for observations [n, F]."""
         return super().forward_actor(features[:, : self.own])
 
 
@@ -54,7 +49,7 @@ class SeparatePolicies(BasePolicy):
     """A policy with its own optimiser for each learner, behind the interface of a single policy.
 
     ``columns``: for each learner the columns of an observation that it sees. ``network``: further arguments of
-    Stable-Baselines3's ``ActorCriticPolicy``. The other arguments are as there.
+    Stable-Baselines3's ``ActorCriticPolicy``.
     """
 
     def __init__(
@@ -124,7 +119,6 @@ class IndependentPPO(PPO):
         super().__init__(SeparatePolicies, environment, policy_kwargs=network, **settings)  # type: ignore[arg-type]
 
     def train(self) -> None:
-        """Let each learner learn from its own rows."""
         joint, buffer, log, updates = self.policy, self.rollout_buffer, self._logger, self._n_updates
         parts = [self._part(buffer, number) for number in range(len(self.names))]
         try:

@@ -1,4 +1,4 @@
-"""Train policies, or resume a training: build the model, let it learn, and between updates measure, log and save."""
+"""Train policies, or resume a training."""
 
 from __future__ import annotations
 
@@ -103,12 +103,12 @@ def train(
         recipe: a recipe, its name, the path of its file, or the content of one.
         scenario: likewise. Its roles say which vehicles learn.
         directory: new folder of the run.
-        scheme: how several learners train together; None: as the recipe says. Likewise:
+        scheme: how several learners train together. Where this or one of the next three is None, the recipe decides.
         seed: of worlds, networks and exploration.
         steps: decisions of all learners together. A training ends with a whole update, so there may be a few more.
-        device: that trains: ``cpu``, or another one for which the algorithm has a variant, such as ``cuda``.
+        device: ``cpu``, or another one for which the algorithm has a variant, such as ``cuda``.
         force: replace an earlier run in ``directory``.
-        settings: by which recipe and scenario differ from their files, ``KEY=VALUE``; ``config.json`` records them.
+        settings: ``KEY=VALUE`` by which recipe and scenario differ from their files, for ``config.json``.
         measure: takes a ``Training``, and returns a function of policies, learner -> policy, that returns metrics. It
             is called before the first update, every few updates and at the end. By default policies are measured on
             the recipe's fixed list of worlds; None: not at all.
@@ -143,7 +143,7 @@ def resume(
         directory: folder of the run.
         measure: as in ``train``.
         on_progress: as in ``train``.
-        other_versions: accept a checkpoint that other versions of packages, or another physics, have written.
+        other_versions: accept a checkpoint of other versions of packages, or of another physics.
 
     Raises ``InvalidInput`` if the folder has no training or a finished one, if another process is training in it, if
     ``config.json`` has changed since the checkpoint, or for other versions.
@@ -162,7 +162,6 @@ def resume(
 
 
 def agent_of(training: Training, directory: Path) -> str:
-    """Name of the trained agent for ``--agents``."""
     return f"{'policy' if len(training.learners) == 1 else 'team'}@{directory}"
 
 
@@ -181,7 +180,7 @@ def _only(policies: Policies) -> Policy:
 def _prepared(
     training: Training, folder: RunFolder, measure: Measure | None, on_progress: Told
 ) -> Iterator[BetweenUpdates]:
-    """Build environment and model; yield what happens between updates. Nothing is written yet.
+    """Build environment and model; nothing is written yet.
 
     Inside, Ctrl-C asks to stop, and torch has one thread: with networks so small a second one makes training 3 to 15
     times slower if another process uses the cores. At the end the global random generators are as before.
@@ -206,7 +205,7 @@ def _prepared(
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv:
-    """Environment of a training, with one row for each learner in each world."""
+    """Return the environment, with one row for each learner in each world."""
     recipe = training.recipe
     scenario, game = open_game(training.scenario, reward=recipe.reward, observation=list(training.row.names))
     appended = APPENDED.get(training.scheme)
@@ -248,7 +247,6 @@ def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainRes
 
 
 def _check_unfinished(folder: RunFolder, training: Training) -> None:
-    """Raise ``InvalidInput`` if the training has finished, even if ``ethbrake run`` has not evaluated it yet."""
     status = read_object(folder.status)
     if status["status"] == "finished" or (status.get("stage") is not None and not any(folder.checkpoints.glob("*"))):
         raise InvalidInput(
@@ -258,7 +256,6 @@ def _check_unfinished(folder: RunFolder, training: Training) -> None:
 
 
 def _check_same(folder: RunFolder, training: Training, saved: Mapping[str, Any], other_versions: bool) -> None:
-    """Raise ``InvalidInput`` if a checkpoint is of another training, or of other versions of packages."""
     if saved["training"] != training.identity:
         raise InvalidInput(
             f"{folder.config}: this file was changed after the checkpoint of step {saved['steps']} was written; restore"

@@ -52,17 +52,16 @@ class Training(NamedTuple):
 
     @property
     def drivers(self) -> dict[str, str]:
-        """Folder of each learner's policy, inside the folder of the run."""
+        """Learner -> folder of its policy in the run."""
         return {name: f"policy/{name}" if self.scheme == "independent" else "policy" for name in self.learners}
 
     @property
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """The learners that share a policy, one group for each policy, front to rear."""
+        """Learners that share a policy, one group for each policy, front to rear."""
         return tuple((name,) for name in self.learners) if self.scheme == "independent" else (self.learners,)
 
     @property
     def networks(self) -> list[NetworkSpec]:
-        """The networks of the policies, one for each of ``groups``."""
         firsts = [self.learners.index(group[0]) for group in self.groups]
         networks = [self.recipe.network_spec(len(self.views[first].names)) for first in firsts]
         if self.scheme == "centralised":  # a vehicle cannot use the critic
@@ -71,12 +70,12 @@ class Training(NamedTuple):
 
     @property
     def row(self) -> View:
-        """The features in a row of the environment: all that some learner observes."""
+        """Features in a row of the environment: all that some learner observes."""
         return View(list(dict.fromkeys(name for view in self.views for name in view.names)))
 
     @property
     def columns(self) -> list[list[int]]:
-        """Columns of a row that each learner observes."""
+        """For each learner, the columns of a row that it observes."""
         place = {name: column for column, name in enumerate(self.row.names)}
         return [[place[name] for name in view.names] for view in self.views]
 
@@ -93,7 +92,7 @@ class Training(NamedTuple):
         return ", ".join(dict.fromkeys(declared[body - 1] for body in self.scenario.learners))
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Everything that affects the training, as plain data: defaults too, words not."""
+        """Return everything that affects the training, defaults included, without titles and descriptions."""
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
 
@@ -103,7 +102,7 @@ class Training(NamedTuple):
         return hashlib.sha256(json.dumps(self.content(), sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
-        """Content of ``config.json``; ``settings`` are those of a command."""
+        """Return the content of ``config.json``."""
         return {
             "recipe": self.recipe.model_dump(mode="json"),
             "scenario": self.scenario.declared(),

@@ -1,4 +1,4 @@
-"""What happens between two updates of a training: measure, log, report, keep the best policies, write checkpoints."""
+"""Work between two updates of a training: measure, log, report, keep the best policies, write checkpoints."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Stopped(Exception):
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
-    """A loss, a weight or the noise of exploration is not finite. The last policy that was finite is saved."""
+    """A loss, a weight or the exploration noise is not finite. The last finite policy is saved."""
 
 
 class BetweenUpdates(BaseCallback):
-    """What happens before the first update, between updates and at the end."""
+    """The work before the first update, between updates and at the end."""
 
     model: BaseAlgorithm
 
@@ -77,6 +77,7 @@ class BetweenUpdates(BaseCallback):
 
     @property
     def chosen(self) -> Policies:
+        """The best policies so far; without measurements the latest."""
         return self.best or self.policies
 
     def _on_step(self) -> bool:
@@ -155,7 +156,7 @@ class BetweenUpdates(BaseCallback):
         )
 
     def write_checkpoint(self) -> None:
-        """Write a checkpoint. Raises ``TrainingDiverged``."""
+        """Raises ``TrainingDiverged``."""
         check_finite(self.model)
         best = [self.best[learners[0]] for learners in self.training.groups] if self.best else []
         course = {
@@ -195,7 +196,7 @@ class BetweenUpdates(BaseCallback):
             ) from None
 
     def save(self, status: Status, reason: BaseException | None = None) -> None:
-        """Save the policies, and write how the training has ended. A finished one needs no checkpoints any more."""
+        """Save the policies and the status; delete the checkpoints of a finished training."""
         for policies, place in ((self.chosen, self.folder.policy), (self.policies, self.folder.last_policy)):
             if policies:
                 save_drivers(policies, place, replace=True)
@@ -213,9 +214,7 @@ class BetweenUpdates(BaseCallback):
 
 
 def check_finite(model: BaseAlgorithm) -> None:
-    """Raise ``TrainingDiverged`` unless losses and weights are finite, and the noise of exploration is finite and above
-    0.
-    """
+    """Raise ``TrainingDiverged`` unless losses and weights are finite, and the exploration noise finite and above 0."""
     losses = torch.tensor([value for name, value in model.logger.name_to_value.items() if name.endswith("loss")])
     noise = getattr(model.policy, "log_std", torch.zeros(1)).detach().exp()
     if not all(bool(torch.isfinite(each).all()) for each in (losses, *model.policy.parameters(), noise, 1.0 / noise)):
@@ -226,10 +225,7 @@ def check_finite(model: BaseAlgorithm) -> None:
 
 
 def policies_of(training: Training, steps: int, tensors: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
-    """Policy of each learner after ``steps`` decisions: learners of one group share one.
-
-    ``tensors`` has those of each group's policy.
-    """
+    """Return learner -> policy after ``steps`` decisions, from the weights of each group's policy."""
     recipe, scenario = training.recipe, training.scenario
     policies: dict[str, Policy] = {}
     for learners, network, own in zip(training.groups, training.networks, tensors, strict=True):
