@@ -68,7 +68,7 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
 
 
 class EthBrakeError(Exception):
-    """Base class of every error that this package raises on purpose; its message is one line.
+    """Base class of every error that this package raises on purpose; its message is always one line.
 
     >>> import ethbrake_marl as eb
     >>> try:
@@ -76,6 +76,7 @@ class EthBrakeError(Exception):
     ... except eb.EthBrakeError as error:
     ...     print(error)
     unknown scenario 'paper-randon'; did you mean 'paper-random'?
+
     """
 
     def __str__(self) -> str:
@@ -83,11 +84,11 @@ class EthBrakeError(Exception):
 
 
 class InvalidInput(EthBrakeError, ValueError):
-    """A value from the user cannot be used."""
+    """A value from the user cannot be used; the message names the argument, its value and what would be right."""
 
 
 class UnknownName(InvalidInput):
-    """A name (scenario, agent, key, run) is unknown."""
+    """A name (scenario, agent, key, run) is unknown; the message suggests a similar name or lists the known ones."""
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
@@ -117,6 +118,7 @@ class MissingExtra(EthBrakeError, ImportError):
     >>> import ethbrake_marl as eb
     >>> issubclass(eb.MissingExtra, ImportError)
     True
+
     """
 
 
@@ -164,7 +166,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 
 
 class AgentFailed(InvalidInput):
-    """An agent of the user raised an exception or returned no valid actions.
+    """An agent of the user raised an exception or returned no valid actions; the message names agent, world and step.
 
     ``row``: row of the world in the batch; None if it is unknown. ``reason``: what the agent did wrong, and at which
     step.
@@ -202,7 +204,7 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Error for an unknown name, which shows a similar name, or all known names.
+    """Return the error for an unknown name; its message shows a similar name, or all known names.
 
     ``kind`` says what the name should denote, such as ``scenario``. ``may_be_own``: users can register names of this
     kind; the message then says that such a name must first be registered or installed.

@@ -16,7 +16,7 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 
 def home_folder() -> Path | None:
-    """Folder under ``$NUMBA_CACHE_DIR`` or the user's cache; None for a user without a home folder."""
+    """Return the folder under ``$NUMBA_CACHE_DIR`` or the user's cache; None for a user without a home folder."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
@@ -45,7 +45,7 @@ def cache_folder() -> Path:
 
 
 def can_be_trusted(folder: Path) -> bool:
-    """Whether this user or root owns a folder: its machine code will be run."""
+    """Return whether this user or root owns a folder: its machine code will be run."""
     return not hasattr(os, "getuid") or folder.stat().st_uid in (0, os.getuid())
 
 

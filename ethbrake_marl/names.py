@@ -57,7 +57,7 @@ class AgentSettings:
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
-        """Scenario. Raises ``InvalidInput`` if it is not known."""
+        """Return the scenario. Raises ``InvalidInput`` if it is not known."""
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario, for instance make_agent({self.spec!r},"
@@ -128,7 +128,7 @@ WRAPPERS: Registry[Entry] = Registry("shield or search", "shields", register_shi
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
-    """Agent, or team of a training run or shield, of a name (this module's first lines).
+    """Return the agent, or the team of a training run or shield, that a name stands for (this module's first lines).
 
     ``scenario`` is needed by teams, wrappers and agents that look ahead. A Python file that is named runs with all your
     rights. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for a bad argument.
@@ -136,6 +136,7 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("constant:3.5").name
     'constant:3.5'
+
     """
     check_count("harm_count", harm_count)
     loaded = None if scenario is None else load_scenario(scenario)
@@ -149,7 +150,7 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
 
 
 def wrapped(team: Team, wrapper: str, settings: AgentSettings) -> Team:
-    """Team with the shield or search ``wrapper`` around it, such as ``episode:pairwise``."""
+    """Return a team with the shield or search ``wrapper`` around it, such as ``episode:pairwise``."""
     entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
     around: Team = _called(settings.spec, entry.make, team, argument, settings)
     return around._replace(name=settings.spec)
@@ -211,7 +212,7 @@ def _driver(given: Any, scenario: Scenario, harm_count: str) -> Any:
 
 
 def group(name: str) -> list[str]:
-    """Specs of a group: of the entry ``NAME``, then of all ``NAME.MORE``; nothing for another name."""
+    """Return the specs of a group: of the entry ``NAME``, then of all ``NAME.MORE``; nothing for another name."""
     if name not in AGENTS or callable(AGENTS[name].make):
         return []
     listed: list[Any] = [AGENTS[each].make for each in AGENTS if each == name or each.startswith(f"{name}.")]
@@ -219,7 +220,7 @@ def group(name: str) -> list[str]:
 
 
 def split_specs(text: str) -> list[str]:
-    """Split at commas, except those in the path of something that exists."""
+    """Split a list of specs at its commas, except those in the path of something that exists."""
     parts, specs = text.split(","), []
     while parts:
         joined = (k for k in range(len(parts), 1, -1) if _path_exists(",".join(parts[:k])))
@@ -240,7 +241,10 @@ def _path_exists(text: str) -> bool:
 
 
 def _split(spec: object) -> tuple[str, list[str]]:
-    """Agent and its wrappers, from the inside. A ``+`` in the path of something that exists is the path's."""
+    """Return the agent and its wrappers, from the inside. A ``+`` in the path of something that exists is the path's.
+
+    Raises ``UnknownName`` for a wrapper that is not known.
+    """
     if not isinstance(spec, str) or not spec:
         raise InvalidInput(f"agent {spec!r:.80}: must be a name, for instance full_brake, policy@runs/mine or ppo+step")
     core, wrappers = spec, list[str]()
@@ -282,7 +286,7 @@ def _make(core: str, settings: AgentSettings) -> Driver:
 
 
 def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | None = None) -> tuple[Entry, str | None]:
-    """Entry of a name and the argument that is left for it."""
+    """Return the entry of a name and the argument that is left for it."""
     rest, _, last = argument.rpartition(":")
     if argument and f"{name}.{last}" in table:
         return table[f"{name}.{last}"], rest or None
@@ -332,7 +336,7 @@ def open_game(
     observation: Any = None,
     reward_vector: Any = None,
 ) -> tuple[Scenario, Game]:
-    """Scenario and game; agents play the roles that name them.
+    """Return a scenario and its game, in which roles that name agents are played by these.
 
     Arguments are those of ``EthBrakeParallelEnv``.
     """
@@ -374,12 +378,12 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[Entry]:
-    """Entries of all agents and wrappers that can be loaded, without groups; a wrapper's form has its +."""
+    """Return the entries of all agents and wrappers that can be loaded, without groups; a wrapper's form has its +."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 
 
 def why_not_listed() -> list[str]:
-    """Why the other agents and wrappers cannot be loaded."""
+    """Return why the other agents and wrappers cannot be loaded."""
     reasons = (table.why_not(name) for table in (AGENTS, WRAPPERS) for name in table)
     return [reason for reason in reasons if reason is not None]

@@ -29,7 +29,7 @@ class WorkerLost(EthBrakeError):
 def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     """Run function calls in parallel; yield their results in the order of the calls.
 
-    Inside ``joblib.parallel_config(backend=...)`` the calls run there, for instance on a cluster of Ray.
+    Inside ``joblib.parallel_config(backend=...)`` the calls run where this says, for instance on a cluster of Ray.
 
     Args:
         calls: tuples (function, argument, ...) with module-level functions. A generator's tuples are taken shortly

@@ -73,6 +73,7 @@ class ShownProgress:
         self._open = ""  # name of the task in the terminal's last line; empty if this line has ended
 
     def __call__(self, progress: Progress) -> None:
+        """Print the progress if it is time."""
         now, task = time.monotonic(), progress.name.partition(": ")[0]
         if self._open not in ("", task) or progress.note:
             self.end()

@@ -101,7 +101,7 @@ class Registry(Mapping[str, T]):
         return name in self.loaded or name in points(self.group)
 
     def __iter__(self) -> Iterator[str]:
-        """Built-in objects, then entry points, then objects that this process registered."""
+        """Yield the names: first built-in objects, then entry points, then objects that this process registered."""
         built_in = (name for name in self.loaded if name in self._built_in)
         return iter(dict.fromkeys([*built_in, *points(self.group), *self.loaded]))
 

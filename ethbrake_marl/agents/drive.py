@@ -49,7 +49,7 @@ class Agent(Script, Protocol):
 
     @property
     def knows(self) -> str:
-        """What it has to know: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
+        """What it has to know, for tables: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
 
 
 class Team(NamedTuple):
@@ -68,7 +68,7 @@ class Team(NamedTuple):
 
     @staticmethod
     def of(drivers: Mapping[str, Agent], name: str, shield: Shield | None = None) -> Team:
-        """Team of ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for what is no vehicle or no agent."""
+        """Return the team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for what is no vehicle or no agent."""
         bodies = {}
         for vehicle, agent in drivers.items():
             if not isinstance(vehicle, str) or re.fullmatch("vehicle_[1-9][0-9]?", vehicle) is None:
@@ -78,7 +78,7 @@ class Team(NamedTuple):
         return Team(name, dict(sorted(bodies.items())), shield)
 
     def game(self, game: Game) -> Game:
-        """The game with this team's shield. Raises ``InvalidInput`` unless the team drives all its learners."""
+        """Return ``game`` with this team's shield. Raises ``InvalidInput`` unless the team drives all its learners."""
         driven, wanted = sorted(self.drivers), sorted(game.rules.learners.tolist())
         if driven != wanted:
             theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
@@ -92,6 +92,7 @@ class Team(NamedTuple):
 
 
 def check_agent(agent: Any, where: str) -> None:
+    """Raise ``InvalidInput``, which begins with ``where``, unless this is an agent."""
     missing = [each for each in ("name", "knows", "begin", "act") if not hasattr(agent, each)]
     if missing:
         raise InvalidInput(
@@ -102,6 +103,7 @@ def check_agent(agent: Any, where: str) -> None:
 
 
 def check_knows(knows: Any, where: str) -> None:
+    """Raise ``InvalidInput``, which begins with ``where``, unless this says what an agent has to know."""
     if not isinstance(knows, str) or knows not in (*KNOWLEDGE, UNSTATED):
         right = ", ".join(repr(each) for each in KNOWLEDGE)
         raise InvalidInput(f"{where}: knows = {knows!r:.60}: must be one of {right}, or {UNSTATED!r}")
@@ -129,14 +131,14 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
 
 
 def drive(game: Game, alert: State, team: Team) -> State:
-    """Last state after a team has driven these worlds from the alert to the end."""
+    """Let a team drive these worlds from the alert to the end; return the last state, the result of the episodes."""
     for _, state in play(game, alert, team, donate=True):
         last = state
     return last
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Proposed actions, [n, L] in the order of ``drivers``, and new memories."""
+    """Return the actions that agents propose, [n, L] in the order of ``drivers``, and their new memories."""
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
         commands, after[body] = asked(agent, state, memories[body], body)

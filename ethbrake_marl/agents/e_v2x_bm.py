@@ -1,7 +1,7 @@
-"""E-V2X-BM: the constant deceleration that does the least harm, chosen at the alert.
+"""E-V2X-BM: brakes with the constant deceleration that does the least harm, chosen at the alert.
 
 ``pairwise`` is the paper's closed form. ``coupled`` plays the whole line in the physics of the episode, with the
-changes of speed, later impacts and lasting contact that the closed form leaves out.
+changes of speed, later impacts and lasting contact that the closed form leaves out: its harm is the harm that happens.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
-    """Constant deceleration of vehicle ``body`` that does the least harm, in every world, and this harm.
+    """Return the constant deceleration of vehicle ``body`` that does the least harm, in every world, and this harm.
 
     All others hold ``alert.wanted``. ``count``: what is minimised (``episode.counts``). If the choice of the closed
     form does no harm, it is the result. If several do equally little, the least harm of the other count decides, then
@@ -52,12 +52,12 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
 
 
 def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
-    """Harm in this count, and in the one that decides ties, [2, n, C]; ``tried``: decelerations [n, C]."""
+    """Return the harm in this count, and in the one that decides ties, [2, n, C]; ``tried``: decelerations [n, C]."""
     return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
 
 
 def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
-    """Best decelerations and their harms under this count and the one that decides ties, [n, 3].
+    """Return the best decelerations and their harms under this count and the one that decides ties, [n, 3].
 
     All decelerations of a world are split into equal parts, then again and again those parts that may hold a better
     one. A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
@@ -122,6 +122,7 @@ def take_middle(at, harm, known):
 
 @kernel
 def compare(harm, known):
+    """Return -1 if ``harm`` [2] is less than ``known[1:]``, 0 if it is the same, 1 if it is more."""
     for count in range(2):  # the other count decides ties
         if abs(harm[count] - known[count + 1]) > TIE:
             return -1 if harm[count] < known[count + 1] else 1
@@ -184,7 +185,7 @@ class EV2XBMPairwise:
 
 
 def last_if_held(alert: State, rules: Rules) -> State:
-    """Last state of the episodes in which all vehicles hold ``alert.wanted``, decision by decision."""
+    """Return the last state of the episodes in which all vehicles hold ``alert.wanted``, decision by decision."""
     state = first_decision(alert, rules.learners, rules.time_step_s, rules.horizon_s)
     rules, nothing = rules._replace(learners=NOBODY), np.zeros((alert.n, 0))
     while not state.ended.all():
@@ -193,7 +194,7 @@ def last_if_held(alert: State, rules: Rules) -> State:
 
 
 def make_e_v2x_bm(argument: str | None, settings: Any) -> EV2XBM | EV2XBMPairwise:
-    """Agent ``e_v2x_bm[:pairwise]``. Raises ``InvalidInput`` for another argument."""
+    """Return the agent ``e_v2x_bm[:pairwise]``. Raises ``InvalidInput`` for another argument."""
     if argument == "pairwise":
         return EV2XBMPairwise()
     if argument is not None:

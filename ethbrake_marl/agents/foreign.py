@@ -66,7 +66,10 @@ def ask_function(function: Any, seen: Observations) -> Any:
 
 
 def ask_model(model: Any, seen: Observations) -> Any:
-    """Deterministic actions of an object with ``predict``, under its ``VecNormalize``; a recurrent one is refused."""
+    """Return the deterministic actions of an object with ``predict``, under its ``VecNormalize``.
+
+    Raises ``InvalidInput`` if it also returns a state.
+    """
     statistics = statistics_of(model)
     answer = model.predict(seen if statistics is None else statistics.normalize_obs(seen), deterministic=True)
     if not isinstance(answer, tuple):
@@ -88,7 +91,7 @@ def ask_torch(module: Any, seen: Observations) -> Any:
 
 
 def ask_onnx(session: Any, seen: Observations) -> Any:
-    """Output ``action`` of an ONNX model, or its first one."""
+    """Return the output ``action`` of an ONNX model, or its first one."""
     session = session_of(session)
     names = [output.name for output in session.get_outputs()]
     return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: seen})[0]
@@ -121,7 +124,7 @@ def _opened(content: bytes) -> Any:
 
 
 def _refuse_training_mode(module: Any, who: str) -> None:
-    """Refuse a layer whose results are random, or depend on the other worlds of a batch."""
+    """Raise ``InvalidInput`` for a layer whose results are random, or depend on the other worlds of a batch."""
     for layer in module.modules():
         shares = [getattr(layer, name, None) for name in ("p", "dropout")]
         random = any(isinstance(share, float | int) and share > 0.0 for share in shares)
@@ -141,7 +144,7 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
 
 
 def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
-    """Number of discrete actions of a policy; None: it returns numbers in [-1, 1].
+    """Return the number of discrete actions of a policy; None: it returns numbers in [-1, 1].
 
     Raises ``InvalidInput`` if its action space is neither a box from -1 to 1 nor as ``given``.
     """
@@ -191,6 +194,7 @@ def check_wrappers(policy: Any, who: str) -> None:
 
 
 def layers_of(env: Any) -> Iterator[Any]:
+    """Yield an environment and everything inside it, from the outside in."""
     yield env
     for name in INSIDE:
         inside = getattr(env, "__dict__", {}).get(name, ())  # its own: wrappers forward attributes
@@ -200,7 +204,7 @@ def layers_of(env: Any) -> Iterator[Any]:
 
 
 def _was_normalised(model: Any) -> bool:
-    """Whether the last observation that a model has stored was normalised.
+    """Return whether the last observation that a model has stored was normalised.
 
     The model then stores the original, too (off-policy algorithms always do), or the observation lies outside its space.
     """

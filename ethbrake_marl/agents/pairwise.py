@@ -36,7 +36,7 @@ class Choice(NamedTuple):
 
 @kernel
 def braking_now(speed, braking, onset, now):
-    """Acceleration (m/s2) of a vehicle that coasts until its onset, then brakes to rest, and how long."""
+    """Return the acceleration (m/s2) of a vehicle that coasts until its onset, then brakes to rest, and how long."""
     if now < onset:
         return 0.0, onset - now
     if speed > 0.0 and braking > 0.0:
@@ -74,7 +74,7 @@ def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset,
 
 @large
 def predicted_harm(line, braking, wait, body, a):
-    """H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2)."""
+    """Return H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2)."""
     gap, speed, harm = line[GAP], line[SPEED], 0.0
     if body > 1:
         i = body - 1
@@ -139,7 +139,7 @@ def choose(line, braking, wait, body, at, harm, best, least):
 
 
 def closed_form(alert: State, braking: Floats, body: int) -> Choice:
-    """Choice of vehicle ``body`` where the others brake with ``braking`` [n, N + 1] (m/s2) to rest."""
+    """Return the choice of vehicle ``body`` where the others brake with ``braking`` [n, N + 1] (m/s2) to rest."""
     wait = np.maximum(alert.car[:, LATENCY] - alert.time_s[:, np.newaxis], 0.0)
     choice = Choice(np.empty(alert.n), np.empty(alert.n))
     choose(alert.line, braking, wait, body, np.empty(CANDIDATES), np.empty(CANDIDATES), *choice)
@@ -147,7 +147,7 @@ def closed_form(alert: State, braking: Floats, body: int) -> Choice:
 
 
 def pairwise(alert: State, body: int) -> Choice:
-    """Deceleration of vehicle ``body`` (1: Vehicle 1) that minimises H, and H, in every world.
+    """Return the deceleration of vehicle ``body`` (1: Vehicle 1) that minimises H, and H, in every world.
 
     Where several do, such as all that avoid both impacts, it is the middle one. It needs gaps, speeds, capacities and
     latencies of the vehicle and its neighbours; an obstacle is not seen.

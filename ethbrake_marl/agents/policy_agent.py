@@ -114,7 +114,7 @@ class PolicyAgent:
             )
 
     def begin(self, alert: State, body: int) -> Any:
-        """Policy's memory for new episodes."""
+        """Return the policy's memory for new episodes."""
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
@@ -134,6 +134,8 @@ class PolicyAgent:
         return to_command(state, body, self._actions(answer, state, body)), memory
 
     def _own(self, memory: Any, n: int) -> Any:
+        """Return a memory in arrays of its own."""
+
         def copied(part: Any) -> NDArray[Any]:
             array = np.array(to_array(part))
             if array.shape[:1] != (n,) or array.dtype.hasobject:
@@ -183,7 +185,7 @@ def policy_agent(
     actions: int | None = None,
     ignore_wrappers: bool = False,
 ) -> PolicyAgent:
-    """Agent that drives with a policy of any library.
+    """Return an agent that drives with a policy of any library.
 
     The policy maps observations, [n, F] float32, to actions, [n, 1] or [n]: numbers in [-1, 1], or indices. A policy
     with a memory is a function ``(observations, state) -> (actions, state)``.

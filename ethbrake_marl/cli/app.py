@@ -105,7 +105,7 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Whether a shell runs this command in order to complete a command line (see ``--show-completion``).
+    """Return whether a shell runs this command in order to complete a command line (see ``--show-completion``).
 
     A stray variable that requests a completion is ignored if the completion script's other variables are missing.
     """

@@ -69,7 +69,7 @@ def schema_option(module: str, function: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Examples at the end of a help page, from command lines without ``ethbrake``."""
+    """Return the examples at the end of a help page, from command lines without ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 

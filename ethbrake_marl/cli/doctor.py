@@ -79,7 +79,7 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
 
 def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """Check ``name`` with the result (ok, detail) of ``look()``; an error in ``look`` is a failed check."""
+    """Return the check ``name`` with the result (ok, detail) of ``look()``; an error in ``look`` is a failed check."""
     try:
         return Check(name, *look())
     except Exception as error:

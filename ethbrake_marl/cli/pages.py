@@ -17,9 +17,9 @@ def register_page(shows: str, write: Callable[..., None]) -> None:
     Args:
         shows: subject of the page: ``"evaluation"`` (``evaluate --report``), ``"worlds"`` (``scenario sample``) or
             ``"run"`` (``ethbrake run``).
-        write: its arguments are, for ``"evaluation"``, the path of the file, what was compared
-            (``evaluation.compared``), and the command; for ``"worlds"``, the path of the file, the scenario, the number
-            of worlds and the seed. For ``"run"`` it returns a ``training.experiment.Report``.
+        write: function that writes the page. Its arguments are, for ``"evaluation"``, the path of the file, what was
+            compared (``evaluation.compared``), and the command; for ``"worlds"``, the path of the file, the scenario,
+            the number of worlds and the seed. For ``"run"`` it returns a ``training.experiment.Report``.
 
     """
     PAGES.add(shows, write, lambda other: other is write)

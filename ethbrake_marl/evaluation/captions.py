@@ -1,4 +1,4 @@
-"""The line that says in which worlds results were computed."""
+"""One line that says in which worlds results were found."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STAY = "\u00a0"  # a space at which no line ends
 
 
 def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
-    """Value of each quantity, or ``[smallest, largest]``: a list with one per vehicle or pair.
+    """Return for each quantity its value, or ``[smallest, largest]``: a list with one per vehicle or pair.
 
     ``{"gaps_m": [7.0, [5.0, 9.0]], "restitution": 0.1}``. Rates that no vehicle has are left out.
     """
@@ -37,7 +37,7 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def caption(parameters: Mapping[str, Any]) -> str:
-    """One line: scenario, number of worlds, seed, recordings and quantities."""
+    """Return one line: scenario, number of worlds, seed, recordings and quantities."""
     parts = []
     for key, (symbol, unit) in SYMBOLS.items():
         if key in parameters:

@@ -1,4 +1,4 @@
-"""Compare two results on the same worlds: the difference in harm, team by team."""
+"""Compare two results on the same worlds: how the harm of each team differs, paired by world."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Comparison:
 
 
 def compare_results(first: Saved | Result, second: Saved | Result) -> Comparison:
-    """Differences in harm, team by team: paired where both results have rows per world, from errors otherwise.
+    """Return how harm differs, team by team: paired where both results have rows per world, from errors otherwise.
 
     Raises ``InvalidInput`` for results of different worlds or scenarios, and without a common team.
     """

@@ -73,7 +73,7 @@ class Result:
         return team in self.columns
 
     def take(self, rows: Any) -> Result:
-        """Result of some of its worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
+        """Return the result in some of its worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
         columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
         worlds = {name: each[rows] for name, each in self.worlds.items()}
         if not len(worlds["world"]):
@@ -83,7 +83,7 @@ class Result:
         return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
-        """Table with one row per team and world: name of a column -> values. A missing number is NaN."""
+        """Return a table with one row per team and world: name of a column -> values. A missing number is NaN."""
         names = list(dict.fromkeys(name for own in self.columns.values() for name in own))
         table: Columns = {"agent": np.repeat([*self.columns], self.n)}
         table |= {name: np.tile(each, len(self.columns)) for name, each in self.worlds.items()}
@@ -94,7 +94,7 @@ class Result:
         return table | {"knows": np.repeat([self.knows[team] for team in self.columns], self.n)}
 
     def to_pandas(self) -> Any:
-        """Table of ``arrays`` as a ``DataFrame``. Raises ``MissingExtra`` without pandas."""
+        """Return the table of ``arrays`` as a ``DataFrame``. Raises ``MissingExtra`` without pandas."""
         with naming_extras():
             from pandas import DataFrame
 
@@ -182,6 +182,7 @@ def evaluate(
 def drive_chunk(
     alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]
 ) -> dict[str, Columns]:
+    """Return the columns of every team in these worlds."""
     return {name: _driven(alert, name, team, game, measures) for name, team in agents.items()}
 
 
@@ -220,7 +221,7 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 
 def hidden_from(alert: State, game: Game) -> Bools:
-    """Whether the V2X channel hides something from a learner at its first decision, [n].
+    """Return whether the V2X channel hides something from a learner at its first decision, [n].
 
     It does not know all of a vehicle, or that one reacts later than its messages say, because it waits itself.
     """
@@ -231,11 +232,12 @@ def hidden_from(alert: State, game: Game) -> Bools:
 
 
 def known_by(team: Team) -> str:
-    """What a team has to know, as one text: ``messages + true model``."""
+    """Return what a team has to know, as one text: ``messages + true model``."""
     return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _known(team).values())
 
 
 def _known(team: Team) -> dict[str, str]:
+    """Return vehicle, or ``shield`` -> what it has to know."""
     each = {f"vehicle_{body}": getattr(agent, "knows", UNSTATED) for body, agent in team.drivers.items()}
     return each if team.shield is None else {**each, "shield": getattr(team.shield, "knows", MODEL)}
 

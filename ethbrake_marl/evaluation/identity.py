@@ -24,7 +24,7 @@ WORDS = ("name", "title", "description", "source")  # keys of a scenario that do
 
 
 def worlds_sha256(worlds: State) -> str:
-    """SHA-256 of worlds at the alert: all their arrays, little-endian, without the push, which is 0."""
+    """Return the SHA-256 of worlds at the alert: all their arrays, little-endian, without the push, which is 0."""
     digest = hashlib.sha256()
     for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
         digest.update(f"{array.shape}".encode())

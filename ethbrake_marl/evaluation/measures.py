@@ -55,10 +55,10 @@ class Watch(Protocol):
     """A measure that sees every state of the episodes."""
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Look at two successive states; ``step`` None: between the alert and the first decision."""
+        """Look at what happened between two states; ``step`` None: between the alert and the first decision."""
 
     def result(self, last: State) -> Given:
-        """Value, as of a measure."""
+        """Return the value, as a measure does."""
 
 
 class Statistic(NamedTuple):
@@ -84,7 +84,7 @@ class Measure(NamedTuple):
 
 
 def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
-    """Columns of a measure: name -> [n]. Raises ``InvalidInput`` for a value of another shape or kind."""
+    """Return the columns of a measure: name -> [n]. Raises ``InvalidInput`` for a value of another shape or kind."""
     if given is None:
         return {}
     parts: Mapping[str, Any] = given if isinstance(given, Mapping) else {"": given}
@@ -114,7 +114,7 @@ def collided(game: Game, alert: State, last: State) -> Given:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> Given:
-    """Harm of the line, and what each vehicle bears of it; no honest cost where impacts are not exact."""
+    """Return the harm of the line, and what each vehicle bears of it; no honest cost where impacts are not exact."""
     if count == "honest" and PHYSICS in last.memories:
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}

@@ -103,7 +103,7 @@ _REWARDED: dict[str, TermFunction] = {
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
-    """Measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
+    """Return the measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
 
     A measure of a file is called ``NAME``, or ``FILE.py:NAME`` if another one of ``names`` is called ``NAME``. Raises
     ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
@@ -184,6 +184,8 @@ def _objective(name: str, game: Game, alert: State, last: State) -> Given:
 
 
 class SummedTerm:
+    """Adds up a term of a reward over all steps."""
+
     def __init__(self, term: TermFunction, game: Game, alert: State) -> None:
         self.term, self.sum = term, np.zeros(alert.n)
 

@@ -18,7 +18,7 @@ HARD_MPS2 = 1.0  # a command above this is hard driving
 
 
 def own_way_m(alert: State, body: int, until_s: float) -> Floats:
-    """Way of a vehicle until ``until_s``, if nobody touches it, [n] m."""
+    """Return the way of a vehicle until ``until_s``, if nobody touches it, [n] m."""
     check_exact(alert, "pushed_m")
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
@@ -53,7 +53,7 @@ class PushedAway:
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> Given:
-        """Metres of each vehicle, and whether those of Vehicle 1 are more than 5."""
+        """Return the metres of each vehicle, and whether those of Vehicle 1 are more than 5."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
             f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - own

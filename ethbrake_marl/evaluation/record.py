@@ -75,7 +75,7 @@ class EpisodeRecord:
 
     @property
     def initial(self) -> State:
-        """World at the alert."""
+        """The world at the alert."""
         return self.states[0]
 
     @property
@@ -116,7 +116,7 @@ def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAM
 
 
 def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> EpisodeRecord:
-    """Record of one world from its states at the alert, at all decisions and at the end."""
+    """Return the record of one world from its states at the alert, at all decisions and at the end."""
     until = 2 + sum(not state.ended[0] for state in states[1:])
     states, world = states[:until], states[0]
     pieces = [_between(before, after, sample_s) for before, after in pairwise(states)]

@@ -130,7 +130,7 @@ def _digest(objects: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _beside(file: Path, beside: Mapping[str, str] | None) -> tuple[Columns | None, str]:
-    """Rows per world, or None and the reason."""
+    """Return the rows per world, or None and why there are none."""
     if beside is None:
         return None, f"{file} was written without a file that has one row per world; evaluate again with --per-world"
     rows = file.parent / beside["file"]

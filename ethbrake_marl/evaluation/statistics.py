@@ -42,7 +42,7 @@ Clusters = NDArray[Any] | None
 
 
 def mean(values: Floats, clusters: Clusters = None) -> Estimate:
-    """Mean with its t interval, ``mean -+ t s / sqrt(n)``.
+    """Return the mean with its t interval, ``mean -+ t s / sqrt(n)``.
 
     If no value is negative, the interval does not go below 0. If all values are 0, there is no interval: zeros show
     that more is rare, but not how much more it can be.
@@ -55,13 +55,12 @@ def mean(values: Floats, clusters: Clusters = None) -> Estimate:
 
 
 def difference(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate:
-    """Mean of ``values - baseline`` with its t interval."""
+    """Return the mean of ``values - baseline`` with its t interval."""
     return _mean(values - baseline, clusters)
 
 
 def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate | None:
-    """Relative decrease ``1 - r`` for ``r = mean(values) / mean(baseline)``, by the delta method; None if the baseline
-    is 0.
+    """Return ``1 - r`` for ``r = mean(values) / mean(baseline)``, by the delta method; None if the baseline is 0.
 
     The standard error of r is ``std(values - r baseline) / (sqrt(n) abs(mean(baseline)))``.
     """
@@ -75,7 +74,7 @@ def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Est
 
 
 def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
-    """Share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
+    """Return the share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
 
     The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width
     ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds
@@ -130,7 +129,7 @@ def _mean(values: Floats, clusters: Clusters) -> Estimate:
 
 
 def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters) -> Estimate:
-    """Ratio with its interval; ``residuals`` [n] are x - r y, and ``weights`` [n] are y."""
+    """Return a ratio with its interval; ``residuals`` [n] are x - r y, and ``weights`` [n] are y."""
     n, whole = len(residuals), fsum(weights)
     if clusters is None:
         if n < 2:
@@ -153,7 +152,7 @@ def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> t
 
 
 def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, float, float] | tuple[None, None, None]:
-    """Standard error, degrees of freedom and skewness of a ratio from sums [G]; None if one has all weight."""
+    """Return standard error, degrees of freedom and skewness of a ratio from sums [G]; None if one has all weight."""
     groups, share = len(residuals), weights / whole
     rest = 1.0 - share
     if groups < 2 or not (rest > LEAST_REST).all():
@@ -165,10 +164,10 @@ def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, fl
 
 
 def _freedom(share: Floats, scale: Floats) -> float:
-    """Satterthwaite's ``tr(K)^2 / tr(K^2)``, with ``K_gk = scale_g^.5 C_gk scale_k^.5`` and, for the shares h,
+    """Return Satterthwaite's ``tr(K)^2 / tr(K^2)``, with ``K_gk = scale_g^.5 C_gk scale_k^.5`` and, for the shares h,
 
-    ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)``: the covariance of the deviations from the common ratio
-    if each recording's own deviation has the variance h_g^2.
+    ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)``: the covariance of the deviations from the common ratio if
+    each recording's own deviation has the variance h_g^2.
     """
     whole = fsum(share * share)
     two, three, four = (fsum(scale * share**power) for power in (2, 3, 4))

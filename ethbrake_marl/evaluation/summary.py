@@ -66,6 +66,7 @@ class SummaryTable(list[SummaryRow]):
         return sheet.only(k for k, name in enumerate(sheet.names) if name in names).html()
 
     def sheet(self) -> Sheet:
+        """Return the table with all columns that have a heading."""
         columns = [
             Column(each.heading, key, short=each.short, **_FORMATS.get(each.kind, {}))
             for key, (_, each) in self.shown.items()
@@ -103,7 +104,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Notes for the reader of the numbers: rejected worlds, exploits, hidden values."""
+        """Return what a reader should know before believing the numbers: rejected worlds, exploits, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
             drawn = rejected + self.parameters["count"]
@@ -131,10 +132,11 @@ class SummaryTable(list[SummaryRow]):
         return HEAD | {name: text for name, text in own.items() if not name.startswith("Decrease")}
 
     def to_markdown(self) -> str:
+        """Return the table as Markdown, with the texts below it."""
         return f"{self.sheet().markdown()}\n\n{self._below()}\n"
 
     def to_latex(self) -> str:
-        """LaTeX ``tabular`` with the rules of the package ``booktabs``."""
+        """Return the table as LaTeX ``tabular`` with the rules of the package ``booktabs``."""
         return self.sheet().latex()
 
     def to_json(self) -> list[dict[str, Any]]:
@@ -144,7 +146,7 @@ class SummaryTable(list[SummaryRow]):
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
 
     def to_pandas(self) -> Any:
-        """A ``DataFrame`` with one row per team; ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
+        """Return a ``DataFrame`` with one row per team; ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
 
         A missing number is NaN. Raises ``MissingExtra`` without pandas.
         """
@@ -166,7 +168,7 @@ class SummaryTable(list[SummaryRow]):
 
 
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
-    """Table of a result, one row per team.
+    """Return the table of a result, one row per team.
 
     ``baseline``: team that the others are compared with, paired by world. Without full braking, the default, there are
     no comparisons; any other team must be in the result (``UnknownName``).
@@ -198,7 +200,7 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
 
 
 def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
-    """Key of an estimate -> its column, measure and statistic; comparisons and predictions last."""
+    """Return key of an estimate -> its column, measure and statistic; comparisons and predictions last."""
     shown: dict[str, tuple[str, Measure, Statistic]] = {}
     kinds = {name: column.dtype.kind for own in result.columns.values() for name, column in own.items()}
     minimised = result.about.get("agent_settings", {}).get("harm_count")
@@ -252,7 +254,7 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
 
 
 def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Result]) -> Sheet:
-    """One table of several evaluations, such as the tests of a standard: a section for each, a row per team.
+    """Return one table of several evaluations, such as the tests of a standard: a section for each, a row per team.
 
     A team has passed if no vehicle collides in any world.
     """

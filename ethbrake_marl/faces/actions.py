@@ -19,7 +19,7 @@ class Indices(Discrete):
 
 
 def action_space(count: int | None) -> Any:
-    """Space of one learner: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices."""
+    """Return the space of one learner: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices."""
     if count is None:
         return Box(-1.0, 1.0, (1,), np.float32)
     check_whole_number("actions", count, 2)
@@ -27,7 +27,7 @@ def action_space(count: int | None) -> Any:
 
 
 def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:
-    """Actions as float64 of ``shape``; axes of length 1 may be missing or added.
+    """Return actions as float64 of ``shape``; axes of length 1 may be missing or added.
 
     Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape, for
     what is not a number, and for a wrong index. The step refuses numbers outside [-1, 1].

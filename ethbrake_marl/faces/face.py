@@ -23,7 +23,7 @@ class Face:
     begins_again = False  # whether an ended episode is followed by the next one, without a reset
 
     def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
-        """Open a game whose episodes are truncated after ``most_steps``; None: at the horizon alone."""
+        """Open a game, whose episodes are truncated after ``most_steps``; None: at the horizon alone."""
         if most_steps is not None:
             check_whole_number("number of steps of an episode", most_steps, 1)
         (self.scenario, self.game), self.render_mode, self._most_steps = opened, render_mode, most_steps
@@ -58,7 +58,7 @@ class Face:
         return state, step
 
     def _rewards(self, step: Step) -> Floats:
-        """Rewards of a step, [n, B], or [n, B, K] where they are vectors."""
+        """Return the rewards of a step, [n, B], or [n, B, K] where they are vectors."""
         rewards: Floats = (step.reward if step.vector is None else step.vector).take(self.bodies - 1, axis=1)
         return rewards
 
@@ -66,7 +66,7 @@ class Face:
         return dictionaries(self.game, state, step, self.stream.seed or 0, self.bodies)
 
     def describe_worlds(self) -> dict[str, Any]:
-        """Drawn values of each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         return self.stream.describe(self._begun("describe_worlds"))
 
     def describe_world(self) -> dict[str, Any]:

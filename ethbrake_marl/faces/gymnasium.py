@@ -37,7 +37,7 @@ class OneLearner(Face):
         return FeatureBox(self.game.views[self.bodies[0]].features), action_space(actions)
 
     def _observe(self, state: State) -> Observations:
-        """Observation of the learner in every world, [n, F]."""
+        """Return what the learner observes in every world, [n, F]."""
         seen: Observations = self.game.observe_alike(state, self.bodies)[:, 0]
         return seen
 

@@ -99,7 +99,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return self.action_spaces[agent]
 
     def reward_space(self, agent: str) -> Any:
-        """Space of an agent's vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
+        """Return the space of an agent's vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
         if not self.game.rewarding.components:
             raise InvalidInput("reward_space: rewards are numbers here; make the environment with reward_vector")
         return self.reward_spaces[agent]
@@ -130,12 +130,12 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         )
 
     def state(self) -> Observations:
-        """Full state of the line, in the space ``state_space``."""
+        """Return the full state of the line, in the space ``state_space``."""
         whole: Observations = full_state(self._begun("state"), *self._of_state)[0]
         return whole
 
     def _columns(self, actions: Mapping[str, Any]) -> Floats:
-        """Learners' actions, [1, L]; behind a shield, a missing one is NaN."""
+        """Return the learners' actions, [1, L]. Behind a shield, a missing one is NaN."""
         if not isinstance(actions, Mapping):
             raise InvalidInput(
                 f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
@@ -165,7 +165,7 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
-    """Environment in which agents act in turns, front to rear; settings as in ``parallel_env``.
+    """Return the environment in which agents act in turns, front to rear; settings as in ``parallel_env``.
 
     It is PettingZoo's conversion: a bad action is refused at the turn of the last agent.
 

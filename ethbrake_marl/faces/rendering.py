@@ -22,7 +22,7 @@ class Renderer:
         """Called after a step."""
 
     def render(self) -> Any:
-        """Picture in the render mode; of many worlds, a list."""
+        """Return what the render mode promises; of many worlds, a list."""
 
     def close(self) -> None:
         """Give back windows and files."""
@@ -45,6 +45,7 @@ def render_metadata() -> dict[str, Any]:
 
 
 def make_renderer(environment: Any, mode: str | None) -> Any:
+    """Return the renderer of a mode. Raises ``InvalidInput``."""
     if mode is None:
         return Renderer()
     if mode not in RENDERERS:

@@ -43,7 +43,7 @@ def make_sb3_vec_env(
     render_mode: str | None = None,
     actions: int | None = None,
 ) -> EthBrakeVecEnv:
-    """``n_envs`` worlds for Stable-Baselines3, which are simulated together.
+    """Return ``n_envs`` worlds for Stable-Baselines3, which are simulated together.
 
     ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``.
 
@@ -122,6 +122,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         raise InvalidInput(f"appended = {self.appended!r}: must be 'number', 'state' or None")
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seed of the worlds for the next reset."""
         self._seeds = [chosen_seed(seed)] * self.num_envs
         return self._seeds
 
@@ -159,7 +160,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return self._observe(state), reward.astype(np.float32), over.repeat(len(self.bodies)), infos
 
     def _renew(self, state: State, step: Step, ended: Any, infos: list[dict[str, Any]]) -> State:
-        """Write the last infos of ended episodes, and begin the next ones."""
+        """Write the last infos of the episodes that have ended, and begin the next ones."""
         L, last = len(self.bodies), state.take(ended)
         rows = (ended[:, np.newaxis] * L + np.arange(L)).reshape(-1)
         terms = {name: term[ended] for name, term in step.terms.items()}
@@ -209,7 +210,7 @@ class EthBrakeVecEnv(Face, VecEnv):
             setattr(self, name, saved[name])
 
     def render(self, mode: str | None = None) -> Any:
-        """Texts of all worlds (``ansi``), or one picture of all of them."""
+        """Return the texts of all worlds (``ansi``), or one picture of all of them."""
         return self.get_images() if self.render_mode == "ansi" else VecEnv.render(self, mode)
 
     def get_images(self) -> list[Any]:

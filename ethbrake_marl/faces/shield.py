@@ -31,7 +31,7 @@ def shield(
     harm_count: str = "first",
     **options: Any,
 ) -> Any:
-    """A shielded copy of an environment, of the same class, or a shielded team.
+    """Return a shielded copy of an environment, of the same class, or a shielded team.
 
     The copy starts with ``reset``; ``env`` stays as it is. The shield decides inside: what wrappers of ``env`` do to an
     action, they do to the proposal. Infos: ``shield_...`` (docs/shield.md).
@@ -73,7 +73,7 @@ def shield(
 
 
 def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
-    """The team with a shield. ``scenario``: of the worlds, if it is known."""
+    """Return a team with a shield. ``scenario``: of the worlds, if it is known."""
     settings = AgentSettings(f"{team.name}+{mode}", None, scenario, harm_count, options)
     other = wrapped(team, str(mode), settings)
     if other.shield is None:
@@ -105,7 +105,7 @@ def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Tea
 
 
 def playing(env: Any, game: Game) -> Any:
-    """Copy of an environment, with its wrappers, that plays ``game`` and has no running episode."""
+    """Return a copy of an environment, with its wrappers, that plays ``game`` and has no running episode."""
     base = env.unwrapped
     instead = {id(base.game): game, id(base.scenario): base.scenario, id(base.episode): None, id(base.renderer): None}
     other = copy.deepcopy(env, instead)

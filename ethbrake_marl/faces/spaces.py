@@ -21,5 +21,5 @@ class FeatureBox(Box):
 
 
 def reward_box(components: Sequence[Any]) -> Box:
-    """Space of vector rewards: float64, so that weighted sums equal the scalar reward to the last bit."""
+    """Return the space of vector rewards: float64, so that weighted sums equal the scalar reward to the last bit."""
     return Box(-np.inf, np.inf, (len(components),), np.float64)

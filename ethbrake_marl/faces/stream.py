@@ -33,7 +33,7 @@ class Stream:
         self.given: Drawn | None = None  # the worlds that the last reset asked for
 
     def reset(self, n: int, seed: int | None, options: Any = None) -> State:
-        """New episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
+        """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
 
         Raises ``InvalidInput`` for a bad seed or option, and changes nothing then; warns of unknown options.
         """
@@ -45,13 +45,14 @@ class Stream:
         return state
 
     def next_episodes(self, n: int) -> State:
-        """The next n worlds at their first decision, in memory of their own."""
+        """Return the next n worlds at their first decision, in memory of their own."""
         assert self.seed is not None
         state = self.game.reset(self.game.draw(n, self.seed, self.next))
         self.next += n
         return state
 
     def describe(self, state: State) -> dict[str, Any]:
+        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         numbers, seed = state.clock[:, NUMBER].astype(np.int64), self.seed or 0
         place, parts = np.arange(state.n), [] if self.given is None else [self.given]
         of_stream = np.flatnonzero(numbers >= 0)

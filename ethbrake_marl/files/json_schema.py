@@ -1,4 +1,4 @@
-"""JSON Schemas of scenario and recipe files, for editors."""
+"""JSON Schemas of scenario and recipe files, with which editors complete and check YAML."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 class FileSchema(GenerateJsonSchema):
-    """Generator of JSON Schemas of files in which no value may be ``null``: a key without a value is left out."""
+    """JSON Schema generator for files in which no value may be ``null``: a key without a value is left out."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
         return self.generate_inner(schema["schema"])

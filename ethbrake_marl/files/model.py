@@ -82,15 +82,15 @@ class Wording:
         return self._needed
 
     def instead(self, key: str) -> str:
-        """What to write instead of the unknown ``key``."""
+        """Return what to write instead of the unknown ``key``."""
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Vehicle or pair to which the value at ``path`` belongs."""
+        """Return the vehicle or pair to which the value at ``path`` belongs."""
         return ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """What would be valid instead of the value that pydantic reports; empty: a general text is used."""
+        """Return what would be valid instead of the value that pydantic reports; empty: a general text is used."""
         return ""
 
 
@@ -112,8 +112,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
-    """Read a YAML file or document into ``model``; raise ``InvalidInput`` with file, line, key, value and what is
-    valid.
+    """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
 
     ``advice`` is the end of the message "must be a mapping ...", for a file that does not contain a mapping.
     """
@@ -156,7 +155,7 @@ def first_mistake(error: ValidationError) -> Mistake:
 
 
 def path_of(detail: ErrorDetails) -> YamlPath:
-    """Path, inside the file, of a mistake that pydantic reports.
+    """Return the path, inside the file, of a mistake that pydantic reports.
 
     The tags of unions are removed. If ``refuse`` raised the error, its argument ``at`` is appended.
     """
@@ -224,7 +223,7 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Hint for an unknown ``key``: "did you mean ...?"; empty if no key is similar.
+    """Return a hint for an unknown ``key``: "did you mean ...?"; empty if no key is similar.
 
     A valid key with a wrong or missing unit is also recognised: ``gaps_km``, ``mass``.
     """

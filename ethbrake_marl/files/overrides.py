@@ -52,7 +52,7 @@ class Override:
 
     @staticmethod
     def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-        """Apply settings to a copy of ``content``; return the changed top-level keys with their new values.
+        """Apply settings to a copy of ``content``, and return the changed top-level keys with their new values.
 
         For ``content = {"reward": {"harm": 1}, "seed": 3}`` and the setting ``reward.harm=2`` the result is
         ``{"reward": {"harm": 2}}``. Raises ``InvalidInput`` if a path leads into a value that is neither a mapping nor

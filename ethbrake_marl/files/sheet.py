@@ -37,7 +37,7 @@ class Estimate:
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """Mapping with ``value``, and ``interval`` as ``[low, high]`` or null."""
+        """Return ``value``, and ``interval`` as ``[low, high]`` or null."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
@@ -138,6 +138,7 @@ class Sheet:
 
     @property
     def names(self) -> list[str]:
+        """Names of the columns in CSV and JSON."""
         return [column.name for column in self._columns()]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
@@ -164,7 +165,7 @@ class Sheet:
         ]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """In a cell with several lines of text, all but the first line are dim.
+        """Yield the table, with the note below, for a terminal.
 
         Names in the first column are never broken: those that do not fit are numbered and listed below the table.
         """
@@ -203,7 +204,7 @@ class Sheet:
             yield Text(f"\n{note}", "dim")
 
     def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
-        """How many columns a terminal of ``width`` characters shows, and names that do not fit -> numbers."""
+        """Return how many columns a terminal of ``width`` characters shows, and names that do not fit -> numbers."""
         columns = self._columns()
         texts = [[each.short or each.heading, *(row[k] for row in rows)] for k, each in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
@@ -218,7 +219,7 @@ class Sheet:
         return shown, {name: f"[{number}]" for number, name in enumerate(long, 1)}
 
     def markdown(self) -> str:
-        """Markdown without title and note.
+        """Return the table as Markdown, without title and note.
 
         Markdown tables have no sections, so each row's first cell begins with the section: ``Section: cell``.
         """
@@ -287,7 +288,7 @@ class Sheet:
 
 
 def terminal_text(*shown: RenderableType) -> str:
-    """Tables and texts as plain text, as wide as this terminal: in a script, a notebook and a file alike."""
+    """Return tables and texts as plain text, as wide as this terminal: in a script, a notebook and a file alike."""
     from rich.console import Console
 
     text = io.StringIO()
@@ -297,7 +298,7 @@ def terminal_text(*shown: RenderableType) -> str:
 
 
 def flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Row with two entries, ``x_low`` and ``x_high``, in place of a pair ``x_interval``."""
+    """Return a row with two entries, ``x_low`` and ``x_high``, in place of a pair ``x_interval``."""
     line: dict[str, Any] = {}
     for name, value in row.items():
         if name.endswith("_interval"):

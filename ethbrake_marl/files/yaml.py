@@ -201,7 +201,7 @@ def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
 
 
 def _scalar(node: yaml.ScalarNode) -> Any:
-    """Value of a scalar; a quoted or block scalar is always text."""
+    """Return a scalar's value. A quoted or block scalar is always text."""
     if node.style is not None:
         return str(node.value)
     value = next(

@@ -27,7 +27,7 @@ class Actor:
         self.members = [type(self)(member, tensors, f"among_{m}.") for m, member in enumerate(spec.among, 1)]
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Actions [n, 1] in [-1, 1] for observations [n, F] float32. Raises ``InvalidInput``."""
+        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32. Raises ``InvalidInput``."""
         check_observations(observations, self.spec.observation_size)
         actions = np.empty((len(observations), 1), np.float32)
         for start in range(0, len(observations), BLOCK_ROWS):
@@ -36,7 +36,7 @@ class Actor:
         return actions
 
     def columns(self, x: Float32s) -> Float32s:
-        """Actions [1, rows] for observations that stand in columns, [F, rows]."""
+        """Return the actions [1, rows] for observations that stand in columns, [F, rows]."""
         if not self.gate:
             y = self.forward(self.networks[0], x)
             if self.spec.output == "choice":
@@ -53,11 +53,11 @@ class Actor:
         return y
 
     def expert(self, x: Float32s) -> NDArray[np.int64]:
-        """Number (from 0) of the expert that acts on each column of ``x``, [rows]."""
+        """Return the number (from 0) of the expert that acts on each column of ``x``, [rows]."""
         return np.asarray(self.forward(self.gate, x).argmax(axis=0))
 
     def chosen(self, choice: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Actions [1, rows] of the choices [rows]: policies come first, then actions."""
+        """Return the actions [1, rows] of the choices [rows]: policies come first, then actions."""
         y = self.actions[np.newaxis, np.maximum(choice - len(self.members), 0)]
         for m, member in enumerate(self.members):
             rows = np.flatnonzero(choice == m)
@@ -66,7 +66,7 @@ class Actor:
         return y
 
     def forward(self, layers: Layers, x: Float32s) -> Float32s:
-        """Outputs [outputs, rows] of a network."""
+        """Return the outputs [outputs, rows] of a network."""
         for number, (weight, bias) in enumerate(layers, 1):
             y = np.empty((len(weight), x.shape[1]), np.float32)
             dense(weight, bias, x, y)

@@ -19,7 +19,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a 
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Policy of a bundle, or of a training run that has a folder ``policy``.
+    """Return the policy of a bundle, or of a training run that has a folder ``policy``.
 
     Raises ``InvalidInput`` if there is none, and ``CorruptBundle`` with file and reason if it is damaged.
     """
@@ -77,7 +77,7 @@ def _bundle_in(path: Path) -> Path:
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Name -> folder of every shipped policy: its card, and the folder ``policy``."""
+    """Return name -> folder of every shipped policy: its card, and the folder ``policy``."""
     return {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob("*/policy"))}
 
 
@@ -90,7 +90,7 @@ def load_shipped(name: str) -> Policy:
 
 
 def load_named_policy(name: str) -> Policy:
-    """Shipped policy by its name, or any other by the path of its run or bundle (``./ppo`` for a folder)."""
+    """Return a shipped policy by its name, or any other by the path of its run or bundle (``./ppo`` for a folder)."""
     return load_policy(shipped_policies().get(name, name))
 
 
@@ -109,7 +109,7 @@ def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], 
 
 
 def load_drivers(folder: str | os.PathLike[str]) -> dict[str, Policy]:
-    """What ``save_drivers`` wrote, vehicle -> policy, front to rear. Raises the errors of ``load_policy``."""
+    """Return what ``save_drivers`` wrote, vehicle -> policy, front to rear. Raises the errors of ``load_policy``."""
     path = Path(folder)
     names = sorted((each.name for each in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
     if names:

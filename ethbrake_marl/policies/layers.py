@@ -1,5 +1,7 @@
-"""Layers of a network with the same bits in any batch, on any machine: ``tanh`` and sums are fixed sequences of IEEE
-operations.
+"""Layers of a network with the same bits in any batch, on any machine.
+
+Mathematics libraries round ``tanh`` and sums differently on different machines, and even at different positions of an
+array. Here both are fixed sequences of IEEE operations.
 """
 
 from __future__ import annotations

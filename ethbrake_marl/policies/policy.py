@@ -62,12 +62,12 @@ class Policy:
         return View(self.manifest.observation.features)
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Actions [n, 1] in [-1, 1] for observations [n, F] float32, each by itself."""
+        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32, each by itself."""
         return self.actor(observations)
 
     @classmethod
     def make(cls, tensors: Mapping[str, Float32s], *, network: NetworkSpec, observation: View, **manifest: Any) -> Self:
-        """Policy of these tensors. ``manifest``: the other fields of ``Manifest``, but hashes and versions.
+        """Return a policy of these tensors. ``manifest``: the other fields of ``Manifest``, but hashes and versions.
 
         Raises ``InvalidInput`` with the bad tensor or field.
         """
@@ -94,7 +94,7 @@ class Policy:
             write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
 
     def to_onnx(self) -> bytes:
-        """ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+        """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
         The acceleration is the action times the capacity to brake or to drive, as the policy observes them. The model
         adds products in another order than this package. Raises ``MissingExtra`` without the package onnx.

@@ -1,5 +1,4 @@
-"""The paper's hybrid (Algorithm 1): at the alert, the policy or E-V2X-BM gets the whole episode, whichever does less
-harm.
+"""The paper's hybrid (Algorithm 1): at the alert, a policy or E-V2X-BM gets the whole episode, whoever does less harm.
 
 The harm of the policy, played from the alert on, is compared with H*, the harm of E-V2X-BM's constant deceleration.
 With the coupled H*, which is the price of this deceleration, the harm of the episode is the smaller of both, to the
@@ -66,7 +65,7 @@ class EpisodeShield:
             )
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Memory at the first decision ``state``, with the driver of each episode."""
+        """Return the memory at the first decision ``state``, with the driver of each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
         remembered = begin(game.agents({body: agent})[body], alert, body)
@@ -84,7 +83,7 @@ class EpisodeShield:
         )  # fmt: skip
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Action of the driver that was chosen at the alert, [n, 1], and the new memory."""
+        """Return the action of the driver that was chosen at the alert, [n, 1], and the new memory."""
         memory: Memory = state.memories["shield"]
         (body,) = self.drivers
         own, after = propose(game.agents(self.drivers), state, {body: memory.agent})

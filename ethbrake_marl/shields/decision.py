@@ -42,7 +42,7 @@ class ShieldReason(IntEnum):
 
 
 def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
-    """Body -> agent from front to rear. Raises ``InvalidInput`` for what is no agent."""
+    """Return body -> agent from front to rear. Raises ``InvalidInput`` for what is no agent."""
     for body, agent in (drivers or {}).items():
         check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
     return dict(sorted((drivers or {}).items()))
@@ -60,14 +60,14 @@ def check_harm_count(count: str) -> None:
 
 
 def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
-    """Values of learners [n, L] as values of vehicles, [n, N]; ``other`` for those that follow scripts."""
+    """Return values of learners [n, L] as values of vehicles, [n, N]; ``other`` for those that follow scripts."""
     wide = np.full((state.n, state.vehicles), other, columns.dtype)
     wide[:, game.rules.learners - 1] = columns
     return wide
 
 
 def intervention(before: State, step: Step, after: State) -> Floats:
-    """Minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
+    """Return minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
     memory = after.memories.get("shield")
     if memory is None:
         raise InvalidInput(

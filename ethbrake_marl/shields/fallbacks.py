@@ -25,7 +25,7 @@ ALONE = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried w
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
-    """Plans at the alert, constant actions: [n, T, L] each.
+    """Return the plans at the alert, constant actions: [n, T, L] each.
 
     One learner: E-V2X-BM. Several: full braking, E-V2X-BM of one while the others brake fully, and for each the best
     share of its brakes, one after the other.
@@ -46,13 +46,13 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
 
 
 def held(game: Game, actions: Floats) -> Floats:
-    """Plans that repeat actions [n, L] up to the horizon."""
+    """Return the plans that repeat actions [n, L] up to the horizon."""
     decisions = int(np.ceil(game.rules.horizon_s / game.rules.time_step_s)) + 1
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
 def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
-    """Best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
+    """Return the best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
 
     Their harm is the largest over the states that a world may be in, which stand one after the other in ``states``.
     Tried are the plan's next actions, and all of them a little harder or softer: small changes mend deviations from a
@@ -77,7 +77,7 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
 def rollout(
     game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: str, most: Any = np.inf
 ) -> Floats:
-    """Plans with the actions of agents that drive from now on, as long as the harm is at most ``most`` [n].
+    """Return the plans with the actions of agents that drive from now on, as long as the harm is at most ``most`` [n].
 
     ``state`` has the agents' memories.
     """

@@ -113,11 +113,11 @@ class StepShield:
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def seen(self, state: State, memory: Memory) -> State:
-        """States that the worlds may be in now, M rows for each world, the nominal one first."""
+        """Return the states that the worlds may be in now, M rows for each world, the nominal one first."""
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Harm of plans, [n] m2/s2: the largest over the M ``states`` of each world, or above ``most``.
+        """Return the harm of plans, [n] m2/s2: the largest over the M ``states`` of each world, or above ``most``.
 
         It is infinite where a vehicle would bear more than its cap (``caps`` [n, N] m2/s2).
         """
@@ -127,7 +127,7 @@ class StepShield:
         return harm
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
-        """Plans if the shield's agents drive on from the nominal ``state``, as long as harm <= ``most``."""
+        """Return the plans if the shield's agents drive on from the nominal ``state``, as long as harm <= ``most``."""
         return rollout(game, self.drivers, state, plans, self.count, most)
 
     def bound(self, memory: Memory) -> Floats:
@@ -141,7 +141,7 @@ class StepShield:
         return {body: begin(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Constant actions from which the first plan is chosen, [n, T, L] each."""
+        """Return the constant actions from which the first plan is chosen, [n, T, L] each."""
         return first_plans(game, alert, state, self.count)
 
     def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
@@ -166,6 +166,7 @@ class StepShield:
         )  # fmt: skip
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
+        """Return the actions to apply, [n, L], and the new memory."""
         memory: Memory = state.memories["shield"]
         proposed, state = self.asked(game, state, proposed)
         if not donate:
@@ -202,7 +203,7 @@ class StepShield:
         )  # fmt: skip
 
     def asked(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
-        """Proposals, [n, L], NaN for none, and the state with the memories of the shield's agents.
+        """Return the proposals, [n, L], NaN for none, and the state with the memories of the shield's agents.
 
         The agents propose where nobody else does. If one has a memory, they are asked at every decision.
         """
@@ -274,7 +275,7 @@ class StepShield:
 
 
 def part(states: State, rows: Ints, M: int) -> State:
-    """The M states of each of the worlds ``rows``, which increase."""
+    """Return the M states of each of the worlds ``rows``, which increase."""
     if len(rows) * M == states.n:
         return states
     return states.take(rows if M == 1 else (rows[:, np.newaxis] * M + np.arange(M)).ravel())
@@ -282,7 +283,7 @@ def part(states: State, rows: Ints, M: int) -> State:
 
 @cache
 def trials(learners: int) -> Bools:
-    """Which of L proposals are tried together, [1 or 1 + L, L]: all of them, then one by one from the front."""
+    """Return which of L proposals are tried together, [1 or 1 + L, L]: all of them, then one by one from the front."""
     alone = np.eye(learners, dtype=np.bool_)
     return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
 

@@ -27,7 +27,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
-        """New model on the CPU, whose random numbers depend on the recipe's seed only.
+        """Return a new model on the CPU, whose random numbers depend on the recipe's seed only.
 
         ``environment`` has one row for each learner in each world.
         """

@@ -87,7 +87,7 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
 
 
 def like(new: Any, saved: Any) -> Any:
-    """Saved data with the types of ``new``: arrays in place of tensors, named tuples in place of plain ones.
+    """Return saved data with the types of ``new``: arrays in place of tensors, named tuples in place of plain ones.
 
     Raises ``ValueError`` if the entries differ, or the shape or type of an array.
     """

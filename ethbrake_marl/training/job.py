@@ -34,6 +34,8 @@ def folder_of_many(folder: Path, *results: str) -> Iterator[None]:
 
 
 class Job(NamedTuple):
+    """One training of many. It can be pickled."""
+
     training: Training
     folder: Path  # of its run, which need not exist
     settings: tuple[str, ...] = ()  # ``KEY=VALUE``, by which it differs from files, for ``config.json``

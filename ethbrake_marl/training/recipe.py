@@ -171,7 +171,7 @@ class TrainingRecipe(FileModel):
         """Raise ``InvalidInput`` if the recipe does not fit the number of learners."""
 
     def replace(self, **changes: Any) -> Self:
-        """The recipe with other values: ``replace(seed=3)``. Raises ``InvalidInput`` as ``load_recipe`` does."""
+        """Return the recipe with other values: ``replace(seed=3)``. Raises ``InvalidInput`` as ``load_recipe`` does."""
         content = {**self.model_dump(mode="json"), **{key: plain(value) for key, value in changes.items()}}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         return changed  # type: ignore[return-value]  # another class only with another algorithm
@@ -306,7 +306,7 @@ def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Keys that are possible in place of the last key of ``path``; a reward also has own terms."""
+        """Return the keys that are possible in place of the last key of ``path``; a reward also has own terms."""
         inside = super().known(path)
         return [*inside, *own_terms()] if path[:-1] == ("reward",) else inside
 

@@ -88,7 +88,7 @@ class RunFolder:
                 self.write_status(ended, reason=reason, written=written)
 
     def training(self) -> Training:
-        """Training that a run records.
+        """Return the training that a run records.
 
         Raises ``InvalidInput`` if this is no run, if a file is damaged, or if a folder is a link.
         """
@@ -121,7 +121,7 @@ class RunFolder:
                 path.unlink()
 
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
-        """Writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
+        """Return the writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
 
         ``steps``: number of steps before the next row if a training goes on; None: the events begin anew.
         """

@@ -77,10 +77,11 @@ class SeparatePolicies(BasePolicy):
 
     @property
     def policies(self) -> list[ActorCriticPolicy]:
+        """Policies of the learners, front to rear."""
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1]."""
+        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1]."""
         count = len(observation)
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
         for number, policy, rows in self._by_learner(observation):
@@ -89,7 +90,7 @@ class SeparatePolicies(BasePolicy):
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
-        """Critics' values [n, 1] for observations [n, F + 1]."""
+        """Return the critics' values [n, 1] for observations [n, F + 1]."""
         values = torch.empty(len(observation), 1)
         for number, policy, rows in self._by_learner(observation):
             values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])

@@ -30,7 +30,7 @@ class Training(NamedTuple):
 
     @classmethod
     def of(cls, recipe: Any, scenario: AnyScenario, **changes: Any) -> Training:
-        """Training of a recipe in a scenario, both as ``load_recipe`` and ``load_scenario`` take them.
+        """Return the training of a recipe in a scenario, both as ``load_recipe`` and ``load_scenario`` take them.
 
         Learners observe what the recipe lists, else what the scenario lists. ``changes``: other values for keys of the
         recipe. Raises ``InvalidInput`` if recipe and scenario do not fit each other.
@@ -112,7 +112,7 @@ class Training(NamedTuple):
         }
 
     def who_drives(self) -> str:
-        """For instance, ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Return, for instance, ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         parts = (f"{self.drivers[group[0]]} drives {', '.join(group)}" for group in self.groups)
         return f"scheme {self.scheme}: {'; '.join(parts)}"
 
