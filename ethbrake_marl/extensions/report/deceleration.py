@@ -59,32 +59,32 @@ def deceleration_figure(
     styles = [series_style(number) | {"marker": "", "linewidth": 1.5} for number in range(3)]
     mark: dict[str, Any] = {"linestyle": "none", "markerfacecolor": "none", "clip_on": False, "zorder": 5}
     axes.plot(at, predicted, label="predicted (pairwise)", **styles[2])
+    for count, harm, style in zip(HARM, (first, total), styles, strict=False):
+        axes.plot(at, harm, label=f"simulated {IN_WORDS[count]}", **style)
     axes.vlines(chosen, predicted[place], first[place], color=styles[2]["color"], linewidth=1.0, linestyle=":")
     harms = f"{predicted[place]:.2f} predicted, {first[place]:.2f} simulated"
     axes.plot(
         [chosen], [predicted[place]], label=f"a* = {chosen:.3f} m/s², closed form: {harms}",
         **{**styles[2], **mark, "marker": "D", "markersize": 6},
     )  # fmt: skip
-    for count, harm, style, size in zip(HARM, (first, total), styles, (6, 10), strict=False):
+    for count, style, size in zip(HARM, styles, (6, 10), strict=False):
         best = coupled(world, body, count, horizon_s)
         a, least = float(best.deceleration_mps2[0]), float(best.harm[0])
-        axes.plot(at, harm, label=f"simulated {IN_WORDS[count]}", **style)
         axes.plot(
             [a], [least], label=f"a* = {a:.3f} m/s², coupled, least {IN_WORDS[count]}: {least:.2f}",
             **{**style, **mark, "marker": "o", "markersize": size},
         )  # fmt: skip
-        if known is not None:
-            axes.axhline(
-                known[count], label=f"best known {IN_WORDS[count]}: {known[count]:.2f}", **style | {"linewidth": 0.9}
-            )
+    for (count, harm), style in zip((known or {}).items(), styles, strict=False):
+        axes.axhline(harm, label=f"best known {IN_WORDS[count]}: {harm:.2f}", **style | {"linewidth": 0.9})
     axes.set(
         title=title or f"{loaded.name}: one world",
         xlabel=f"Constant deceleration of Vehicle {body} (m/s²)",
         ylabel="Harm (m²/s²)",
         xlim=(0.0, float(at[-1])),
+        ylim=(0.0, None),
     )
     note = (
         f"{quantities(world)}. Harm until {horizon_s:g} s. Predicted: closed form for each pair alone. Simulated:"
         " motion of the whole line, with all impacts."
     )
-    return finish(figure, note, axes, columns=2, fontsize=8.5)
+    return finish(figure, note, axes, columns=2, fontsize=8)
