@@ -206,7 +206,7 @@ def layers_of(env: Any) -> Iterator[Any]:
 def _was_normalised(model: Any) -> bool:
     """Return whether the last observation that a model has stored was normalised.
 
-    The model then stores the original, too (off-policy algorithms always do), or the observation lies outside its space.
+    The model then stores the original too (off-policy algorithms always do), or the observation is outside its space.
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True
