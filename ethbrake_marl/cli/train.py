@@ -176,7 +176,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     table = Sheet("", columns, rows, note)
     settings = read_object(result.directory / "config.json").get("settings", ())
     own = [each for each in settings if read_settings([each], [*type(plan).model_fields]).scenario]
-    own += [] if count == "first" else [f"harm_count={count}"]
+    own += {"first": [], "honest": ["rules=honest"]}.get(count, [f"harm_count={count}"])
     words = ["--scenario", scenario or loaded.name, "--agents", f"full_brake,{result.agent}"]
     command = shlex.join(["ethbrake", "evaluate", *words, *(word for each in own for word in ("--set", each))])
     out.result(

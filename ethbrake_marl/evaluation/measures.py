@@ -72,6 +72,7 @@ class Statistic(NamedTuple):
     heading: str = ""  # in tables; "": not in tables
     short: str = ""  # heading in a terminal
     ending: str = ""  # of the column's name, after the measure's
+    meaning: str = ""  # "": that of the measure
 
 
 class Measure(NamedTuple):

@@ -114,11 +114,12 @@ def still_moving(game: Game, alert: State, last: State) -> Given:
     return ~last.at_rest
 
 
+FAR = "Share of worlds in which Vehicle 1 is pushed more than 5 m beyond the point where it would stop by itself."
 PUSHED_M = Part(
     watch=pushed_m, unit="m",
     shown=(
         Statistic("pushed_m_1", "mean", "Vehicle 1 pushed (m)", "Pushed\nm", "1"),
-        Statistic("pushed_far_rate", "rate", "Vehicle 1 pushed > 5 m", "Pushed\n> 5 m", "1_far"),
+        Statistic("pushed_far_rate", "rate", "Vehicle 1 pushed > 5 m", "Pushed\n> 5 m", "1_far", FAR),
     ),
 )  # fmt: skip
 PUSHED_MPS = Part(pushed_mps, unit="m/s", shown=(Statistic("pushed_mps", "mean", "Push (m/s)", "Push\nm/s"),))

@@ -128,7 +128,7 @@ class SummaryTable(list[SummaryRow]):
 
     def meanings(self) -> dict[str, str]:
         """Return heading -> what the column means."""
-        own = {each.heading: measure.meaning for measure, each in self.shown.values() if each.heading}
+        own = {each.heading: each.meaning or measure.meaning for measure, each in self.shown.values() if each.heading}
         return HEAD | {name: text for name, text in own.items() if not name.startswith("Decrease")}
 
     def to_markdown(self) -> str:

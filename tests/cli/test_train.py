@@ -48,7 +48,7 @@ def test_train__under_honest_rules_says_so_in_the_recipe_the_table_and_the_comma
     answer = ethbrake("train", "--recipe", tiny_recipe, "--set", "rules=honest", "--output", "runs/mine")
     config = json.loads(Path("runs/mine/config.json").read_text())
     assert config["recipe"]["reward"]["harm_count"] == "honest" and config["settings"] == ["rules=honest"]
-    assert answer.out.splitlines()[-1].endswith("--agents full_brake,policy@runs/mine --set harm_count=honest")
+    assert answer.out.splitlines()[-1].endswith("--agents full_brake,policy@runs/mine --set rules=honest")
     assert "Honest cost" in answer.out and "honest cost " in answer.err
 
 

@@ -38,6 +38,8 @@ def _added(compared: Compared) -> Sheet:
         pairs = ((result[without(name)][COLUMN[count]], result[TEAM][COLUMN[count]]) for count in counts)
         rows.append((name, *(difference(less, whole, result.clusters) for less, whole in pairs)))
     columns = [Column("Learner", text=True)]
-    columns += [Column(f"More {IN_WORDS[count]} without it", sign="+") for count in counts]
-    about = "The same team, but that vehicle brakes fully; the others were not trained for that."
+    columns += [Column(IN_WORDS[count].capitalize(), sign="+") for count in counts]
+    about = (
+        "How much more harm there is without it: the vehicle brakes fully, and the others were not trained for that."
+    )
     return Sheet("What each learner adds, mean per world (m²/s²)", columns, rows, about)

@@ -62,6 +62,7 @@ def regret(game: Game, alert: State, last: State) -> Given:
     return {count: last.harm(count) - harm for count, harm in least(game, alert).items()}
 
 
+SHARE = "How much of what the best known braking saves the agent saves: 0 % for full braking, 100 % for the best known."
 LIMITS = {
     "best_known": Part(
         best_known, unit="m2/s2",
@@ -73,7 +74,7 @@ LIMITS = {
             Statistic("regret_first", "mean", "Regret, first-impact", "Regret\nfirst", "first"),
             Statistic(
                 "share_of_possible_reduction_first", "decrease", "Share of possible, first-impact",
-                "Share of\npossible", "first",
+                "Share of\npossible", "first", SHARE,
             ),
             Statistic("regret_total", "mean", ending="total"),
             Statistic("share_of_possible_reduction_total", "decrease", ending="total"),

@@ -91,7 +91,7 @@ def test_several_learners__who_bears_what_and_what_each_adds(tmp_path: Path) -> 
     *_, cost, more = learners_sheets(compared._replace(harm_count="honest"))
     means = [compared.result["full_brake"][f"honest_cost{ending}"].mean() for ending in ("_1", "_2", "_3", "")]
     assert [cell.value for cell in cost.rows[0][1:]] == pytest.approx(means)
-    assert more.headings[-1] == "More honest cost without it"
+    assert more.headings[-1] == "Honest cost"
 
 
 # ---- its parts
