@@ -50,7 +50,7 @@ class Plan(NamedTuple):
     offsets: Ints  # of the observed neighbours: -1 is the next vehicle ahead
     role: bool
     obstacle: bool
-    places: Ints  # [F] of each feature among the kernel's values; -1: one of the next two; empty: all in this order
+    places: Ints  # [F] index of each feature in the kernel's ``value``; -1: of ``groups`` or ``own``; empty: in order
     groups: tuple[tuple[Group, list[int], list[int]], ...]  # of other packages: group, columns, features in the group
     own: tuple[tuple[int, Own, int], ...]  # column, feature, offset (0: of the vehicle itself)
     scaling: Floats  # [3, F] 1 / scale, low and high

@@ -1,8 +1,9 @@
 """One line of bodies through an interval of constant commands, from event to event.
 
-Between two events every body has a constant jerk: 0 where brakes act at once, so the same text serves both, and the
-compiler drops the jerk where ``builds`` is the constant False. ``ahead`` is the first body that takes part: 1 where
-there is no obstacle. Times within an interval count from its start.
+``builds`` says whether some body's force follows its command at a finite rate. Between two events every body has a
+constant jerk: 0 where brakes act at once, so the same text serves both, and the compiler drops the jerk where
+``builds`` is the constant False. ``ahead`` is the first body that takes part: 1 where there is no obstacle. Times
+within an interval count from its start.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ from ethbrake_marl.motion.push import push
 
 # what `drive` returns
 APART = 0  # no two bodies could touch
-MET = 1  # contacts were resolved
+MET = 1  # went from event to event; if nothing touched, what contacts changed is 0
 FAILED = 2  # a check of the physics failed: never the user's fault
 
 MISSED_M = 1e-9  # a gap below minus this means that a contact was missed

@@ -134,9 +134,9 @@ def resolve_cluster(line, car, scratch, first, last):
 
 @large
 def note_thrown(line, scratch, p):
-    """Add an impact's change of the closing speed of pair p, which has had one, to the row THROWN.
+    """Add what an impact changes of pair p's closing speed to the row THROWN, if the pair has had an impact before.
 
-    If the impact is the pair's own, also add its push.
+    If pair p itself closes in this impact, also add to PUSHED the part that forces had built up.
     """
     change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
     closing = scratch[CLOSING, p]

@@ -67,7 +67,7 @@ class Memory(NamedTuple):
     proposed: Floats  # [n, L] last proposals; NaN: none
     applied: Floats  # [n, L] last actions
     reason: Ints  # [n, L] why
-    margin: Floats  # [n, L] bound minus the least price that was tried after the proposal (m2/s2)
+    margin: Floats  # [n, L] bound minus the least price or estimate tried after the proposal (m2/s2)
     intervened: Bools  # [n, N] whether the last proposal was replaced
     replaced: Ints  # [n] number of actions that have been replaced
     members: Any = None  # what a subclass remembers of the states that a world may be in

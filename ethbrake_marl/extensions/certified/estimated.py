@@ -259,7 +259,7 @@ def without_channel(game: Game, lines: State) -> tuple[Game, State]:
 
 
 def in_order(place: Floats, known: Bools) -> Floats:
-    """Return places (m), from a vehicle outwards, so that nobody is nearer than the vehicle before.
+    """Return places (m) of the vehicles in one direction, moved so that each is at least as far as the one before.
 
     An unknown place is at most as far away as the next ``known`` one beyond.
     """

@@ -38,7 +38,7 @@ class MembersShield(StepShield):
     """A step shield for worlds that may be in one of M states."""
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the members, M rows for each world, with the memories of the shield's agents."""
+        """Return the members (the states in which a world may be), M rows for each world, with the agents' memories."""
         states = joined(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)
         own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}

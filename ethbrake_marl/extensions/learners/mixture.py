@@ -235,9 +235,10 @@ class MixtureModel(VineModel):
         pupil.follow(0.0)
 
     def worlds_of(self, act: Act, explored: Explored) -> State:
-        """Return the worlds in which a new expert is to be trained: it is better there, or not much worse.
+        """Return the worlds in which a new expert, which drives by ``act``, is to be trained further.
 
-        Left out are worlds in which it is as good as the best earlier expert, or that expert does no harm.
+        It is better there than the best earlier expert, or not much worse. Left out are worlds in which both are equal,
+        or in which the earlier expert does no harm.
         """
         gained, _ = self.drive_from(explored.start, act, self.recipe.reward.harm_count)
         more = gained - explored.gained

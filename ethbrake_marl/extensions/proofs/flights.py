@@ -39,7 +39,10 @@ def flight_lead(pair, opening, flight):
 
 @kernel
 def best_flight(pair, opening):
-    """Return the duration (s) of the flight with the largest lead; infinite if a longer one always has a larger."""
+    """Return the duration (s) of the flight (time apart, with ``opening`` m/s at its begin) with the largest lead (m).
+
+    Infinite if a longer flight always has a larger lead.
+    """
     share, press, reach, _ = pair
     if press <= 0.0:
         return math.inf

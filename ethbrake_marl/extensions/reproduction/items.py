@@ -187,6 +187,7 @@ def plain(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
 
 
 def overview(results: Mapping[Item, Made]) -> Sheet:
+    """Return the table of all claims, the paper's and ours."""
     return claims_sheet([claim for made in results.values() for claim in made.claims])
 
 

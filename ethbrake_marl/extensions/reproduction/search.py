@@ -79,7 +79,9 @@ def search(
     policies: Mapping[str, str] = SHIPPED,
     tell: OnProgress = lambda progress: None,
 ) -> tuple[list[Reading], Floats]:
-    """Return the readings of a grid, and their numbers, [R, 4, 2]. Of readings with the same numbers it has the first.
+    """Return the R readings of a grid, and for each the 4 rows of Table III, [R, 4, 2]: collision rate and mean harm.
+
+    Of readings with the same numbers only the first is returned.
 
     ``policies`` are the specs of ``SAC`` and ``PPO``.
     """

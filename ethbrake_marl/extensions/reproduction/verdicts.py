@@ -46,6 +46,7 @@ class Claim(NamedTuple):
 
 
 def claims_sheet(claims: Sequence[Claim]) -> Sheet:
+    """Return a table with one row for each claim of the paper: theirs, ours, and why they differ."""
     rows = [(each.where, each.paper, each.ours, each.nearest, each.verdict) for each in claims]
     headings = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
     return Sheet("", [Column(heading, text=True) for heading in headings], rows)
