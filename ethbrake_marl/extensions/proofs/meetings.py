@@ -144,5 +144,5 @@ def stays_ahead(at, drive, until):
 
 @large
 def stays_behind(at, brake, until):
-    """Does a vehicle, ``at`` its state, that first brakes for ``brake`` s avoid the front vehicle until ``until`` (s)?"""
+    """Does a vehicle (``at``: its state) that brakes for ``brake`` s avoid the front vehicle until ``until`` (s)?"""
     return behind_leader(at, braking_first(at, brake), until)[0] >= -AHEAD_M
