@@ -69,6 +69,7 @@ html_title = f"ethbrake_marl {__version__}"
 html_favicon = "figures/favicon.svg"
 html_extra_path = ["../scenarios/scenario.schema.json", "../train/recipe.schema.json"]
 html_static_path = ["static"]
+html_search_scorer = str(DOCS / "static/search.js")
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
