@@ -102,7 +102,7 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
         teams=[team for each in teams for team in each.values()],
     )  # fmt: skip
     header = {**table.header, "episodes": given.episodes, "list_seed": given.seed, "command": command}
-    header |= {} if known is None else {"after": known.header["command"]}
+    header |= {} if known is None else {"after": known.header.get("command", "a table without a command")}
     harm, profiles = dict(table.harm), dict(table.profiles)
     for count in known.harm if known is not None else ():
         if count not in harm:  # stays as it was

@@ -125,6 +125,11 @@ def test_documents(result: Result) -> None:
     assert "Decrease" in table.meanings() and "closing speed" in table.meanings()["Push (m/s)"]
 
 
+def test_meanings__are_of_the_column_and_not_only_of_its_measure() -> None:
+    told = summarise(eb.evaluate("paper-random", "full_brake", episodes=20, measures="pushed_m")).meanings()
+    assert told["Vehicle 1 pushed > 5 m"].startswith("Share of worlds") and "Share" not in told["Vehicle 1 pushed (m)"]
+
+
 def test_data_frame(result: Result) -> None:
     pytest.importorskip("pandas")
     frame, row = summarise(result).to_pandas(), summarise(result)[1]

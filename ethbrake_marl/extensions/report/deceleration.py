@@ -74,8 +74,10 @@ def deceleration_figure(
             [a], [least], label=f"a* = {a:.3f} m/s², coupled, least {IN_WORDS[count]}: {least:.2f}",
             **{**style, **mark, "marker": "o", "markersize": size},
         )  # fmt: skip
-    for (count, harm), style in zip((known or {}).items(), styles, strict=False):
-        axes.axhline(harm, label=f"best known {IN_WORDS[count]}: {harm:.2f}", **style | {"linewidth": 0.9})
+        if known is not None:
+            axes.axhline(
+                known[count], label=f"best known {IN_WORDS[count]}: {known[count]:.2f}", **style | {"linewidth": 0.9}
+            )
     axes.set(
         title=title or f"{loaded.name}: one world",
         xlabel=f"Constant deceleration of Vehicle {body} (m/s²)",

@@ -130,3 +130,9 @@ def test_load__refuses_what_is_no_table(table: BestHarmTable, tmp_path: Path, me
 def test_load__refuses_a_missing_file(tmp_path: Path) -> None:
     with refused("there is no such file; give the file of a table"):
         BestHarmTable.load(tmp_path / "t.npz")
+
+
+def test_meanings__of_regret_and_of_the_share_differ() -> None:
+    told = eb.summarise(eb.evaluate("paper-random", "full_brake,best_harm", episodes=20, measures="limits")).meanings()
+    assert told["Regret, first-impact"].startswith("Harm minus")
+    assert told["Share of possible, first-impact"].startswith("How much of what the best known braking saves")
