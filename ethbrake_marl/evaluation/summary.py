@@ -127,9 +127,12 @@ class SummaryTable(list[SummaryRow]):
         return notes
 
     def meanings(self) -> dict[str, str]:
-        """Return heading -> what the column means."""
-        own = {each.heading: each.meaning or measure.meaning for measure, each in self.shown.values() if each.heading}
-        return HEAD | {name: text for name, text in own.items() if not name.startswith("Decrease")}
+        """Return heading -> what the column means; of measures without a column, name -> what it means."""
+        told = {each.heading: each.meaning or measure.meaning for measure, each in self.shown.values() if each.heading}
+        for measure, each in self.shown.values():
+            if not each.heading and measure not in DEFAULT:
+                told[measure.name] = measure.meaning
+        return HEAD | {name: text.replace("``", "") for name, text in told.items() if not name.startswith("Decrease")}
 
     def to_markdown(self) -> str:
         """Return the table as Markdown, with the texts below it."""
@@ -209,7 +212,7 @@ def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
         ending = name.removeprefix(measure.name).removeprefix("_")
         own = [each for each in measure.shown if each.ending == ending]
         for each in own or [Statistic(name, "rate" if kind == "b" else "mean")]:
-            if measure.name == COLUMN["honest"] and minimised != "honest":  # only in JSON
+            if "honest" in each.key and minimised != "honest":  # only in JSON
                 each = each._replace(heading="")
             if kind != "U":
                 shown[each.key] = name, measure, each

@@ -155,9 +155,10 @@ def page_of(
         "Whole run": f"{time.monotonic() - experiment.started:.0f} s",
         "Settings": ", ".join(read_object(RunFolder(trained.directory).config).get("settings", ())),
     }
+    scheme = f" and the scheme {training.scheme}" if learned == TEAM else ""
     summary = (
-        f"The {learned} was trained with {recipe.algorithm}, scheme {training.scheme}. It was saved after {steps:,}"
-        " steps, when it was best in the worlds that the recipe names."
+        f"The {learned} learned by the recipe {recipe.name}, with the algorithm {recipe.algorithm}{scheme}"
+        f" (docs/train.md). It is the best of those measured during the training: that of step {steps:,}."
     )
     if learned == TEAM:
         summary += f" The agent “{SHIELDED}” is the trained team with the step shield."

@@ -63,6 +63,7 @@ def regret(game: Game, alert: State, last: State) -> Given:
 
 
 SHARE = "How much of what the best known braking saves the agent saves: 0 % for full braking, 100 % for the best known."
+NAMED = {"honest": "honest cost", "first": "first-impact", "total": "total"}  # in headings
 LIMITS = {
     "best_known": Part(
         best_known, unit="m2/s2",
@@ -70,14 +71,16 @@ LIMITS = {
     ),
     "regret": Part(
         regret, unit="m2/s2",
-        shown=(
-            Statistic("regret_first", "mean", "Regret, first-impact", "Regret\nfirst", "first"),
-            Statistic(
-                "share_of_possible_reduction_first", "decrease", "Share of possible, first-impact",
-                "Share of\npossible", "first", SHARE,
-            ),
-            Statistic("regret_total", "mean", ending="total"),
-            Statistic("share_of_possible_reduction_total", "decrease", ending="total"),
+        shown=tuple(
+            each
+            for count, name in NAMED.items()
+            for each in (
+                Statistic(f"regret_{count}", "mean", f"Regret, {name}", f"Regret\n{count}", count),
+                Statistic(
+                    f"share_of_possible_reduction_{count}", "decrease", f"Share of possible, {name}",
+                    f"Possible\n{count}", count, SHARE,
+                ),
+            )
         ),
     ),
 }  # fmt: skip

@@ -136,3 +136,13 @@ def test_meanings__of_regret_and_of_the_share_differ() -> None:
     told = eb.summarise(eb.evaluate("paper-random", "full_brake,best_harm", episodes=20, measures="limits")).meanings()
     assert told["Regret, first-impact"].startswith("Harm minus")
     assert told["Share of possible, first-impact"].startswith("How much of what the best known braking saves")
+    assert "Regret, honest cost" not in told
+
+
+def test_limits__of_the_honest_cost_have_columns_if_agents_minimise_it() -> None:
+    result = eb.evaluate("paper-random", "full_brake,best_harm", episodes=20, measures="limits", harm_count="honest")
+    table = eb.summarise(result)
+    braking, best = table
+    assert "regret_honest" in table.sheet().names and best["share_of_possible_reduction_honest"].value == 1.0
+    cost = braking["honest_cost"].value - braking["best_known_honest"].value
+    assert braking["regret_honest"].value == pytest.approx(cost) and cost > 1.0
