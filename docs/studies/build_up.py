@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import warnings
 from typing import Any
 
@@ -51,6 +52,7 @@ def harms(worlds: eb.State, scenario: eb.Scenario, agents: dict[str, Any]) -> di
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     warnings.simplefilter("ignore")  # the policies were not trained with these brakes, and warn
     for name, rates in CASES.items():
         scenario = BASE

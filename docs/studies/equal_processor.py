@@ -8,7 +8,7 @@ same command continues them after an interruption.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -52,7 +52,12 @@ def curve_of(run: RunFolder, count: str) -> Curve:
 
 
 if __name__ == "__main__":
-    seconds, folder, picture = int(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seconds", type=int, help="processor time of each training")
+    parser.add_argument("folder", type=Path, help="folder of the trainings")
+    parser.add_argument("picture", type=Path, help="file for the figure")
+    given = parser.parse_args()
+    seconds, folder, picture = given.seconds, given.folder, given.picture
     panels, known = {}, {}
     for test, count in TESTS.items():
         label = f"{test}: {'first-impact' if count == 'first' else 'total'} harm (m²/s²)"

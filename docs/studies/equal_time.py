@@ -8,7 +8,7 @@ the motion of the worlds. No shipped table contains the worlds of this list, so 
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 from collections.abc import Mapping, Sequence
 
@@ -66,8 +66,10 @@ def rows_of(driven: Mapping[str, tuple[float, eb.State]], teams: Mapping[str, eb
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("agents", nargs="*", default=AGENTS)
     scenario, game = eb.open_game("paper-random")
-    teams = make_teams(sys.argv[1:] or AGENTS, scenario)
+    teams = make_teams(parser.parse_args().agents, scenario)
     rows = rows_of(drive(scenario.sample(WORLDS, SEED), teams, game, REPEATS), teams)
     print("\n".join(f"| {' | '.join(cells)} |" for cells in (HEAD, ["---"] * len(HEAD), *rows)))
     print(f"\nMachine: {this_machine()}")

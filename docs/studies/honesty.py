@@ -9,7 +9,7 @@ harm ``honest``, where a push costs 10. For each price Vehicle 2 is searched for
 
 from __future__ import annotations
 
-import sys
+import argparse
 from typing import NamedTuple
 
 import numpy as np
@@ -95,6 +95,9 @@ def draw(found: dict[str, list[Cost]]) -> Figure:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("picture", help="file for the figure")
+    given = parser.parse_args()
     every = {test: costs_of(test) for test in TESTS}
     print("| agent | price of a push of 1 m/s | first-impact harm | total harm | push (m/s) | drives | still moving |")
     print("|---|---:|---:|---:|---:|---:|---:|")
@@ -104,4 +107,4 @@ if __name__ == "__main__":
             shown = "" if agent == "full_brake" else f"{price:g}"
             numbers = f"{first:.2f} | {total:.2f} | {push:.2f} | {100 * drove:.1f} % | {100 * moving:.1f} %"
             print(f"| {agent} | {shown} | {numbers} |")
-    write_picture(sys.argv[1], draw(every), force=True)
+    write_picture(given.picture, draw(every), force=True)

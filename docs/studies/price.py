@@ -8,7 +8,7 @@ difference of their harms, paired by world.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -131,6 +131,9 @@ def draw(found: Mapping[str, eb.Result]) -> Figure:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("picture", help="file for the figure")
+    given = parser.parse_args()
     results = drive(eb.load_scenario(SCENARIO), WORLDS, channels())
-    write_picture(sys.argv[1], draw(results), force=True)
+    write_picture(given.picture, draw(results), force=True)
     print(tables(results))

@@ -10,7 +10,7 @@ takes one or two minutes on one core.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from statistics import median
 
 import torch
@@ -72,7 +72,10 @@ def line(block: str, seeds: list[dict[str, float]]) -> str:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("programs", nargs="+")
+    given = parser.parse_args()
     torch.set_num_threads(1)
     eb.register_term("speed", speed, unit="m/s")
-    rows = [line(block, [measure(block, train(block, seed)) for seed in SEEDS]) for block in sys.argv[1:]]
+    rows = [line(block, [measure(block, train(block, seed)) for seed in SEEDS]) for block in given.programs]
     print("\n".join([f"| {' | '.join(['block', *MEASURES])} |", "| --- |" + " ---: |" * len(MEASURES), *rows]))

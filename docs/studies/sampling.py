@@ -8,7 +8,7 @@ horizon. It drives Vehicle 2, all others brake fully. Error: harm in the map min
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -110,8 +110,11 @@ def draw(studies: Sequence[Convergence]) -> Figure:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("picture", help="file for the figure")
+    given = parser.parse_args()
     studies = [convergence(agent) for agent in AGENTS]
-    write_picture(sys.argv[1], draw(studies), force=True)
+    write_picture(given.picture, draw(studies), force=True)
     worlds = eb.load_scenario(SCENARIO).sample(WORLDS, SEED)
     software = ", ".join(f"{name} {number}" for name, number in versions().items())
     print("\n\n".join([*map(table, studies), f"Worlds: SHA-256 {worlds_sha256(worlds)}; {software}."]))

@@ -6,7 +6,7 @@ Measure on idle cores.
 
 from __future__ import annotations
 
-import sys
+import argparse
 import time
 
 import numpy as np
@@ -43,7 +43,7 @@ def single_times(shield: Shield, decisions: int, *, asks: bool = False) -> list[
     return took
 
 
-def main(decisions: int = 5_000) -> None:
+def main(decisions: int) -> None:
     teams = {
         name: eb.make_agent(f"ppo+{name}", scenario=SCENARIO)
         for name in ("step", "robust:gaps_m=0.5", "robust:braking_capacity_mps2=10%:gaps_m=0.5")
@@ -62,4 +62,6 @@ def main(decisions: int = 5_000) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("decisions", type=int, nargs="?", default=5_000)
+    main(parser.parse_args().decisions)

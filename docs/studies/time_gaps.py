@@ -8,7 +8,7 @@ Prints the harm of each agent, and the avoided share of full braking's harm, by 
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -60,6 +60,9 @@ def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("picture", help="file for the figure")
+    given = parser.parse_args()
     table: dict[str, dict[str, np.ndarray]] = {count: {} for count in COUNTS}
     for name in SCENARIOS:
         harms = [mean_harm(with_time_gap(eb.load_scenario(name), gap_s)) for gap_s in GAPS_S]
@@ -68,4 +71,4 @@ if __name__ == "__main__":
             for gap_s, row in zip(GAPS_S, table[count][name], strict=True):
                 saved = " ".join(f"{1.0 - harm / row[0]:6.1%}" if row[0] > LEAST else "     –" for harm in row[1:])
                 print(f"{name:20} {gap_s:.1f} s {count:5} {' '.join(f'{harm:6.2f}' for harm in row)}  saved {saved}")
-    write_picture(sys.argv[1], draw(table["first"], "first"), force=True)
+    write_picture(given.picture, draw(table["first"], "first"), force=True)
