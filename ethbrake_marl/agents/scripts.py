@@ -28,7 +28,7 @@ FULL_BRAKE, COAST = Held("full_brake"), Held("coast")
 
 
 def make_held(argument: str | None, settings: Any) -> Held:
-    """Return the script with the name ``settings.spec``. Raises ``InvalidInput`` unless its argument is right."""
+    """Return the script called ``settings.spec``. Raises ``InvalidInput`` for a wrong argument."""
     check_role(settings.spec)
     return Held(settings.spec)
 
