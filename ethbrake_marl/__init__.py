@@ -1,8 +1,7 @@
 """Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
 Importing the package registers ``EthBrake-v1`` with Gymnasium and ``ethbrake/ethbrake-v1`` with PettingZoo. A public
-name is imported when it is first used, so torch and matplotlib are loaded only if needed. The block under ``if
-TYPE_CHECKING`` is the list of public names, for type checkers and for these imports.
+name is imported when it is first used, so torch and matplotlib are loaded only if needed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Lazy imports: the ``__init__`` of a folder lists public names, and each is imported when it is first used.
 
-The list is a block of imports under ``if TYPE_CHECKING``. Type checkers see the imports; this module reads them from
-the source file. So packages that a caller does not need (torch, matplotlib, scipy) are not loaded.
+The list is a block of imports under ``if TYPE_CHECKING``, which type checkers understand. This module reads it from the
+source file.
 """
 
 from __future__ import annotations

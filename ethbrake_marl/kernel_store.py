@@ -50,7 +50,6 @@ def can_be_trusted(folder: Path) -> bool:
 
 
 def is_temporary(folder: Path) -> bool:
-    """Return whether ``folder`` is deleted when this process ends."""
     return folder.name.startswith(_TEMPORARY)
 
 

@@ -6,9 +6,8 @@
     agent   = NAME[:ARGUMENT][@PATH], or FILE.py:FUNCTION[:ARGUMENT][@PATH]
     wrapper = NAME[:ARGUMENT], a search or a shield around what stands before it
 
-Two tables contain the names of agents and of wrappers; packages add entries by entry points. An entry called
-``NAME.ARGUMENT`` is used for this argument only. An agent's entry may also be a group: a list of specs, such as
-``ladder``.
+The tables ``AGENTS`` and ``WRAPPERS`` contain the names. An entry called ``NAME.ARGUMENT`` is used for this argument
+only. An agent's entry may also be a group: a list of specs, such as ``ladder``.
 """
 
 from __future__ import annotations
@@ -287,7 +286,6 @@ def _make(core: str, settings: AgentSettings) -> Driver:
 
 
 def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | None = None) -> tuple[Entry, str | None]:
-    """Return the entry of a name, and the rest of the argument."""
     rest, _, last = argument.rpartition(":")
     if argument and f"{name}.{last}" in table:
         return table[f"{name}.{last}"], rest or None
@@ -348,7 +346,6 @@ def open_game(
 
 
 def check_learners(scenario: Scenario) -> None:
-    """Raise ``InvalidInput`` if the scenario has no learner."""
     if not scenario.learners:
         raise InvalidInput(
             f"scenario {scenario.name!r} has no learner that the agents could drive; choose the scenario that the"

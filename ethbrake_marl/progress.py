@@ -98,7 +98,6 @@ class ShownProgress:
             self._told_s = now
 
     def end(self) -> None:
-        """End the line that is being updated."""
         if self._open:
             self._print("\n")
             self._open = ""

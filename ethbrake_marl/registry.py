@@ -6,8 +6,7 @@ its ``pyproject.toml``, as this package does for its extensions:
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function. Objects
-that are not used are not imported, so they cannot break anything.
+When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function.
 """
 
 from __future__ import annotations

@@ -189,7 +189,6 @@ class EV2XBMPairwise:
 
 
 def last_if_held(alert: State, rules: Rules) -> State:
-    """Return the last state of episodes in which all vehicles hold the commands ``alert.wanted``."""
     state = first_decision(alert, rules.learners, rules.time_step_s, rules.horizon_s)
     rules, nothing = rules._replace(learners=NOBODY), np.zeros((alert.n, 0))
     while not state.ended.all():
@@ -198,7 +197,6 @@ def last_if_held(alert: State, rules: Rules) -> State:
 
 
 def make_e_v2x_bm(argument: str | None, settings: Any) -> EV2XBM | EV2XBMPairwise:
-    """Return the agent ``e_v2x_bm[:pairwise]``. Raises ``InvalidInput`` for another argument."""
     if argument == "pairwise":
         return EV2XBMPairwise()
     if argument is not None:

@@ -1,7 +1,4 @@
-"""Policies of other libraries: how each kind is called, and which settings of its training are applied or refused.
-
-Nothing here imports torch or Stable-Baselines3; onnxruntime is imported only to open a file.
-"""
+"""Policies of other libraries: how each kind is called, and which settings of its training are applied or refused."""
 
 from __future__ import annotations
 
@@ -98,7 +95,6 @@ def ask_onnx(session: Any, seen: Observations) -> Any:
 
 
 def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
-    """Return the bytes of an ``.onnx`` file."""
     file = Path(path).expanduser()
     if file.suffix != ".onnx":
         raise InvalidInput(
@@ -194,7 +190,6 @@ def check_wrappers(policy: Any, who: str) -> None:
 
 
 def layers_of(env: Any) -> Iterator[Any]:
-    """Yield an environment and everything inside it, from the outside in."""
     yield env
     for name in INSIDE:
         inside = getattr(env, "__dict__", {}).get(name, ())  # its own: wrappers forward attributes

@@ -113,7 +113,6 @@ class PolicyAgent:
             )
 
     def begin(self, alert: State, body: int) -> Any:
-        """Return the policy's memory for new episodes."""
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
@@ -133,8 +132,6 @@ class PolicyAgent:
         return to_command(state, body, self._actions(answer, state, body)), memory
 
     def _own(self, memory: Any, n: int) -> Any:
-        """Return a checked copy of a memory."""
-
         def copied(part: Any) -> NDArray[Any]:
             array = np.array(to_array(part))
             if array.shape[:1] != (n,) or array.dtype.hasobject:
@@ -145,7 +142,6 @@ class PolicyAgent:
         return mapped(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
-        """Return the policy's answer as actions [n] in [-1, 1]."""
         given, n, last = to_array(answer), state.n, (self.actions or 0) - 1
         kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
         if self.actions is not None:

@@ -25,7 +25,6 @@ class OneLearner(Face):
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
     ) -> tuple[Any, Any]:
-        """Set the game; return the spaces of observations and actions."""
         self._open(open_game(*game), render_mode, most_steps)
         self.bodies, self.actions = self.game.rules.learners, actions
         names = [self.scenario.vehicle_names[i - 1] for i in self.bodies]
@@ -37,7 +36,6 @@ class OneLearner(Face):
         return FeatureBox(self.game.views[self.bodies[0]].features), action_space(actions)
 
     def _observe(self, state: State) -> Observations:
-        """Return the learner's observations, [n, F]."""
         seen: Observations = self.game.observe_alike(state, self.bodies)[:, 0]
         return seen
 

@@ -122,7 +122,6 @@ class EthBrakeVecEnv(Face, VecEnv):
         raise InvalidInput(f"appended = {self.appended!r}: must be 'number', 'state' or None")
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the training worlds, for the next reset."""
         self._seeds = [chosen_seed(seed)] * self.num_envs
         return self._seeds
 
@@ -220,7 +219,6 @@ class EthBrakeVecEnv(Face, VecEnv):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute for all rows."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 
@@ -230,7 +228,6 @@ class EthBrakeVecEnv(Face, VecEnv):
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False for every row."""
         return [False for _ in self._get_indices(indices)]
 
     def _refuse_some_rows(self, what: str, indices: Any) -> None:

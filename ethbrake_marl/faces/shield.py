@@ -74,7 +74,6 @@ def shield(
 
 
 def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
-    """Return a team with a shield. ``scenario`` is the scenario of its worlds, or None if unknown."""
     settings = AgentSettings(f"{team.name}+{mode}", None, scenario, harm_count, options)
     other = wrapped(team, str(mode), settings)
     if other.shield is None:

@@ -71,7 +71,6 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         self.observation_space, self.action_space = (batch_space(space, self.num_envs) for space in spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
-        """Start an episode in every row; arguments as in ``EthBrakeParallelEnv.reset``."""
         state = self._begin(self.num_envs, seed, options)
         super().reset(seed=self.stream.seed if seed is not None else None)
         every = np.ones(self.num_envs, np.bool_)
@@ -103,8 +102,8 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
     def _columns(self, state: State, step: Step | None, rows: Bools, stepped: Bools) -> dict[str, Any]:
         """Return infos in Gymnasium's vector form: arrays of values, each with a mask of the rows that have a value.
 
-        ``rows`` get a value. Cost and reward terms of rows that have not ``stepped`` are 0: their last step belongs to
-        another episode.
+        The mask is ``rows`` [n]. Cost and reward terms of rows that have not ``stepped`` are 0: their last step belongs
+        to an earlier episode.
         """
         infos: dict[str, Any] = {}
         for name, column in arrays(self.game, state, step, self.stream.seed or 0, self.bodies[0]).items():

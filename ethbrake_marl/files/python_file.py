@@ -1,7 +1,7 @@
 """Runs the user's Python files, and records their SHA-256.
 
-A file runs only if the user names it in code or on the command line (``--agents my_file.py:make_agent``). A name in a
-run's folder, a recipe or a scenario never starts it.
+A file runs only if the user names it in code or on the command line (``--agents my_file.py:make_agent``), never because
+of a run's folder, a recipe or a scenario.
 """
 
 from __future__ import annotations
@@ -64,7 +64,6 @@ def _run_file(path: Path, what: str) -> ModuleType:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> None:
-    """Run a file as a new module."""
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     _RUN[path] = sys.modules[module.__name__] = module

@@ -328,6 +328,5 @@ def _latex(text: str) -> str:
 
 
 def _html(value: object) -> str:
-    """Return ``value.__html__()``, or else its text escaped for HTML."""
     known: Callable[[], str] | None = getattr(value, "__html__", None)
     return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

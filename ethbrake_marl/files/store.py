@@ -88,7 +88,6 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
 
 
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write a file. Raises the errors of ``check_target``."""
     write_file(check_target(path, force=force), data)
 
 

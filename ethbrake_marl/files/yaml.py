@@ -92,7 +92,7 @@ class Document:
     lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
     def where(self, path: YamlPath) -> str:
-        """Return file and line of a value, such as ``my.yaml, line 7``; for a missing value, the line around it."""
+        """Return file and line of a value, such as ``my.yaml, line 7``. A missing value has the line of its mapping."""
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
                 return f"{self.file}, line {self.lines[path[:length]]}"

@@ -66,7 +66,6 @@ class Actor:
         return y
 
     def forward(self, layers: Layers, x: Float32s) -> Float32s:
-        """Return the outputs [outputs, rows] of one network."""
         for number, (weight, bias) in enumerate(layers, 1):
             y = np.empty((len(weight), x.shape[1]), np.float32)
             dense(weight, bias, x, y)

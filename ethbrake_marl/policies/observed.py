@@ -121,7 +121,6 @@ class ObservationSchema(Finite):
 
 
 def _is_ours(own: Own) -> bool:
-    """Return whether this package defines the feature."""
     return str(getattr(own.function, "__module__", "")).startswith("ethbrake_marl.")
 
 

@@ -42,14 +42,12 @@ class ShieldReason(IntEnum):
 
 
 def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
-    """Return body -> agent from front to rear. Raises ``InvalidInput`` for an object that is not an agent."""
     for body, agent in (drivers or {}).items():
         check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
     return dict(sorted((drivers or {}).items()))
 
 
 def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:
-    """Raise ``InvalidInput`` unless there is an agent for each learner, and for nobody else."""
     if list(drivers) != game.rules.learners.tolist():
         theirs, right = (", ".join(f"vehicle_{i}" for i in each) for each in (drivers, game.rules.learners))
         raise InvalidInput(f"shield: has agents for {theirs}; must have one for each learner, {right or 'none'}")

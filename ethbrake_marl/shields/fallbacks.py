@@ -55,9 +55,8 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
     """Return the constant actions that do the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
     It tries the plan's next actions, all of them a little harder or softer, and, with several learners, one learner's
-    other actions while the rest follow the plan. (Small changes correct deviations from a good plan far more often than
-    constants that span all brakes.) ``states`` may have several possible states of each world, one after the other:
-    then the largest harm counts.
+    other actions while the rest follow the plan.  ``states`` may have several possible states of each world, one after
+    the other: then the largest harm counts.
     """
     learners, rows, each = game.rules.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]
@@ -79,7 +78,7 @@ def rollout(
 ) -> Floats:
     """Return ``plans`` with the actions of agents that drive from ``state`` on, until the harm is above ``most`` [n].
 
-    ``state`` has the agents' memories. Later actions of the plans stay.
+    ``state`` has the agents' memories.
     """
     plans, rows, drivers = plans.copy(), np.arange(state.n), game.agents(drivers)
     while (~state.ended & (state.harm(count) <= most)).any():

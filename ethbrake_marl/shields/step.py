@@ -141,11 +141,9 @@ class StepShield:
         return self.first_memory(game, alert, state, state, self.agents_at(game, alert))
 
     def agents_at(self, game: Game, alert: State) -> dict[int, Any]:
-        """Return body -> memory of the shield's agent at the alert."""
         return {body: begin(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Return the plans of constant actions among which the first one is chosen, [n, T, L] each."""
         return first_plans(game, alert, state, self.count)
 
     def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
@@ -282,7 +280,6 @@ class StepShield:
 
 
 def part(states: State, rows: Ints, M: int) -> State:
-    """Return the M states of each world in ``rows`` (in increasing order)."""
     if len(rows) * M == states.n:
         return states
     return states.take(rows if M == 1 else (rows[:, np.newaxis] * M + np.arange(M)).ravel())
