@@ -21,8 +21,7 @@ _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 def plain_text(text: str, keep: str = "") -> str:
     """Return ``text`` with unprintable characters as Python escapes, except those in ``keep``.
 
-    Control characters, and characters that change the direction of text, could otherwise make a name or path from a
-    file move the cursor or print backwards.
+    So a name or path from a file cannot move the cursor or print backwards.
     """
     if text.isprintable():
         return text
@@ -46,8 +45,8 @@ def count_of(n: int, thing: str) -> str:
 def describe_error(error: BaseException, path: str | None = None) -> str:
     """Describe an exception from a user's code in a few words, with the line that raised it.
 
-    The line is the last one of the user's file ``path`` in the traceback; None: the innermost line. An error of this
-    package is described by its message only.
+    The line is the last one of the file ``path`` in the traceback; None: the innermost line. An error of this package
+    is described by its message only.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -145,8 +144,8 @@ def _missing(package: str) -> MissingExtra:
 class PhysicsError(EthBrakeError, ArithmeticError):
     """Some worlds of a batch could not be simulated, because of a defect in the physics code.
 
-    The other worlds are not affected: compute the batch again without the failed ones. ``worlds``: number of each
-    failed world (or its row in the batch, if the caller made the batch) -> reason.
+    The other worlds are not affected. ``worlds``: number of each failed world (or its row, if the caller made the
+    batch) -> reason.
     """
 
     def __init__(self, worlds: Mapping[int, str]) -> None:
@@ -162,7 +161,7 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 class AgentFailed(InvalidInput):
     """A user's agent raised an exception or returned invalid actions. The message names agent, world and step.
 
-    ``row``: row of the world in the batch, or None if unknown. ``reason``: what the agent did wrong, and at which step.
+    ``row``: the world's row in the batch, or None if unknown. ``reason``: what went wrong, and at which step.
     """
 
     def __init__(self, agent: str, row: int | None, reason: str) -> None:
@@ -197,10 +196,9 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name; the message shows a similar name, or all ``known`` names.
+    """Return the error for an unknown name. Its message shows a similar name, or all ``known`` names.
 
-    ``kind`` is a noun such as ``scenario``. With ``may_be_own`` the message adds that the user's own names must first
-    be registered or installed.
+    ``kind`` is a noun such as ``scenario``. ``may_be_own``: the message adds that own names must be registered first.
     """
     names = sorted({*known})
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []

@@ -169,7 +169,7 @@ def statistics_of(model: Any) -> Any:
 def check_wrappers(policy: Any, who: str) -> None:
     """Raise ``InvalidInput`` if a model was trained under a wrapper that may change observations or actions.
 
-    It also refuses a model from a file that has lost the statistics of its ``VecNormalize``.
+    Also if it was trained with ``VecNormalize``, whose statistics its file lacks.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else layers_of(env):
@@ -201,8 +201,8 @@ def layers_of(env: Any) -> Iterator[Any]:
 def _was_normalised(model: Any) -> bool:
     """Return whether a model was trained on normalised observations.
 
-    Then it also stores the original observation (as off-policy algorithms always do), or the last one is outside its
-    space.
+    Its last observation is then outside its space, or the original one is stored too (off-policy algorithms always do
+    so).
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

@@ -44,8 +44,8 @@ Clusters = NDArray[Any] | None
 def mean(values: Floats, clusters: Clusters = None) -> Estimate:
     """Return the mean with its t interval, ``mean -+ t s / sqrt(n)``.
 
-    If no value is negative, the interval ends at 0. If all values are 0, there is no interval: zeros do not show how
-    large other values can be.
+    If no value is negative, the interval does not go below 0. If all values are 0, there is no interval: zeros do not
+    show how large other values can be.
     """
     estimate = _mean(values, clusters)
     if (values < 0.0).any() or estimate.interval is None:

@@ -20,7 +20,7 @@ class Face:
 
     bodies: Ints
     episode: State = None  # type: ignore[assignment]  # until the first reset
-    begins_again = False  # whether an ended episode is followed by the next one, without a reset
+    begins_again = False  # whether the next episode starts by itself when one has ended
 
     def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
         """Set the game of this environment. An episode is truncated after ``most_steps``; None: only at the horizon."""

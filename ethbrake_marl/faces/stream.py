@@ -33,7 +33,7 @@ class Stream:
         self.given: Drawn | None = None  # the worlds that the last reset asked for
 
     def reset(self, n: int, seed: int | None, options: Any = None) -> State:
-        """Return new episodes: in the first n worlds of ``seed``, or if it is None in the next n worlds.
+        """Return new episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
 
         The first reset without a seed draws a random one. ``options`` may specify the worlds instead. Raises
         ``InvalidInput`` for a bad seed or option, and then changes nothing; warns of unknown options.

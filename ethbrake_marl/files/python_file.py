@@ -25,9 +25,8 @@ _SHA256: dict[Path, str] = {}  # of each Python file, and of the files that they
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
     """Run a Python file, once per process, and return the object ``name`` that it defines.
 
-    The code has all rights of the user. ``reads``: another file that it uses, such as weights, whose SHA-256 is
-    recorded too. Raises ``InvalidInput`` if the Python file is missing, raises an error, has changed since it ran, or
-    does not define ``name``.
+    The code has all rights of the user. ``reads``: a file that it uses, such as weights; its SHA-256 is recorded too.
+    Raises ``InvalidInput`` if the Python file is missing, fails, has changed since it ran, or does not define ``name``.
     """
     module = _run_file(Path(path).expanduser(), f"file {path!r}")
     if not hasattr(module, name):

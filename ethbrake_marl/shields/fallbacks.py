@@ -78,7 +78,7 @@ def rollout(
 ) -> Floats:
     """Return ``plans`` with the actions of agents that drive from ``state`` on, until the harm is above ``most`` [n].
 
-    ``state`` has the agents' memories.
+    ``state`` contains the agents' memories.
     """
     plans, rows, drivers = plans.copy(), np.arange(state.n), game.agents(drivers)
     while (~state.ended & (state.harm(count) <= most)).any():

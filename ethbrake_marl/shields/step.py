@@ -116,7 +116,9 @@ class StepShield:
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the M possible states of each world, M rows per world, the most likely first. M = 1 in this class."""
+        """Return the M possible states of each world, M rows per world, the nominal (middle) one first. M = 1 in this
+        class.
+        """
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
@@ -299,7 +301,7 @@ def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: 
 
 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback: the shield's own agents drive on from the most likely state. The harm has no estimate yet (0)."""
+    """Fallback: the shield's own agents drive on from the nominal state. The harm has no estimate yet (0)."""
     nominal = after if after.n == len(plans) else after.take(np.arange(0, after.n, after.n // len(plans)))
     return shield.rolled_out(game, nominal, plans, most), np.zeros(len(plans))
 

@@ -61,13 +61,13 @@ class BetweenUpdates(BaseCallback):
             )
         self.model.set_logger(Logger(str(folder.path), []))
         self.count = 0  # updates so far
-        self.policies: Policies = {}  # the last ones whose weights are finite
-        self.steps = self.updates = 0  # of `policies`
-        self.best: Policies = {}  # on the fixed list; empty if nothing was measured
-        self.best_value = math.inf
+        self.policies: Policies = {}  # the latest policies with finite weights
+        self.steps = self.updates = 0  # decisions and updates when `policies` was copied
+        self.best: Policies = {}  # best policies on the fixed list; empty if nothing was measured
+        self.best_value = math.inf  # the metric of `best`
         self.evaluations: list[dict[str, float]] = []
-        self.note = ""
-        self.restored = False  # the work after this update was done before the checkpoint
+        self.note = ""  # text for the next progress report
+        self.restored = False  # True just after `restore`: this update's work was done before the checkpoint
         self.wall_start, self.cpu_start = time.monotonic(), time.process_time()
 
     @property

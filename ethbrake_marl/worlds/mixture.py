@@ -22,9 +22,9 @@ _SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them if all
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Content of a scenario file with changed values. A new way to declare gaps (or speeds, ...) replaces the old one.
+    """Content of a scenario file with changed values; a key that becomes None is left out.
 
-    A key that becomes None is left out.
+    A new way to declare gaps, speeds or an obstacle replaces the old one.
     """
     old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
     if "speeds_mps" in changes:

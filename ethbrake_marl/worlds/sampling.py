@@ -107,11 +107,12 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
         entries = scenario.sources[key]
         drawn = np.empty((n, len(entries)))
         for i, possible in enumerate(entries):
-            for k, quantity in possible.items():
+            for k, quantity in possible.items():  # each vehicle type that is possible here
                 rows: Any = slice(None) if len(possible) == 1 else kind[:, i] == k
                 if isinstance(quantity, float):
                     drawn[rows, i] = quantity
                     continue
+                # All columns of a table take their number from one place, so a world takes them from the same row.
                 stream, column = ROW if isinstance(quantity, TableColumn) else RULES[key].place(i)
                 u = numbers(width_of(stream, scenario.vehicles), stream)[rows, column]
                 of = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)

@@ -260,9 +260,9 @@ class Scenario(Part):
         return own or any(member.has_obstacle for member in self.members)
 
     def unheard(self, types: Ints | None = None) -> Bools:
-        """Whether equipment keeps i from getting messages of j, for vehicles of ``types`` [n, N]: [n, N, N].
+        """Whether i cannot get messages of j because of the equipment of their vehicle types, [n, N, N].
 
-        Without types: [1, N, N], whether i may lack messages of j.
+        ``types`` [n, N] are the types. None: [1, N, N], whether this is possible.
         """
         if self.types_of_line is None:
             return np.zeros((1, self.vehicles, self.vehicles), np.bool_)
