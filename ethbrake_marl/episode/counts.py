@@ -53,7 +53,7 @@ def other_count(count: Count) -> str:
 
 @kernel
 def pair_amount(line, p, weights):
-    """Amount of pair p in one world so far (m2/s2); ``weights`` [6] define the count."""
+    """Harm of pair p in one world so far (m2/s2), as the count with the ``weights`` [6] counts it."""
     harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
     beside = weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
     return harm + (weights[2] * line[PASSED, p] + beside)
@@ -67,7 +67,7 @@ def own_amount(line, p, weights):
 
 @kernel
 def amount_so_far(line, weights):
-    """Amount of one world so far in a count (m2/s2), always summed from the obstacle to the rear."""
+    """Harm of one world so far, as a count counts it (m2/s2), always summed from the obstacle to the rear."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
         amount += pair_amount(line, p, weights)
@@ -75,7 +75,7 @@ def amount_so_far(line, weights):
 
 
 def pair_amounts(line: Floats, count: Count) -> Floats:
-    """Amount of each pair so far in a count, [n, N + 1] m2/s2; column 0 is the pair with the obstacle."""
+    """Harm of each pair so far, as ``count`` counts it, [n, N + 1] m2/s2; column 0 is the pair with the obstacle."""
     first, total, passed, push, drove, moving = weights_of(count)
     harm = first * line[:, FIRST] + total * line[:, TOTAL]
     beside = push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING]

@@ -116,9 +116,7 @@ class StepShield:
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the M possible states of each world, M rows per world, the nominal (middle) one first. M = 1 in this
-        class.
-        """
+        """Return the M possible states of each world, M rows per world, the nominal one first. Here M = 1."""
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
@@ -295,13 +293,13 @@ def trials(learners: int) -> Bools:
 
 
 def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback: the best constant actions. If scripts look at the state, the harm has no estimate yet (0)."""
+    """Fallback: the best constant actions. If scripts look at the state, the estimate is 0 (unknown)."""
     plans, estimate = best_constant(game, after, plans, shield.count)
     return plans, np.zeros(len(plans)) if game.scripts else estimate
 
 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback: the shield's own agents drive on from the nominal state. The harm has no estimate yet (0)."""
+    """Fallback: the shield's own agents drive on from the nominal state. The estimate is 0 (unknown)."""
     nominal = after if after.n == len(plans) else after.take(np.arange(0, after.n, after.n // len(plans)))
     return shield.rolled_out(game, nominal, plans, most), np.zeros(len(plans))
 

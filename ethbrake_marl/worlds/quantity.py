@@ -64,7 +64,7 @@ class Uniform(Distribution):
     uniform: Ends = Field(description="[low, high]")
 
     def value(self, u: Floats) -> Floats:
-        """Value in [low, high], because u is at most 1 - 2^-53."""
+        """Value in [low, high]: it is never above high, because u is at most 1 - 2^-53."""
         low, high = self.uniform
         return low + (high - low) * u
 

@@ -62,8 +62,7 @@ class Drawn(NamedTuple):
 def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) -> Drawn:
     """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
 
-     Raises ``InvalidInput`` for bad arguments, and
-    for a world that is rejected ``MOST_ATTEMPTS`` times.
+    Raises ``InvalidInput`` for bad arguments, and for a world that is rejected ``MOST_ATTEMPTS`` times.
     """
     index = world_numbers(n, seed, first, channel)
     if not scenario.members:
