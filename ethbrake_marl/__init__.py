@@ -1,8 +1,7 @@
 """Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
-Importing the package registers ``EthBrake-v1`` with Gymnasium and ``ethbrake/ethbrake-v1`` with PettingZoo. Each public
-name is imported when it is first used, so torch and matplotlib are loaded only if they are needed. The block under
-``if TYPE_CHECKING`` lists every public name once, for type checkers and for the import at run time.
+Importing the package registers ``EthBrake-v1`` with Gymnasium and ``ethbrake/ethbrake-v1`` with PettingZoo. A public
+name is imported when it is first used, so torch and matplotlib are loaded only if needed.
 """
 
 from __future__ import annotations
@@ -97,13 +96,13 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "t
 
 
 def _usable() -> list[str]:
-    """Return the public names whose packages are installed. Importing another one raises ``MissingExtra``."""
+    """Return the public names that can be imported; the others need a package that is not installed."""
     missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
     return [name for name in _HOMES if name not in missing]
 
 
 def _import_public(name: str) -> Any:
-    """The package's ``__getattr__``."""
+    """Import a public name when it is first used (the package's ``__getattr__``)."""
     if name == "__all__":
         return ["__version__", *_usable()]
     if name not in _HOMES:

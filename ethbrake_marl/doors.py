@@ -1,7 +1,7 @@
 """Lazy imports: the ``__init__`` of a folder lists public names, and each is imported when it is first used.
 
-The list is a block of imports under ``if TYPE_CHECKING``, which type checkers read as imports, and this module from
-the source file. So packages that a caller does not need (torch, matplotlib, scipy) are not loaded.
+The list is a block of imports under ``if TYPE_CHECKING``, which type checkers understand. This module reads it from the
+source file.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 @cache
 def names_behind(file: str) -> dict[str, str]:
-    """Return name -> module of the imports in the ``if TYPE_CHECKING`` block of an ``__init__``."""
+    """Return name -> module of the imports in the ``if TYPE_CHECKING`` block of an ``__init__.py``."""
     statements = ast.parse(Path(file).read_text("utf-8")).body
     block = next(statement for statement in statements if isinstance(statement, ast.If)).body
     imports = [statement for statement in block if isinstance(statement, ast.ImportFrom)]
@@ -27,7 +27,7 @@ def names_behind(file: str) -> dict[str, str]:
 def front_door(package: str, file: str) -> Callable[[str], Any]:
     """Return ``__getattr__`` for a package's ``__init__``, and set its ``__all__`` and ``__dir__``.
 
-    ``package`` and ``file`` are ``__name__`` and ``__file__`` of the ``__init__``.
+    ``package`` and ``file`` are its ``__name__`` and ``__file__``.
     """
     folder, names = sys.modules[package], names_behind(file)
     vars(folder).update(__all__=[*names], __dir__=lambda: sorted({*vars(folder), *names}))

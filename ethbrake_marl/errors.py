@@ -19,10 +19,9 @@ _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """Return ``text`` with unprintable characters as Python escapes, except the space and the characters in ``keep``.
+    """Return ``text`` with unprintable characters as Python escapes, except those in ``keep``.
 
-    Control characters, separators and characters that set the direction of text are escaped: names and paths from files
-    could otherwise move the cursor or print a line backwards.
+    So a name or path from a file cannot move the cursor or print backwards.
     """
     if text.isprintable():
         return text
@@ -30,10 +29,7 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str) -> str:
-    """Return one line of ``plain_text``; a text longer than ``LINE_LIMIT`` is shortened in the middle.
-
-    The beginning (what is wrong, and where) and the end (what would be right) are kept.
-    """
+    """Return ``plain_text`` on one line; if it is longer than ``LINE_LIMIT``, its middle is left out."""
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
     if len(text) == len(blanks) and len(line) <= LINE_LIMIT:
@@ -42,15 +38,15 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Return a number and its noun (``thing``, in the singular), such as ``1 world`` or ``10,000 worlds``."""
+    """Return a number with its noun, such as ``1 world`` or ``10,000 worlds``. ``thing`` is the singular."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
 def describe_error(error: BaseException, path: str | None = None) -> str:
-    """Describe an exception from the user's code in a few words, with the line that raised it.
+    """Describe an exception from a user's code in a few words, with the line that raised it.
 
-    That is the last line of the user's file ``path`` in the traceback; None: the innermost line. An error of this
-    package is described by its message only.
+    The line is the last one of the file ``path`` in the traceback; None: the innermost line. An error of this package
+    is described by its message only.
     """
     text = str(error) if isinstance(error, EthBrakeError) else f"{type(error).__name__}: {error}"
     frames = traceback.extract_tb(error.__traceback__)
@@ -68,7 +64,7 @@ def describe_error(error: BaseException, path: str | None = None) -> str:
 
 
 class EthBrakeError(Exception):
-    """Base class of every error that this package raises on purpose; its message is always one line.
+    """Base class of all errors that this package raises on purpose. The message is always one line.
 
     >>> import ethbrake_marl as eb
     >>> try:
@@ -84,19 +80,19 @@ class EthBrakeError(Exception):
 
 
 class InvalidInput(EthBrakeError, ValueError):
-    """A value from the user cannot be used; the message names the argument, its value and what would be right."""
+    """A value from the user cannot be used. The message names the argument, its value and what would be right."""
 
 
 class UnknownName(InvalidInput):
-    """A name (scenario, agent, key, run) is unknown; the message suggests a similar name or lists the known ones."""
+    """A name (of a scenario, agent, key or run) is unknown. The message suggests a similar name or lists all names."""
 
 
 class AlreadyExists(EthBrakeError, FileExistsError):
-    """A file or a registered name exists already. ``force`` (``--force``) overwrites a file."""
+    """A file or a registered name already exists. ``force`` (``--force``) overwrites a file."""
 
 
 class CorruptBundle(EthBrakeError, ValueError):
-    """A policy bundle is damaged, or is none; nothing was loaded from it."""
+    """A policy bundle is damaged, or the folder is not a bundle. Nothing was loaded."""
 
 
 _EXTRA_OF = {
@@ -113,7 +109,7 @@ _EXTRA_OF = {
 
 
 class MissingExtra(EthBrakeError, ImportError):
-    """A package of an optional extra is not installed; the message contains the command that installs it.
+    """An optional package is not installed. The message contains the command that installs it.
 
     >>> import ethbrake_marl as eb
     >>> issubclass(eb.MissingExtra, ImportError)
@@ -124,10 +120,7 @@ class MissingExtra(EthBrakeError, ImportError):
 
 @contextmanager
 def naming_extras() -> Iterator[None]:
-    """Raise ``MissingExtra`` if an import in the block fails because an optional extra is missing.
-
-    Any other import error is raised unchanged.
-    """
+    """Turn a failed import of an optional package, inside the block, into ``MissingExtra``."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -138,7 +131,7 @@ def naming_extras() -> Iterator[None]:
 
 
 def need(package: str) -> None:
-    """Raise ``MissingExtra`` unless ``package``, of an optional extra, is installed; do not import it."""
+    """Raise ``MissingExtra`` unless the optional ``package`` is installed. It is not imported."""
     if find_spec(package) is None:
         raise _missing(package)
 
@@ -149,10 +142,10 @@ def _missing(package: str) -> MissingExtra:
 
 
 class PhysicsError(EthBrakeError, ArithmeticError):
-    """Some worlds of a batch could not be simulated. The cause is a defect of the physics kernel, never of the input.
+    """Some worlds of a batch could not be simulated, because of a defect in the physics code.
 
-    A caller may compute the batch again without the failed worlds, which do not affect the others. ``worlds``: number
-    of each failed world in its list (or its row in the batch, if the caller made it) -> reason.
+    The other worlds are not affected. ``worlds``: number of each failed world (or its row, if the caller made the
+    batch) -> reason.
     """
 
     def __init__(self, worlds: Mapping[int, str]) -> None:
@@ -166,10 +159,9 @@ class PhysicsError(EthBrakeError, ArithmeticError):
 
 
 class AgentFailed(InvalidInput):
-    """An agent of the user raised an exception or returned no valid actions; the message names agent, world and step.
+    """A user's agent raised an exception or returned invalid actions. The message names agent, world and step.
 
-    ``row``: row of the world in the batch; None if it is unknown. ``reason``: what the agent did wrong, and at which
-    step.
+    ``row``: the world's row in the batch, or None if unknown. ``reason``: what went wrong, and at which step.
     """
 
     def __init__(self, agent: str, row: int | None, reason: str) -> None:
@@ -183,9 +175,9 @@ class AgentFailed(InvalidInput):
     @staticmethod
     @contextmanager
     def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
-        """If the block raises ``AgentFailed``, replace the agent's name in the error by ``name``.
+        """Replace the agent's name by ``name`` in an ``AgentFailed`` that the block raises.
 
-        ``others`` are the names of the other vehicles' agents, which stay in their errors.
+        ``others`` are the names of other vehicles' agents, whose errors stay unchanged.
         """
         try:
             yield
@@ -196,18 +188,17 @@ class AgentFailed(InvalidInput):
 
 
 class Unfamiliar(UserWarning):
-    """A trained policy or a table of best known harm is from other worlds or other physics."""
+    """A trained policy, or a table of best known harm, was made for other worlds or another physics."""
 
 
 class FreeImpacts(UserWarning):
-    """An objective gives an impact no weight, so that causing it costs nothing."""
+    """An objective gives some impact no weight, so causing it costs nothing."""
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name; its message shows a similar name, or all known names.
+    """Return the error for an unknown name. Its message shows a similar name, or all ``known`` names.
 
-    ``kind`` says what the name should denote, such as ``scenario``. ``may_be_own``: users can register names of this
-    kind; the message then says that such a name must first be registered or installed.
+    ``kind`` is a noun such as ``scenario``. ``may_be_own``: the message adds that own names must be registered first.
     """
     names = sorted({*known})
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
@@ -217,7 +208,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
-    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]. Messages call it ``what``."""
+    """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]; ``what`` is its name."""
     whole = isinstance(value, Integral) and not isinstance(value, bool)
     if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
@@ -225,7 +216,7 @@ def check_whole_number(what: str, value: object, least: int, most: int | None = 
 
 
 def check_one_learner(scenario: str, learners: Sequence[str], advice: str) -> None:
-    """Raise ``InvalidInput``, which ends with ``advice``, unless there is exactly one learner."""
+    """Raise ``InvalidInput`` unless there is exactly one learner; the message ends with ``advice``."""
     if len(learners) != 1:
         raise InvalidInput(
             f"scenario {scenario!r} has {len(learners)} learners ({', '.join(learners) or 'none'}); {advice}"

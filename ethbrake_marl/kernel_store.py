@@ -1,4 +1,4 @@
-"""The cache folder of compiled kernels, and calls before the first compilation; imports no numba."""
+"""The cache folder of compiled physics code, and functions to call before the first compilation. Imports no numba."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _tellers: list[Callable[[Path, bool], None]] = []
 
 
 def home_folder() -> Path | None:
-    """Return the folder under ``$NUMBA_CACHE_DIR`` or the user's cache; None for a user without a home folder."""
+    """Return this package's folder in ``$NUMBA_CACHE_DIR`` or the user's cache; None without a home folder."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
@@ -26,9 +26,9 @@ def home_folder() -> Path | None:
 
 @cache
 def cache_folder() -> Path:
-    """Return the folder of the compiled kernels.
+    """Return the folder of the compiled code.
 
-    It is temporary if ``home_folder`` cannot be written, its disk is full, or it belongs to somebody else.
+    It is a temporary folder if ``home_folder`` cannot be written to, has no space, or belongs to another user.
     """
     folder = home_folder()
     try:
@@ -45,19 +45,18 @@ def cache_folder() -> Path:
 
 
 def can_be_trusted(folder: Path) -> bool:
-    """Return whether this user or root owns a folder: its machine code will be run."""
+    """Return whether this user or root owns a folder, since machine code from it will be run."""
     return not hasattr(os, "getuid") or folder.stat().st_uid in (0, os.getuid())
 
 
 def is_temporary(folder: Path) -> bool:
-    """Return whether ``folder`` is deleted when this process ends."""
     return folder.name.startswith(_TEMPORARY)
 
 
 def on_first_compilation(tell: Callable[[Path, bool], None]) -> None:
-    """Call ``tell(folder, is_empty)`` once, just before this process compiles its first kernel.
+    """Call ``tell(folder, is_empty)`` once, just before this process compiles for the first time.
 
-    ``is_empty``: the cache ``folder`` has no compiled kernel yet.
+    ``is_empty``: the cache ``folder`` contains no compiled code yet.
     """
     _tellers.append(tell)
 

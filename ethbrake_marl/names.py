@@ -1,4 +1,4 @@
-"""Names become things here: ``full_brake``, ``constant:3``, ``policy@runs/mine``, ``mine.py:make``, ``ppo+step``.
+"""Agents and shields by name: ``full_brake``, ``constant:3``, ``policy@runs/mine``, ``mine.py:make``, ``ppo+step``.
 
 ::
 
@@ -6,8 +6,8 @@
     agent   = NAME[:ARGUMENT][@PATH], or FILE.py:FUNCTION[:ARGUMENT][@PATH]
     wrapper = NAME[:ARGUMENT], a search or a shield around what stands before it
 
-Two tables hold the names, agents and wrappers; packages add to them by entry points, as this one does. An entry
-``NAME.ARGUMENT`` stands for this argument. An agent's entry may also be a list of specs (a group, ``ladder``).
+The tables ``AGENTS`` and ``WRAPPERS`` contain the names. An entry called ``NAME.ARGUMENT`` is used for this argument
+only. An agent's entry may also be a group: a list of specs, such as ``ladder``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Driver = Agent | Team
 
 @dataclass(frozen=True, slots=True)
 class AgentSettings:
-    """What a function that makes an agent may want to know, beside the argument in the agent's name.
+    """Settings for a function that makes an agent, in addition to the argument in the agent's name.
 
     >>> import ethbrake_marl as eb
     >>> def make_mine(argument, settings):
@@ -57,7 +57,7 @@ class AgentSettings:
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
-        """Return the scenario. Raises ``InvalidInput`` if it is not known."""
+        """Return the scenario. Raises ``InvalidInput`` if it is unknown."""
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario, for instance make_agent({self.spec!r},"
@@ -82,17 +82,17 @@ def register_agent(
     knows: str = UNSTATED,
     form: str | None = None,
 ) -> None:
-    """Give an agent a name, for every place that takes names. Entry points: ``ethbrake_marl.agents``.
+    """Give an agent a name, which can be used wherever agents are named. Entry points: ``ethbrake_marl.agents``.
 
-    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad one.
+    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for an invalid one.
 
     Args:
         name: characters ``a-z``, ``0-9``, ``_``, ``-``, beginning with a letter.
-        make: ``make(argument, settings)`` returns the agent, or a team; ``argument`` is the text after the colon, or
-            None. Instead: the specs of a group.
-        about: one line.
-        knows: what it has to know: one of ``agents.drive.KNOWLEDGE``.
-        form: as ``NAME[:ARGUMENT][@PATH]``; None: the name, with or without an argument.
+        make: ``make(argument, settings)`` returns the agent or a team; ``argument`` is the text after the colon, or
+            None. For a group: a list of specs.
+        about: description in one line.
+        knows: what the agent needs to know: one of ``agents.drive.KNOWLEDGE``.
+        form: how the name is written, as ``NAME[:ARGUMENT][@PATH]``; None: the name, with or without an argument.
 
     """
     _add(AGENTS, name, make, about, knows, form)
@@ -106,10 +106,10 @@ def register_shield(
     knows: str = UNSTATED,
     form: str | None = None,
 ) -> None:
-    """Give a shield, or a search, a name that can stand after a ``+``. Entry points: ``ethbrake_marl.shields``.
+    """Give a shield or a search a name that can stand after a ``+``. Entry points: ``ethbrake_marl.shields``.
 
-    ``make(team, argument, settings)`` returns the wrapped team; the rest is as in ``register_agent``. If it gives the
-    team a shield, the name is also a mode of ``eb.shield``, whose further keywords are ``settings.options``.
+    ``make(team, argument, settings)`` returns the wrapped team; the rest is as in ``register_agent``. A shield's name
+    is also a mode of ``eb.shield``, which passes further keywords as ``settings.options``.
     """
     _add(WRAPPERS, name, make, about, knows, form)
 
@@ -128,10 +128,10 @@ WRAPPERS: Registry[Entry] = Registry("shield or search", "shields", register_shi
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
-    """Return the agent, or the team of a training run or shield, that a name stands for (this module's first lines).
+    """Return the agent or team with a name, such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: module docstring).
 
-    ``scenario`` is needed by teams, wrappers and agents that look ahead. A Python file that is named runs with all your
-    rights. Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for a bad argument.
+    Teams, wrappers and agents that look ahead need ``scenario``. A Python file in the name runs with all your rights.
+    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for a bad argument.
 
     >>> import ethbrake_marl as eb
     >>> eb.make_agent("constant:3.5").name
@@ -150,23 +150,23 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
 
 
 def wrapped(team: Team, wrapper: str, settings: AgentSettings) -> Team:
-    """Return a team with the shield or search ``wrapper`` around it, such as ``episode:pairwise``."""
+    """Return a team inside the shield or search ``wrapper``, such as ``episode:pairwise``."""
     entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
     around: Team = _called(settings.spec, entry.make, team, argument, settings)
     return around._replace(name=settings.spec)
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
-    """Return a team for all learners of a scenario. A single agent drives each of them, with separate memories."""
+    """Return a team for all learners of a scenario. A single agent drives each learner, with separate memories."""
     if isinstance(driver, Team):
         return driver
     return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Return spec -> team. A text may list several specs, with commas; groups are resolved.
+    """Return spec -> team. A text may list several specs, separated by commas; groups are expanded.
 
-    Raises the errors of ``make_agent``, and ``InvalidInput`` for a spec that is listed twice.
+    Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated spec.
     """
     teams: dict[str, Team] = {}
     for each in split_specs(specs) if isinstance(specs, str) else specs:
@@ -178,11 +178,11 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
 
 
 def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Return name -> team of whatever stands for agents.
+    """Return name -> team for any description of agents.
 
-    ``agents`` is a text or list as in ``make_teams``; or a mapping from names of your own to specs, agents, teams, or
-    mappings from vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises
-    ``InvalidInput`` for anything else.
+    ``agents`` is a text or list as in ``make_teams``; or a mapping from names to specs, agents, teams, or mappings from
+    vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises ``InvalidInput`` for
+    anything else.
     """
     if isinstance(agents, str) or (isinstance(agents, Iterable) and not isinstance(agents, Mapping)):
         return make_teams(agents, scenario, harm_count=harm_count)
@@ -212,7 +212,7 @@ def _driver(given: Any, scenario: Scenario, harm_count: str) -> Any:
 
 
 def group(name: str) -> list[str]:
-    """Return the specs of a group: of the entry ``NAME``, then of all ``NAME.MORE``; nothing for another name."""
+    """Return the specs of a group: those of the entry ``NAME``, then of all ``NAME.MORE``; [] for any other name."""
     if name not in AGENTS or callable(AGENTS[name].make):
         return []
     listed: list[Any] = [AGENTS[each].make for each in AGENTS if each == name or each.startswith(f"{name}.")]
@@ -220,7 +220,7 @@ def group(name: str) -> list[str]:
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a list of specs at its commas, except those in the path of something that exists."""
+    """Split a list of specs at its commas, except commas in the path of an existing file or folder."""
     parts, specs = text.split(","), []
     while parts:
         joined = (k for k in range(len(parts), 1, -1) if _path_exists(",".join(parts[:k])))
@@ -241,9 +241,9 @@ def _path_exists(text: str) -> bool:
 
 
 def _split(spec: object) -> tuple[str, list[str]]:
-    """Return the agent and its wrappers, from the inside. A ``+`` in the path of something that exists is the path's.
+    """Return the agent's spec and its wrappers, the innermost first. A ``+`` in an existing path belongs to the path.
 
-    Raises ``UnknownName`` for a wrapper that is not known.
+    Raises ``UnknownName`` for an unknown wrapper.
     """
     if not isinstance(spec, str) or not spec:
         raise InvalidInput(f"agent {spec!r:.80}: must be a name, for instance full_brake, policy@runs/mine or ppo+step")
@@ -286,7 +286,6 @@ def _make(core: str, settings: AgentSettings) -> Driver:
 
 
 def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | None = None) -> tuple[Entry, str | None]:
-    """Return the entry of a name and the argument that is left for it."""
     rest, _, last = argument.rpartition(":")
     if argument and f"{name}.{last}" in table:
         return table[f"{name}.{last}"], rest or None
@@ -320,7 +319,7 @@ def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any
 
 
 def _called(spec: str, make: Callable[..., Any], *given: Any) -> Any:
-    """Call what makes an agent; whatever goes wrong in a user's code is one ``InvalidInput``."""
+    """Call the user's function that makes an agent; any error becomes an ``InvalidInput``."""
     try:
         return make(*given)
     except EthBrakeError:
@@ -336,9 +335,9 @@ def open_game(
     observation: Any = None,
     reward_vector: Any = None,
 ) -> tuple[Scenario, Game]:
-    """Return a scenario and its game, in which roles that name agents are played by these.
+    """Return a scenario and its game. Vehicles whose role names an agent are driven by this agent.
 
-    Arguments are those of ``EthBrakeParallelEnv``.
+    Arguments as in ``EthBrakeParallelEnv``.
     """
     loaded = load_scenario(scenario)
     if learners is not None:
@@ -347,7 +346,6 @@ def open_game(
 
 
 def check_learners(scenario: Scenario) -> None:
-    """Raise ``InvalidInput`` if no vehicle learns."""
     if not scenario.learners:
         raise InvalidInput(
             f"scenario {scenario.name!r} has no learner that the agents could drive; choose the scenario that the"
@@ -357,7 +355,7 @@ def check_learners(scenario: Scenario) -> None:
 
 
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
-    """Return body -> agent of the scripts that look at the state."""
+    """Return body -> agent, for the scripts that look at the state."""
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
         if role.partition(":")[0] not in (LEARNER, *HELD):
@@ -378,12 +376,12 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[Entry]:
-    """Return the entries of all agents and wrappers that can be loaded, without groups; a wrapper's form has its +."""
+    """Return the entries of all agents and wrappers that can be loaded, without groups. A wrapper's form has its +."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 
 
 def why_not_listed() -> list[str]:
-    """Return why the other agents and wrappers cannot be loaded."""
+    """Return the error message of each agent or wrapper that cannot be loaded."""
     reasons = (table.why_not(name) for table in (AGENTS, WRAPPERS) for name in table)
     return [reason for reason in reasons if reason is not None]

@@ -1,4 +1,4 @@
-"""Run independent function calls in parallel, with joblib, in processes with one thread each."""
+"""Runs independent function calls in parallel processes with one thread each, by joblib."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ class WorkerLost(EthBrakeError):
 def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     """Run function calls in parallel; yield their results in the order of the calls.
 
-    Inside ``joblib.parallel_config(backend=...)`` the calls run where this says, for instance on a cluster of Ray.
+    Inside ``joblib.parallel_config(backend=...)`` that backend runs them, for instance on a Ray cluster.
 
     Args:
-        calls: tuples (function, argument, ...) with module-level functions. A generator's tuples are taken shortly
-            before their calls start.
+        calls: tuples (function, argument, ...) with module-level functions. A generator is read shortly before the
+            calls start.
         jobs: number of calls that run at once; None or 1: one after the other, in this process.
 
-    Raises the error that a call raised, ``WorkerLost`` if a process is killed, ``InvalidInput`` if a call cannot be
-    pickled, and ``MissingExtra`` without joblib.
+    Raises the error of a call, ``WorkerLost`` if a process is killed, ``InvalidInput`` if a call cannot be pickled, and
+    ``MissingExtra`` without joblib.
 
     """
     if jobs in (None, 1):
@@ -81,7 +81,7 @@ def _pickled(call: Call) -> bytes:
 
 
 def _answer(call: bytes) -> Any:
-    """Run a pickled call in a worker; printed text goes to stderr."""
+    """Run a pickled call in a worker process; its prints go to stderr."""
     _end_with_parent()
     with redirect_stdout(sys.stderr):
         function, *arguments = pickle.loads(call)
@@ -90,7 +90,7 @@ def _answer(call: bytes) -> Any:
 
 @cache
 def _end_with_parent() -> None:
-    """Make this worker process exit when its parent process ends, even in the middle of a call."""
+    """Make this worker process exit when its parent process ends, even during a call."""
 
     def watch(parent: int) -> None:
         while os.getppid() == parent:

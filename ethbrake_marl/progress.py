@@ -17,7 +17,7 @@ EVERY_S = 10.0  # time between two lines of progress (s) if stderr is not a term
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Progress of a long computation: ``done`` of ``total`` units of work; ``name`` says what is computed.
+    """Progress of a long computation: ``done`` of ``total`` units of work, for the task ``name``.
 
     In training, a unit is one decision of a learner, and ``total`` is rounded up to whole updates.
 
@@ -37,7 +37,7 @@ class Progress:
 
     @property
     def harm(self) -> str:
-        """Harm in the last evaluation, such as ``total harm 24.19``; empty before the first."""
+        """Harm in the last evaluation, such as ``total harm 24.19``; empty before the first evaluation."""
         if self.objective and "objective" in self.metrics:
             return f"{self.objective} {self.metrics['objective']:.2f}"
         words = {"first_impact_harm": "first-impact harm", "total_harm": "total harm", "honest_cost": "honest cost"}
@@ -48,7 +48,7 @@ class Progress:
     def listener(told: Told) -> OnProgress | None:
         """Return the function to call with each ``Progress``, or None.
 
-        ``told`` is this function, ``"show"`` to print progress on stderr, or None. Without stderr nothing is printed.
+        ``told`` is a function; or ``"show"``: print progress on stderr (if there is one); or None.
         """
         if told == "show":
             return None if sys.stderr is None else ShownProgress()
@@ -62,7 +62,7 @@ Told = OnProgress | Literal["show"] | None
 
 
 class ShownProgress:
-    """Prints progress on stderr: on a terminal a line that is updated in place, otherwise a line every ten seconds."""
+    """Prints progress on stderr: on a terminal one line that is updated, otherwise a new line every ten seconds."""
 
     def __init__(self) -> None:
         self._terminal = False
@@ -73,7 +73,7 @@ class ShownProgress:
         self._open = ""  # name of the task in the terminal's last line; empty if this line has ended
 
     def __call__(self, progress: Progress) -> None:
-        """Print the progress if it is time."""
+        """Print the progress, unless a line was printed shortly before."""
         now, task = time.monotonic(), progress.name.partition(": ")[0]
         if self._open not in ("", task) or progress.note:
             self.end()
@@ -98,7 +98,6 @@ class ShownProgress:
             self._told_s = now
 
     def end(self) -> None:
-        """End the line that is updated in place."""
         if self._open:
             self._print("\n")
             self._open = ""

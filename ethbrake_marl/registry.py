@@ -1,13 +1,12 @@
 """Registries of agents, shields, measures, features, objectives, algorithms and commands, by name.
 
-A running program adds an object with a ``register_...`` function, an installed package with an entry point in its
-``pyproject.toml``, as this package does for its extensions:
+A running program adds an object with a ``register_...`` function. An installed package adds one with an entry point in
+its ``pyproject.toml``, as this package does for its extensions:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-When the name is first used, the entry point is loaded and its value passed to the ``register_...`` function. An
-object that is not used is never imported, so it cannot break anything.
+When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function.
 """
 
 from __future__ import annotations
@@ -39,8 +38,8 @@ T = TypeVar("T")
 class Part:
     """Value of an entry point: all arguments of a ``register_...`` function except the name.
 
-    In the group ``ethbrake_marl.measures`` the ``part`` below has the same effect as
-    ``register_measure(name, closing, unit="m/s")``, where ``name`` is the name of the entry point.
+    In the group ``ethbrake_marl.measures``, an entry point NAME with the ``part`` below has the same effect as
+    ``register_measure(NAME, closing, unit="m/s")``.
 
     >>> import ethbrake_marl as eb
     >>> def closing(game, alert, last):
@@ -54,10 +53,7 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Return name -> entry points of a group such as ``agents``; several packages may define the same name.
-
-    Names of this package come first.
-    """
+    """Return name -> entry points of a group such as ``agents``, this package's first; several may have one name."""
     by_name: dict[str, list[EntryPoint]] = {}
     in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
     for point in in_order:
@@ -66,25 +62,25 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def giver(point: EntryPoint) -> str:
-    """Return the package that defines an entry point; ``?`` if it is unknown."""
+    """Return the name of the package that defines an entry point, or ``?``."""
     return "?" if point.dist is None else point.dist.name
 
 
 def versions_used() -> dict[str, str]:
-    """Return name -> version of the other packages whose entry points this process has loaded."""
+    """Return name -> version of other packages whose entry points this process has loaded."""
     return dict(sorted(_VERSIONS.items()))
 
 
 class Registry(Mapping[str, T]):
     """Name -> object, for all objects of one kind. An object is loaded when its name is first looked up.
 
-    Testing whether a name exists, and iterating, load nothing. Looking up a name raises ``UnknownName``, or
-    ``InvalidInput`` if the object cannot be loaded or two installed packages define it, or ``MissingExtra``.
+    Iterating, and testing whether a name exists, load nothing. Looking up a name raises ``UnknownName``; or
+    ``InvalidInput`` if the object cannot be loaded or two packages define it; or ``MissingExtra``.
 
     Args:
         kind: noun for one object in messages, for example ``agent``.
         group: group of the entry points, without the prefix ``ethbrake_marl.``.
-        register: is called with the name and value of an entry point; it must call ``add`` of this registry.
+        register: function that is called with name and value of an entry point; it must call ``add`` of this registry.
         built_in: name -> object, for objects that are defined in code rather than by entry points.
 
     """
@@ -101,7 +97,7 @@ class Registry(Mapping[str, T]):
         return name in self.loaded or name in points(self.group)
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names: first built-in objects, then entry points, then objects that this process registered."""
+        """Yield the names: first built-in objects, then entry points, then objects registered by this process."""
         built_in = (name for name in self.loaded if name in self._built_in)
         return iter(dict.fromkeys([*built_in, *points(self.group), *self.loaded]))
 
@@ -117,9 +113,9 @@ class Registry(Mapping[str, T]):
         return self.loaded[name]
 
     def load(self, name: str) -> list[str]:
-        """Load an object if needed; return all names that its entry point defines.
+        """Load an object if needed; return all names that its entry point defines (several if it is a dictionary).
 
-        These are several if its value is a dictionary. Raises the errors of looking up a name.
+        Raises the errors of looking up a name.
         """
         candidates = points(self.group).get(name, [])
         if (name in self._built_in) + len(candidates) > 1:
@@ -161,9 +157,9 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add an object. Raises ``AlreadyExists`` if another one has the name.
+        """Add an object. Raises ``AlreadyExists`` if another object has the name.
 
-        ``is_same`` says whether an object equals ``part``, which is then not added again.
+        ``is_same`` says whether the existing object equals ``part``; then there is nothing to add.
         """
         names_others = False  # whether an entry point of this name defines parts with other names
         if name not in self.loaded and name in self and name not in self._loading:
@@ -176,11 +172,11 @@ class Registry(Mapping[str, T]):
             )
 
     def usable(self) -> dict[str, T]:
-        """Load all objects; return name -> object of those that could be loaded."""
+        """Load all objects; return name -> object, without those that cannot be loaded."""
         return {name: self.loaded[name] for name in self if self.why_not(name) is None and name in self.loaded}
 
     def why_not(self, name: str) -> str | None:
-        """Load an object; return the error message if this fails."""
+        """Load an object; return the error message if this fails, else None."""
         try:
             self.load(name)
         except (InvalidInput, MissingExtra) as error:
@@ -188,7 +184,7 @@ class Registry(Mapping[str, T]):
         return None
 
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
-        """Return the error for an unknown name. ``known``: the names to suggest or list; None: all."""
+        """Return the error for an unknown name. ``known``: names to suggest or list; None: all."""
         if not points("agents"):
             return UnknownName(
                 f"unknown {self.kind} {name!r}: no entry points of the package {OURS} are installed; install the"

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM set a flag instead of raising an exception; a long computation checks it between steps."""
+"""Ctrl-C and SIGTERM set a flag, which a long computation checks between steps, instead of raising an exception."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stop_on_signal() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C was pressed or SIGTERM was received in the block.
+    """Yield a function that returns whether Ctrl-C or SIGTERM has arrived during the block.
 
-    A second one has its usual effect. Outside the main thread, where Python delivers no signals, the function always
+    A second Ctrl-C has its usual effect. Outside the main thread, where Python receives no signals, the function always
     returns False.
     """
     asked = threading.Event()

@@ -1,1 +1,1 @@
-"""Who drives: the loop that drives whole episodes, scripts, E-V2X-BM, and policies of any library."""
+"""Who drives: the loop over whole episodes, scripts, E-V2X-BM, and policies of any library."""

@@ -1,4 +1,4 @@
-"""The loop in which a team of agents drives worlds to the end."""
+"""The loop in which a team of agents drives worlds to the end of their episodes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ethbrake_marl.episode.step import Step, asked, begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
-# what an agent has to know, from little to much
+# what an agent needs to know, from little to much
 SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
 MESSAGES = "messages"  # also the messages that the vehicle has received
 ESTIMATED = "estimated model"  # also what the scenario says about all worlds: ranges of values, scripts, physics
@@ -28,9 +28,9 @@ CHUNK = 2_500  # worlds of a list that are driven together, to limit memory
 
 
 class Agent(Script, Protocol):
-    """A ``Script`` with a name. It sees the whole state, and decides when the learners do.
+    """A ``Script`` (``episode.game``) with a name: it sees the whole state and returns commands for one vehicle.
 
-    It may also have ``check(game, body)``, which warns, or raises ``InvalidInput``, where it should not drive.
+    An optional method ``check(game, body)`` warns, or raises ``InvalidInput``, if the agent should not drive in a game.
 
     >>> import ethbrake_marl as eb
     >>> class Half:
@@ -49,11 +49,11 @@ class Agent(Script, Protocol):
 
     @property
     def knows(self) -> str:
-        """What it has to know, for tables: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
+        """What the agent needs to know, for tables: one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
 
 
 class Team(NamedTuple):
-    """Who drives the learners of a game.
+    """The agents of all learners of a game, perhaps under a shield.
 
     >>> import ethbrake_marl as eb
     >>> team = eb.Team.of({"vehicle_2": eb.make_agent("coast"), "vehicle_3": eb.make_agent("full_brake")}, "both")
@@ -64,11 +64,11 @@ class Team(NamedTuple):
 
     name: str  # in tables and messages
     drivers: Mapping[int, Agent]  # body -> agent
-    shield: Shield | None = None  # asks its own team, the drivers, what they propose
+    shield: Shield | None = None  # it asks the drivers for proposals
 
     @staticmethod
     def of(drivers: Mapping[str, Agent], name: str, shield: Shield | None = None) -> Team:
-        """Return the team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for what is no vehicle or no agent."""
+        """Return the team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for a bad vehicle name or agent."""
         bodies = {}
         for vehicle, agent in drivers.items():
             if not isinstance(vehicle, str) or re.fullmatch("vehicle_[1-9][0-9]?", vehicle) is None:
@@ -78,7 +78,10 @@ class Team(NamedTuple):
         return Team(name, dict(sorted(bodies.items())), shield)
 
     def game(self, game: Game) -> Game:
-        """Return ``game`` with this team's shield. Raises ``InvalidInput`` unless the team drives all its learners."""
+        """Return ``game`` with this team's shield.
+
+        Raises ``InvalidInput`` unless the team drives exactly the learners, or if the game already has another shield.
+        """
         driven, wanted = sorted(self.drivers), sorted(game.rules.learners.tolist())
         if driven != wanted:
             theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
@@ -92,7 +95,7 @@ class Team(NamedTuple):
 
 
 def check_agent(agent: Any, where: str) -> None:
-    """Raise ``InvalidInput``, which begins with ``where``, unless this is an agent."""
+    """Raise ``InvalidInput`` unless ``agent`` has all parts of an agent; the message begins with ``where``."""
     missing = [each for each in ("name", "knows", "begin", "act") if not hasattr(agent, each)]
     if missing:
         raise InvalidInput(
@@ -103,17 +106,17 @@ def check_agent(agent: Any, where: str) -> None:
 
 
 def check_knows(knows: Any, where: str) -> None:
-    """Raise ``InvalidInput``, which begins with ``where``, unless this says what an agent has to know."""
+    """Raise ``InvalidInput`` unless ``knows`` is one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
     if not isinstance(knows, str) or knows not in (*KNOWLEDGE, UNSTATED):
         right = ", ".join(repr(each) for each in KNOWLEDGE)
         raise InvalidInput(f"{where}: knows = {knows!r:.60}: must be one of {right}, or {UNSTATED!r}")
 
 
 def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Iterator[tuple[Step | None, State]]:
-    """Let a team drive these worlds from the alert to the end: yield every state, and the step that led to it.
+    """Let a team drive the worlds ``alert`` to the end; yield each state with the step that led to it.
 
-    The first pair is ``None`` and the state at the first decision. The agents' commands are applied as they are, not as
-    actions. Under a shield the shield asks them. ``donate``: a state is worthless once the next one is asked for.
+    The first pair is ``None`` and the state at the first decision. Without a shield the agents' commands (m/s2) are
+    applied directly; a shield asks its own agents. ``donate``: each state is overwritten when the next one is computed.
     """
     game = team.game(game)
     if game.shield is None:
@@ -131,14 +134,14 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
 
 
 def drive(game: Game, alert: State, team: Team) -> State:
-    """Let a team drive these worlds from the alert to the end; return the last state, the result of the episodes."""
+    """Let a team drive the worlds ``alert`` to the end; return the last state."""
     for _, state in play(game, alert, team, donate=True):
         last = state
     return last
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Return the actions that agents propose, [n, L] in the order of ``drivers``, and their new memories."""
+    """Return the agents' actions, [n, L] in the order of ``drivers``, and body -> new memory."""
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
         commands, after[body] = asked(agent, state, memories[body], body)
@@ -147,12 +150,12 @@ def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, A
 
 
 def to_command(state: State, body: int, actions: Floats) -> Floats:
-    """Turn actions [n], from -1 (full braking) to 1 (full driving), into commands, [n] m/s2."""
+    """Return commands, [n] m/s2, for actions [n] from -1 (full braking) to 1 (full driving)."""
     return np.where(actions < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body]) * actions
 
 
 def to_action(state: State, body: int, commands: Floats) -> Floats:
-    """Turn commands [n] (m/s2) into actions; one beyond a capacity becomes -1 or 1."""
+    """Return actions in [-1, 1] for commands [n] (m/s2), clipped to the vehicle's capacities."""
     capacity = np.where(commands < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body])
     share = np.divide(commands, capacity, out=np.zeros_like(capacity), where=capacity > 0.0)
     return np.clip(share, -1.0, 1.0)

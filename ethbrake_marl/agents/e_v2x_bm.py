@@ -1,7 +1,8 @@
 """E-V2X-BM: brakes with the constant deceleration that does the least harm, chosen at the alert.
 
-``pairwise`` is the paper's closed form. ``coupled`` plays the whole line in the physics of the episode, with the
-changes of speed, later impacts and lasting contact that the closed form leaves out: its harm is the harm that happens.
+``pairwise`` is the paper's closed form. ``coupled`` simulates the whole line with the physics of the episode. It
+includes what the closed form leaves out (changes of speed, later impacts, lasting contact), so it predicts the harm
+that happens.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ from ethbrake_marl.motion.layout import BRAKING, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.roles import HELD, LEARNER
 
-FIRST_PARTS = 64  # number of parts into which all decelerations are split, and
-PARTS = 8  # into which a cell of them is split
-NARROWEST_MPS2 = 1e-5  # narrower cells are not split
-SMALL = 1e-3  # harm (m2/s2) that is not worth a further split
+FIRST_PARTS = 64  # number of cells into which the range of decelerations is divided first
+PARTS = 8  # number of cells into which a cell is divided
+NARROWEST_MPS2 = 1e-5  # narrower cells are not divided
+SMALL = 1e-3  # a gain in harm (m2/s2) too small to search for
 TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
-    """Return the constant deceleration of vehicle ``body`` that does the least harm, in every world, and this harm.
+    """Return the constant deceleration of vehicle ``body`` with the least simulated harm in every world, and this harm.
 
-    All others hold ``alert.wanted``. ``count``: what is minimised (``episode.counts``). If the choice of the closed
-    form does no harm, it is the result. If several do equally little, the least harm of the other count decides, then
-    the middle one. As a function of the deceleration the harm has kinks and jumps: it is not proven that no
-    deceleration between two samples does less.
+    All other vehicles hold ``alert.wanted``. ``count`` is the harm to minimise (``episode.counts``). If the closed
+    form's choice does no harm, it is the result. Ties: the least harm in the other count decides, then the middle
+    deceleration. The search samples: harm has kinks and jumps as a function of the deceleration, so a value between two
+    samples may do less.
     """
     braking = np.maximum(-alert.wanted, 0.0)
     braking[:, body] = alert.car[:, BRAKING, body]
@@ -52,15 +53,18 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
 
 
 def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
-    """Return the harm in this count, and in the one that decides ties, [2, n, C]; ``tried``: decelerations [n, C]."""
+    """Return the harm of the decelerations ``tried`` [n, C], in ``count`` and in the count that breaks ties: [2, n, C]
+    m2/s2.
+    """
     return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
 
 
 def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
-    """Return the best decelerations and their harms under this count and the one that decides ties, [n, 3].
+    """Return the best deceleration of each world and its harm, in ``count`` and in the count that breaks ties: [n, 3].
 
-    All decelerations of a world are split into equal parts, then again and again those parts that may hold a better
-    one. A result is not within rounding of a jump, unless a jump is within rounding of one of these equal parts.
+    It divides all decelerations into ``FIRST_PARTS`` equal cells, and then repeatedly those cells that may contain a
+    better one. A result is not within rounding of a jump, unless a jump is within rounding of one of the first cells'
+    ends.
     """
     best = np.full((alert.n, 3), np.inf)
     rows, step = np.arange(alert.n), alert.car[:, BRAKING, body] / FIRST_PARTS
@@ -79,12 +83,12 @@ def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
 
 @large
 def find_cells(rows, at, harm, step, best, cells):
-    """Update the best decelerations, and return the number of cells in which there may be better ones.
+    """Update the best decelerations, and return the number of cells that may contain a better one.
 
-    Row j of ``at`` [m, C] and ``harm`` [2, m, C] are samples of the world ``rows[j]``, ``step[rows[j]]`` m/s2 apart.
-    ``best`` [n, 3] are decelerations and their harms. A cell, the interval between two neighbouring samples, may hold a
-    better one if its lower end is above the best by less than the largest change of the harm in this cell and in the
-    cells beside it. ``cells`` [2, .] receives j and the number of the cell in row j.
+    A cell is the interval between two neighbouring samples. It may contain a better one if the smaller harm at its
+    ends, minus the largest change of harm in this cell and the two beside it, is below the best harm. Row j of ``at``
+    [m, C] and ``harm`` [2, m, C] are samples of the world ``rows[j]``, ``step[rows[j]]`` m/s2 apart. ``best`` [n, 3]
+    are decelerations and their harms. ``cells`` [2, .] receives j and the cell's number in row j.
     """
     count, last = 0, at.shape[1] - 1
     for j in range(at.shape[0]):
@@ -109,7 +113,7 @@ def find_cells(rows, at, harm, step, best, cells):
 
 @kernel
 def take_middle(at, harm, known):
-    """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] is ``known[1:]``."""
+    """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] equals ``known[1:]``."""
     ties = 0
     for c in range(len(at)):
         ties += 1 if compare(harm[:, c], known) == 0 else 0
@@ -122,7 +126,7 @@ def take_middle(at, harm, known):
 
 @kernel
 def compare(harm, known):
-    """Return -1 if ``harm`` [2] is less than ``known[1:]``, 0 if it is the same, 1 if it is more."""
+    """Return -1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more."""
     for count in range(2):  # the other count decides ties
         if abs(harm[count] - known[count + 1]) > TIE:
             return -1 if harm[count] < known[count + 1] else 1
@@ -135,14 +139,14 @@ class Memory(NamedTuple):
 
 
 class EV2XBM:
-    """Brakes with the choice of ``coupled``; assumes that the other learners brake fully.
+    """Brakes with the deceleration of ``coupled``, assuming that the other learners brake fully.
 
-    If they do, the harm that it predicts is, to the last bit, the harm of the episode.
+    If they do, the predicted harm is, to the last bit, the harm of the episode.
 
     Args:
         rules: of the episodes.
-        agents: body -> role of the vehicles that agents drive, whose commands are not known at the alert.
-        count: what is minimised: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        agents: body -> role, for vehicles driven by agents whose commands are not known at the alert.
+        count: harm to minimise: ``first``, ``total`` or ``honest`` (``episode.counts``).
 
     """
 
@@ -152,7 +156,7 @@ class EV2XBM:
         self.rules, self.agents, self.count = rules, dict(agents), count
 
     def begin(self, alert: State, body: int) -> Memory:
-        """Choose. Raises ``InvalidInput`` if another vehicle is driven by an agent."""
+        """Choose the deceleration. Raises ``InvalidInput`` if another vehicle is driven by an agent."""
         for other, role in self.agents.items():
             if other != body:
                 raise InvalidInput(
@@ -171,12 +175,12 @@ class EV2XBM:
 
 
 class EV2XBMPairwise:
-    """Brakes with the choice of ``pairwise``, the paper's closed form."""
+    """Brakes with the deceleration of ``pairwise``, the paper's closed form."""
 
     name, knows = "e_v2x_bm:pairwise", STATE
 
     def begin(self, alert: State, body: int) -> Memory:
-        """Choose. Raises ``InvalidInput`` where the closed form does not hold."""
+        """Choose the deceleration. Raises ``InvalidInput`` where the closed form does not hold."""
         deceleration, harm = pairwise(alert, body)
         return Memory(-deceleration, harm)
 
@@ -185,7 +189,6 @@ class EV2XBMPairwise:
 
 
 def last_if_held(alert: State, rules: Rules) -> State:
-    """Return the last state of the episodes in which all vehicles hold ``alert.wanted``, decision by decision."""
     state = first_decision(alert, rules.learners, rules.time_step_s, rules.horizon_s)
     rules, nothing = rules._replace(learners=NOBODY), np.zeros((alert.n, 0))
     while not state.ended.all():
@@ -194,7 +197,6 @@ def last_if_held(alert: State, rules: Rules) -> State:
 
 
 def make_e_v2x_bm(argument: str | None, settings: Any) -> EV2XBM | EV2XBMPairwise:
-    """Return the agent ``e_v2x_bm[:pairwise]``. Raises ``InvalidInput`` for another argument."""
     if argument == "pairwise":
         return EV2XBMPairwise()
     if argument is not None:

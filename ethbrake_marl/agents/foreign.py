@@ -1,7 +1,4 @@
-"""Models of other libraries: how to ask each kind, and what it brings along, which is applied or refused.
-
-Nothing here imports torch or Stable-Baselines3; onnxruntime is imported to open a file.
-"""
+"""Policies of other libraries: how each kind is called, and which settings of its training are applied or refused."""
 
 from __future__ import annotations
 
@@ -39,10 +36,10 @@ INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """Return how to ask a policy without a memory.
+    """Return the function that asks a policy without a memory for its actions.
 
-    Raises ``InvalidInput``, which begins with ``who``, for another kind, and for a model whose actions would depend on
-    chance or on the batch.
+    Raises ``InvalidInput``, beginning with ``who``, for an unknown kind of policy, and for a model whose actions would
+    be random or depend on the rest of the batch.
     """
     if isinstance(policy, bytes) or (hasattr(policy, "run") and hasattr(policy, "get_inputs")):
         return ask_onnx
@@ -66,9 +63,9 @@ def ask_function(function: Any, seen: Observations) -> Any:
 
 
 def ask_model(model: Any, seen: Observations) -> Any:
-    """Return the deterministic actions of an object with ``predict``, under its ``VecNormalize``.
+    """Return the deterministic actions of an object with ``predict``; a ``VecNormalize`` of its training is applied.
 
-    Raises ``InvalidInput`` if it also returns a state.
+    Raises ``InvalidInput`` if the model also returns a state.
     """
     statistics = statistics_of(model)
     answer = model.predict(seen if statistics is None else statistics.normalize_obs(seen), deterministic=True)
@@ -91,14 +88,13 @@ def ask_torch(module: Any, seen: Observations) -> Any:
 
 
 def ask_onnx(session: Any, seen: Observations) -> Any:
-    """Return the output ``action`` of an ONNX model, or its first one."""
+    """Return the output ``action`` of an ONNX model, or its first output."""
     session = session_of(session)
     names = [output.name for output in session.get_outputs()]
     return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: seen})[0]
 
 
 def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
-    """Return the content of an ``.onnx`` file, which can be pickled."""
     file = Path(path).expanduser()
     if file.suffix != ".onnx":
         raise InvalidInput(
@@ -109,7 +105,7 @@ def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
 
 
 def session_of(given: Any) -> Any:
-    """Return the session of the content of an ONNX file, or ``given`` if it is one."""
+    """Return the ONNX session for the bytes of a file; a session is returned unchanged."""
     return _opened(given) if isinstance(given, bytes) else given
 
 
@@ -124,7 +120,7 @@ def _opened(content: bytes) -> Any:
 
 
 def _refuse_training_mode(module: Any, who: str) -> None:
-    """Raise ``InvalidInput`` for a layer whose results are random, or depend on the other worlds of a batch."""
+    """Raise ``InvalidInput`` for a layer that is random, or depends on the other worlds of a batch."""
     for layer in module.modules():
         shares = [getattr(layer, name, None) for name in ("p", "dropout")]
         random = any(isinstance(share, float | int) and share > 0.0 for share in shares)
@@ -136,7 +132,7 @@ def _refuse_training_mode(module: Any, who: str) -> None:
 
 
 def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
-    """Return the names of the features that a model was trained on, or None if it does not bring them."""
+    """Return the names of the features that a model was trained on, or None if it does not record them."""
     if ask is ask_onnx:
         listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(listed.split(",")) if listed else None
@@ -144,9 +140,9 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
 
 
 def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
-    """Return the number of discrete actions of a policy; None: it returns numbers in [-1, 1].
+    """Return the number of discrete actions of a policy; None if it returns numbers in [-1, 1].
 
-    Raises ``InvalidInput`` if its action space is neither a box from -1 to 1 nor as ``given``.
+    Raises ``InvalidInput`` if its action space is neither a box from -1 to 1 nor ``given`` discrete actions.
     """
     space: Any = getattr(policy, "action_space", None)
     if given is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
@@ -166,14 +162,14 @@ def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
 
 
 def statistics_of(model: Any) -> Any:
-    """Return the ``VecNormalize`` of a model of Stable-Baselines3, or None."""
+    """Return the ``VecNormalize`` of a Stable-Baselines3 model, or None."""
     return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
 def check_wrappers(policy: Any, who: str) -> None:
-    """Raise ``InvalidInput`` if a model was trained under a wrapper that may change what it sees or does.
+    """Raise ``InvalidInput`` if a model was trained under a wrapper that may change observations or actions.
 
-    A model from a file may show that it has lost the statistics of its ``VecNormalize``.
+    Also if it was trained with ``VecNormalize``, whose statistics its file lacks.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
     for layer in [] if env is None else layers_of(env):
@@ -194,7 +190,6 @@ def check_wrappers(policy: Any, who: str) -> None:
 
 
 def layers_of(env: Any) -> Iterator[Any]:
-    """Yield an environment and everything inside it, from the outside in."""
     yield env
     for name in INSIDE:
         inside = getattr(env, "__dict__", {}).get(name, ())  # its own: wrappers forward attributes
@@ -204,9 +199,10 @@ def layers_of(env: Any) -> Iterator[Any]:
 
 
 def _was_normalised(model: Any) -> bool:
-    """Return whether the last observation that a model has stored was normalised.
+    """Return whether a model was trained on normalised observations.
 
-    The model then stores the original too (off-policy algorithms always do), or the observation is outside its space.
+    Its last observation is then outside its space, or the original one is stored too (off-policy algorithms always do
+    so).
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True

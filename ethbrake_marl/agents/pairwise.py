@@ -1,12 +1,13 @@
-"""The paper's E-V2X-BM: the constant deceleration of one vehicle that does the least harm to its two pairs, each alone.
+"""The paper's E-V2X-BM: one vehicle's constant deceleration that does the least harm to its two pairs, taken
+separately.
 
-Assumed: the neighbours brake fully, only the first impact of a pair does harm, and impacts change no speed, so the pair
-in front and the pair behind do not influence each other. The harm predicted for a deceleration a is
+Assumptions: the neighbours brake fully, only the first impact of a pair does harm, and impacts change no speed, so the
+pair in front and the pair behind are independent. The harm predicted for a deceleration a is
 
     H(a) = c_front(a)^2 + c_rear(a)^2    (m2/s2)
 
-with the closing speeds c at the first impacts. Between a few decelerations, the candidates, H is concave, so it is
-least at one of them. docs/internals/proofs/constant-deceleration.md derives every line.
+with the closing speeds c at the first impacts. Between a few decelerations, the candidates, H is concave, so its
+minimum is at one of them. docs/internals/proofs/constant-deceleration.md derives every line.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ class Choice(NamedTuple):
 
 @kernel
 def braking_now(speed, braking, onset, now):
-    """Return the acceleration (m/s2) of a vehicle that coasts until its onset, then brakes to rest, and how long."""
+    """Return the present acceleration (m/s2) of a vehicle that coasts until its onset and then brakes, and how long it
+    lasts.
+    """
     if now < onset:
         return 0.0, onset - now
     if speed > 0.0 and braking > 0.0:
@@ -46,11 +49,11 @@ def braking_now(speed, braking, onset, now):
 
 @large
 def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset, until):
-    """Move a pair to its first impact, or to ``until`` (s): return its harm (m2/s2), the gap (m) and both speeds (m/s).
+    """Move a pair to its first impact, or to ``until`` (s); return its harm (m2/s2), the gap (m) and both speeds (m/s).
 
-    Each vehicle coasts until its onset (s), then brakes to rest. The first contact is in one of these pieces of
-    constant accelerations: both coast, one brakes, both brake, one stands (the regimes A to C of the proof). A touch is
-    no impact. Vehicles that touch and press against each other stay together: harm 0.
+    Each vehicle coasts until its onset (s), then brakes to rest. So accelerations are constant in pieces: both coast,
+    one brakes, both brake, one stands (regimes A to C of the proof); the function looks for a contact in each piece. A
+    contact without a closing speed is no impact. If the rear vehicle then presses on, they stay together: harm 0.
     """
     now = 0.0
     while now < until:
@@ -87,10 +90,12 @@ def predicted_harm(line, braking, wait, body, a):
 
 @large
 def find_candidates(line, braking, wait, body, at):
-    """Write the decelerations of vehicle ``body`` at which H may be least to ``at`` [CANDIDATES] (m/s2), in one world.
+    """Write the candidates of vehicle ``body`` in one world, decelerations where H may be least, to ``at`` [CANDIDATES]
+    (m/s2).
 
-    Formulas use the state at its onset: gap d, own speed v and the neighbour's u, closing speed w, and the time s for
-    which the neighbour still coasts before it brakes with b. Some results are not in [0, capacity], or not a number.
+    The formulas use the state at the vehicle's onset: gap d, its speed v, the neighbour's speed u, closing speed w, and
+    the time s for which the neighbour still coasts before it brakes with b. A candidate may be invalid: outside [0,
+    capacity], or not a number.
     """
     gap, speed, onset = line[GAP], line[SPEED], wait[body]
     at[:] = 0.0
@@ -100,26 +105,31 @@ def find_candidates(line, braking, wait, body, at):
         b, s = braking[i], max(wait[i] - onset, 0.0)
         _, d, u, v = meet(gap[i], speed[i], b, wait[i], speed[body], 0.0, onset, onset)
         w = v - u
-        at[2] = v * v / (2.0 * (d + u * s + u * u / (2.0 * b)))  # it stops right behind the neighbour
-        at[3] = (w * w + 2.0 * b * (d - w * s)) / (2.0 * d - b * s * s)  # it touches while both brake
-        at[4] = w * w / (2.0 * d)  # it touches while the neighbour coasts,
-        at[5] = (w * w - 4.0 * TOUCH_MPS * TOUCH_MPS) / (2.0 * d)  # or strikes it then as lightly as can be
-        at[6] = 2.0 * (w * s - d) / (s * s)  # it arrives at the moment in which the neighbour begins to brake
+        at[2] = v * v / (2.0 * (d + u * s + u * u / (2.0 * b)))  # stops right behind the neighbour
+        at[3] = (w * w + 2.0 * b * (d - w * s)) / (
+            2.0 * d - b * s * s
+        )  # reaches the neighbour at closing speed 0 while both brake
+        at[4] = w * w / (2.0 * d)  # the same while the neighbour coasts
+        at[5] = (w * w - 4.0 * TOUCH_MPS * TOUCH_MPS) / (2.0 * d)  # or at closing speed 2 TOUCH_MPS
+        at[6] = 2.0 * (w * s - d) / (s * s)  # reaches the neighbour when it begins to brake
     if body < line.shape[1] - 1:
         i = body + 1
         b, s = braking[i], max(wait[i] - onset, 0.0)
         _, d, v, u = meet(gap[body], speed[body], 0.0, onset, speed[i], b, wait[i], onset)
         w = u - v
         at[7] = v * v / (2.0 * (u * s + u * u / (2.0 * b) - d))  # the neighbour stops right behind
-        at[8] = (2.0 * b * (d - w * s) - w * w) / (b * s * s + 2.0 * d)  # the neighbour touches while both brake
+        at[8] = (2.0 * b * (d - w * s) - w * w) / (
+            b * s * s + 2.0 * d
+        )  # the neighbour arrives at closing speed 0 while both brake
 
 
 @large
 def choose(line, braking, wait, body, at, harm, best, least):
-    """Write the best decelerations of vehicle ``body`` to ``best`` [n] and H to ``least`` [n].
+    """Write the best deceleration of vehicle ``body`` in each world to ``best`` [n] (m/s2), and its H to ``least`` [n].
 
-    ``braking`` [n, N + 1] is how hard each vehicle brakes, or can (m/s2), ``wait`` [n, N + 1] when it may begin (s from
-    now). Of several best candidates it is the middle between the outer ones, if H is as small there.
+    ``braking`` [n, N + 1] is each vehicle's braking capacity or present deceleration (m/s2), ``wait`` [n, N + 1] the
+    time until it may begin to brake (s). If several candidates are equally good, the result is the middle of the outer
+    two, provided that H is as small there.
     """
     for k in range(line.shape[0]):
         find_candidates(line[k], braking[k], wait[k], body, at)
@@ -139,7 +149,9 @@ def choose(line, braking, wait, body, at, harm, best, least):
 
 
 def closed_form(alert: State, braking: Floats, body: int) -> Choice:
-    """Return the choice of vehicle ``body`` where the others brake with ``braking`` [n, N + 1] (m/s2) to rest."""
+    """Return the choice of vehicle ``body`` if the others brake to rest with the decelerations ``braking`` [n, N + 1]
+    (m/s2).
+    """
     wait = np.maximum(alert.car[:, LATENCY] - alert.time_s[:, np.newaxis], 0.0)
     choice = Choice(np.empty(alert.n), np.empty(alert.n))
     choose(alert.line, braking, wait, body, np.empty(CANDIDATES), np.empty(CANDIDATES), *choice)
@@ -149,8 +161,8 @@ def closed_form(alert: State, braking: Floats, body: int) -> Choice:
 def pairwise(alert: State, body: int) -> Choice:
     """Return the deceleration of vehicle ``body`` (1: Vehicle 1) that minimises H, and H, in every world.
 
-    Where several do, such as all that avoid both impacts, it is the middle one. It needs gaps, speeds, capacities and
-    latencies of the vehicle and its neighbours; an obstacle is not seen.
+    Ties, such as all decelerations that avoid both impacts, give the middle one. The result depends on gaps, speeds,
+    capacities and latencies of the vehicle and its neighbours, and ignores an obstacle.
 
     Raises ``InvalidInput`` where the proof does not hold: a vehicle moves backward, or brakes build up gradually.
     """

@@ -1,4 +1,4 @@
-"""Agents that drive with policies of this package, or of any other library."""
+"""Agents that drive with a policy of this package, or of any other library."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class LearnedAgent:
             )
 
     def check(self, game: Game, body: int) -> None:
-        """Warn (``Unfamiliar``) of a policy that was trained on another physics, or at another time step."""
+        """Warn (``Unfamiliar``) if the policy was trained with another physics or another time step."""
         manifest, step_s = self.policy.manifest, game.rules.time_step_s
         then, now = manifest.versions.get(PHYSICS), physics_digest()
         if then not in (None, now):
@@ -79,10 +79,9 @@ class LearnedAgent:
             )
 
     def begin(self, alert: State, body: int) -> None:
-        """There is no memory."""
+        """Return None: there is no memory."""
 
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
-        """Return commands, [n] m/s2."""
         policy = self.policy
         view = self.observation or policy.observation
         seen = view.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
@@ -91,7 +90,7 @@ class LearnedAgent:
 
 @dataclass(frozen=True)
 class PolicyAgent:
-    """Drives with a policy of another library; ``policy_agent`` makes it. It can be pickled where the policy can."""
+    """Drives with a policy of another library; made by ``policy_agent``. It can be pickled if the policy can."""
 
     policy: Any
     name: str
@@ -105,7 +104,7 @@ class PolicyAgent:
     knows: str = MESSAGES
 
     def check(self, game: Game, body: int) -> None:
-        """Raise ``InvalidInput`` where the policy may have been trained on other features than it would get."""
+        """Raise ``InvalidInput`` if the policy may have been trained on other features than it would get here."""
         if self.is_assumed and game.views[body] != self.observation:
             raise InvalidInput(
                 f"agent {self.name!r}: nothing says which features the policy observes, and vehicle_{body} of scenario"
@@ -114,13 +113,12 @@ class PolicyAgent:
             )
 
     def begin(self, alert: State, body: int) -> Any:
-        """Return the policy's memory for new episodes."""
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
         """Return commands, [n] m/s2, and the policy's new memory.
 
-        Raises ``AgentFailed`` for actions of a wrong shape, or one that is not in its range.
+        Raises ``AgentFailed`` for actions of a wrong shape or outside their range.
         """
         seen = self.observation.observe(state, np.array([body]), self.time_step_s)[:, 0]
         if self.initial_state is None:
@@ -134,8 +132,6 @@ class PolicyAgent:
         return to_command(state, body, self._actions(answer, state, body)), memory
 
     def _own(self, memory: Any, n: int) -> Any:
-        """Return a memory in arrays of its own."""
-
         def copied(part: Any) -> NDArray[Any]:
             array = np.array(to_array(part))
             if array.shape[:1] != (n,) or array.dtype.hasobject:
@@ -146,7 +142,6 @@ class PolicyAgent:
         return mapped(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
-        """Return the actions [n] in [-1, 1] for the policy's answer."""
         given, n, last = to_array(answer), state.n, (self.actions or 0) - 1
         kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
         if self.actions is not None:
@@ -193,16 +188,16 @@ def policy_agent(
     Args:
         policy: a function, an object with ``predict`` (Stable-Baselines3: deterministic, under its ``VecNormalize``), a
             torch module (without gradients), an ONNX session or the path of an ``.onnx`` file.
-        name: in tables and messages; None: that of the function, class or file.
-        scenario: in which the policy was trained.
-        observation: features that it was trained on; None: those that its observation space or its ONNX metadata name,
-            otherwise those of ``scenario``, otherwise ``[own, front_1, rear_1]``, where the game has no others.
+        name: name in tables; None: name of the function, class or file.
+        scenario: scenario in which the policy was trained.
+        observation: features that it was trained on; None: the features named by its observation space or ONNX
+            metadata, or else those of ``scenario``, or else ``[own, front_1, rear_1]``.
         initial_state: number of episodes n -> first memory: an array with n rows, or a tuple of such arrays.
         clip: clip actions to [-1, 1], or indices to the valid ones; otherwise they are errors.
         actions: number of discrete actions, evenly spaced from -1 to 1, if the policy returns indices.
         ignore_wrappers: accept a model whose training environment has wrappers that may change observations or actions.
 
-    Raises ``InvalidInput`` for another kind of policy, and for what would not be as in training.
+    Raises ``InvalidInput`` for an unknown kind of policy, and if something would differ from its training.
 
     >>> import ethbrake_marl as eb
     >>> agent = eb.policy_agent(lambda observation: -observation[:, :1].clip(0, 1), name="mine")
@@ -240,7 +235,7 @@ def policy_agent(
 
 
 def _view(given: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
-    """Return what a policy observes: ``given``, what it brings, or what the learners of a scenario observe."""
+    """Return the features that a policy observes: ``given``, its own, or those of its training scenario's learners."""
     if given is not None:
         view = given if isinstance(given, View) else View(given)
         if trained_on not in (None, view.names):

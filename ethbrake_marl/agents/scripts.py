@@ -28,7 +28,6 @@ FULL_BRAKE, COAST = Held("full_brake"), Held("coast")
 
 
 def make_held(argument: str | None, settings: Any) -> Held:
-    """Return the script with the name ``settings.spec``. Raises ``InvalidInput`` unless its argument is right."""
     check_role(settings.spec)
     return Held(settings.spec)
 

@@ -1,1 +1,1 @@
-"""What happens in an episode: its state, one step, what is observed and rewarded, and what would happen."""
+"""An episode: its state, one step, observations and rewards, and predictions of what would happen."""

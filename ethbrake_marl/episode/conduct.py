@@ -1,4 +1,4 @@
-"""Conduct that harm does not count: pushing, driving before the first impact, and moving on past the horizon."""
+"""Conduct that causes no harm by itself: pushing, driving before the first impact, still moving at the horizon."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from ethbrake_marl.motion.layout import COUNT, DROVE, NEXT_TIME, PUSHED, Floats
 
 
 def push(before: State, step: Step, after: State) -> Floats:
-    """Term push, [n]: minus the push of all contacts (m/s), the obstacle's included (``motion.push``)."""
+    """Term push, [n]: minus the push of all contacts (m/s), including the obstacle's (``motion.push``)."""
     check_exact(before, "the term push")
     return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
 
 
 def drove(before: State, step: Step, after: State) -> Floats:
-    """Term drove, [n, N]: minus what a positive command adds to the speed before the first impact (m/s)."""
+    """Term drove, [n, N]: minus the speed that positive commands ask for before the line's first impact (m/s)."""
     check_exact(before, "the term drove")
     return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
 
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
-    """Term still_moving, [n]: -1 for an end at the horizon with a vehicle in motion."""
+    """Term still_moving, [n]: -1 if the episode ends at the horizon with a vehicle in motion."""
     check_exact(before, "the term still_moving")
     return 0.0 - step.out[TRUNCATED]
 
 
 def first_impact_s(before: State, after: State) -> Floats:
-    """Time until which the line has had no impact, [n] s: from ``before.time_s`` to ``after.time_s``.
+    """Time of the line's first impact, [n] s; ``before.time_s`` if it was earlier, ``after.time_s`` if it is later.
 
-    No decision lies between the states.
+    There must be no decision between the two states.
     """
     until: Floats = np.where(before.collided, before.time_s, after.time_s)
     for k, scratch in driven_again(before, after, ~before.collided & after.collided):
@@ -40,6 +40,6 @@ def first_impact_s(before: State, after: State) -> Floats:
 
 
 def driving_s(before: State, after: State) -> Floats:
-    """How long a positive command is in force before the line's first impact, [n, N] s."""
+    """Time between the states, before the line's first impact, with a positive command in force, [n, N] s."""
     asked_mps, commands = after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1], after.commands_mps2
     return asked_mps / np.where(commands > 0.0, commands, 1.0)

@@ -1,17 +1,17 @@
-"""What counts: which amounts of a line a reward, an agent, a shield or a search keeps small, and how much each weighs.
+"""Counts of harm: the amounts that a reward, an agent, a shield or a search keeps small, and the weight of each.
 
 ======  ================================================================================================================
-first   harm of the first impact of each pair, as the paper counts it
+first   harm of the first impact of each pair, as in the paper
 total   harm of every impact
-honest  harm of every impact, also where a contact passes it on, and what no impact shows: ``10 s`` for the push, the
-        speed s that forces have built up and contacts take up; ``10 s`` for the speed s that a vehicle asks for by
-        driving before the line's first impact; ``v^2`` for a vehicle that still moves at v at the horizon, as if it
-        then hit something that stands
+honest  harm of every impact, also where a contact passes it on to another pair, plus a price of conduct without impact:
+        ``10 s`` for a push s (m/s), the closing speed that forces build up and a contact takes up; ``10 s`` for a speed
+        s that a vehicle asks for by driving before the line's first impact; ``v^2`` for a vehicle that still moves at v
+        at the horizon, as if it then hit a standing object
 ======  ================================================================================================================
 
-All are in m2/s2, and none ever falls in an episode. ``honest`` adds a price to harm so that pushing hardly pays:
-without it the best braking pushes Vehicle 1 away (docs/findings.md). The two vehicles of a pair share harm and push
-by their masses; each vehicle bears the price of its own driving and motion alone.
+All are in m2/s2 and never fall during an episode. Without the price in ``honest``, the best braking pushes Vehicle 1
+away (docs/findings.md). The two vehicles of a pair share harm and push by their masses. Each vehicle alone bears the
+price of its own driving and motion.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ COUNTS = {  # name -> weight of each row
     "honest": np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]),
 }
 RULES = {"honest": "honest", "paper": "first"}  # short name -> count
-Count = str | Floats  # the name of a count, or weights of its own, [6]
+Count = str | Floats  # the name of a count, or its weights, [6]
 
 HARM = {"first": "first_impact_harm", "total": "total_harm"}  # counts of harm alone -> column of an evaluation
 COLUMN = {**HARM, "honest": "honest_cost"}  # count -> column
@@ -47,13 +47,13 @@ def check_count(what: str, count: object) -> None:
 
 
 def other_count(count: Count) -> str:
-    """The count that decides ties."""
+    """The count that decides between equal harms."""
     return "total" if isinstance(count, str) and count == "first" else "first"
 
 
 @kernel
 def pair_amount(line, p, weights):
-    """Amount of the pair p of one world so far (m2/s2)."""
+    """Harm of pair p in one world so far (m2/s2), as the count with the ``weights`` [6] counts it."""
     harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
     beside = weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
     return harm + (weights[2] * line[PASSED, p] + beside)
@@ -61,13 +61,13 @@ def pair_amount(line, p, weights):
 
 @kernel
 def own_amount(line, p, weights):
-    """Part of ``pair_amount`` that the vehicle behind bears alone (m2/s2): for its driving and motion."""
+    """Part of ``pair_amount`` for driving and motion, which the rear vehicle bears alone (m2/s2)."""
     return weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
 
 
 @kernel
 def amount_so_far(line, weights):
-    """Amount of one world so far (m2/s2), added up from the obstacle to the rear: the only order used."""
+    """Harm of one world so far, as a count counts it (m2/s2), always summed from the obstacle to the rear."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
         amount += pair_amount(line, p, weights)
@@ -75,7 +75,7 @@ def amount_so_far(line, weights):
 
 
 def pair_amounts(line: Floats, count: Count) -> Floats:
-    """Amount of each pair so far, [n, N + 1] m2/s2."""
+    """Harm of each pair so far, as ``count`` counts it, [n, N + 1] m2/s2; column 0 is the pair with the obstacle."""
     first, total, passed, push, drove, moving = weights_of(count)
     harm = first * line[:, FIRST] + total * line[:, TOTAL]
     beside = push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING]
@@ -83,6 +83,6 @@ def pair_amounts(line: Floats, count: Count) -> Floats:
 
 
 def own_amounts(line: Floats, count: Count) -> Floats:
-    """Part of ``pair_amounts`` that the vehicle behind bears alone, [n, N + 1] m2/s2."""
+    """Part of ``pair_amounts`` for driving and motion, which the rear vehicle bears alone, [n, N + 1] m2/s2."""
     drove, moving = weights_of(count)[4:]
     return np.asarray(drove * line[:, DROVE] + moving * line[:, MOVING])

@@ -1,6 +1,6 @@
-"""Features of observations: fixed scalings of single numbers, in groups that are computed together.
+"""Features, the single numbers of an observation, with fixed scales and in groups.
 
-A vehicle observes ``clip(value / scale, low, high)``. What it does not know reads 0, with the feature ``known`` 0.
+A vehicle observes ``clip(value / scale, low, high)``. An unknown value reads 0, and the group's feature ``known`` is 0.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 
 class Own(NamedTuple):
-    """A feature with a function of its own."""
+    """A feature that is computed by a function of its own."""
 
     feature: Feature
     of: Of
@@ -108,7 +108,7 @@ def _weight_share(state: State, body: int) -> Floats:
 def _of_both(
     name: str, unit: str, high: float, function: Callable[[State, int], Floats], meaning: str
 ) -> dict[str, Own]:
-    """A feature of the vehicle itself, ``own_NAME``, and of a neighbour, ``NAME``."""
+    """Two features with the same function: ``own_NAME`` of the observer, and ``NAME`` of a neighbour."""
     return {
         f"own_{name}": Own(Feature(f"own_{name}", unit, 1.0, 0.0, high, f"own {meaning}"), "own", function),
         name: Own(
@@ -130,21 +130,21 @@ def register_feature(
     of: Of = "own",
     unknown: float = 0.0,
 ) -> None:
-    """Register a feature, which an ``observation:`` list can then name. Entry points: ``ethbrake_marl.features``.
+    """Register a feature for ``observation:`` lists. Entry points: ``ethbrake_marl.features``.
 
-    The docstring of ``function`` is the meaning of the feature. Raises ``AlreadyExists`` for a name in use, and
+    The docstring of ``function`` describes the feature. Raises ``AlreadyExists`` for a name in use, and
     ``InvalidInput`` for a bad argument.
 
     Args:
         name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. A list names a feature of a neighbour as ``front_1.NAME``.
         function: ``function(state, body)``, or ``function(state, body, other)`` for a neighbour, returns the value in
             every world, [n], in ``unit``. ``body`` 1 is the front vehicle.
-        unit: of the value.
-        scale: number above 0; ``clip(value / scale, low, high)`` is observed.
+        unit: unit of the value.
+        scale: number above 0; the observation is ``clip(value / scale, low, high)``.
         low: smallest observed number.
         high: largest observed number.
-        of: whom the feature describes: the observer itself (``own``), or a ``neighbour``, where it knows one.
-        unknown: value for a neighbour that is not known, in ``unit``.
+        of: ``own``: the feature describes the observer itself; ``neighbour``: a vehicle that it knows.
+        unknown: value for an unknown neighbour, in ``unit``.
 
     """
     meaning = described("feature", name, function, r"[a-z][a-z0-9_]{0,63}", "a-z, 0-9 and _, beginning with a letter")
@@ -177,8 +177,8 @@ def register_feature_group(
 ) -> None:
     """Register features that are computed together. Entry points: ``ethbrake_marl.feature_groups``.
 
-    ``function(state, bodies, time_step_s)`` returns values before they are scaled, [n, bodies, ...], of which
-    ``columns`` belong to ``features``. It is called once for all groups that share it.
+    ``function(state, bodies, time_step_s)`` returns unscaled values, [n, bodies, ...]; ``columns`` of the last axis
+    belong to ``features``. Groups with the same function share one call.
     """
     group = Group(tuple(features), function, columns)
     GROUPS.add(name, group, lambda other: other == group)
@@ -203,7 +203,7 @@ GROUPS: Registry[Group] = Registry("group of features", "feature_groups", regist
 
 
 def side_of(name: str) -> int | None:
-    """Offset of a neighbour's group: ``front_2`` -2 (two ahead), ``rear_1`` 1; None for another name."""
+    """Offset of a neighbour's group: ``front_2`` gives -2 (two ahead), ``rear_1`` gives 1; None for another name."""
     match = SIDE.fullmatch(name)
     if match is None or int(match[2]) > MOST_NEIGHBOURS:
         return None
@@ -211,14 +211,14 @@ def side_of(name: str) -> int | None:
 
 
 def group_named(name: str) -> tuple[Feature, ...] | None:
-    """Features of a group, such as ``own``, ``front_1`` or ``contact``; None if there is no such group."""
+    """Features of a group, such as ``own``, ``front_1`` or ``contact``; None for another name."""
     if side_of(name) is not None:
         return NEIGHBOUR
     return WHOLE_GROUPS[name] if name in WHOLE_GROUPS else GROUPS[name].features if name in GROUPS else None
 
 
 def feature_named(name: str) -> Feature:
-    """The feature with a full name, such as ``front_1.gap`` or ``place``. Raises ``UnknownName``."""
+    """Feature with the full name ``front_1.gap``, ``place`` or the like. Raises ``UnknownName``."""
     group, dot, own = name.partition(".")
     if not dot and name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature
@@ -233,7 +233,7 @@ def feature_named(name: str) -> Feature:
 
 
 def known_names() -> list[str]:
-    """Names for an ``observation:`` list: groups first, then features; neighbours as ``front_1``."""
+    """All names for an ``observation:`` list: groups, then features; neighbours as ``front_1``."""
     groups = [*WHOLE_GROUPS, "front_1", "rear_1", *GROUPS]
     inside = [f"{group}.{feature.name}" for group in groups for feature in group_named(group) or ()]
     return [*groups, *LISTS, *inside, *(name if FEATURES[name].of == "own" else f"front_1.{name}" for name in FEATURES)]
@@ -245,9 +245,9 @@ def _names_of(listed: str) -> list[str]:
 
 
 def listed_features(listed: object) -> tuple[str, ...]:
-    """Full names of an ``observation:`` list: ``["own", "front_1.gap"]`` gives ``("own.speed", ..., "front_1.gap")``.
+    """Full names for an ``observation:`` list: ``["own", "front_1.gap"]`` gives ``("own.speed", ..., "front_1.gap")``.
 
-    Raises ``InvalidInput`` for something else than a list, an unknown name, or a name that comes twice.
+    Raises ``InvalidInput`` unless it is a list of known, different names.
     """
     if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
         raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")

@@ -24,7 +24,7 @@ def state_features(vehicles: int, horizon_s: float, obstacle: bool) -> tuple[Fea
 
 
 def full_state(state: State, horizon_s: float, obstacle: bool) -> Observations:
-    """Full state of every world, [n, S] float32, without delays of messages."""
+    """Full state of every world, [n, S] float32, whether or not a vehicle knows it."""
     car = state.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
     own = OWN_VIEW.observe(state._replace(car=car), np.arange(1, state.vehicles + 1), 0.0).reshape(state.n, -1)

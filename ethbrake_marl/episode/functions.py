@@ -13,9 +13,9 @@ from ethbrake_marl.motion.layout import Floats
 
 
 def described(kind: str, name: object, function: object, pattern: str, form: str) -> str:
-    """Docstring of a function to be registered, on one line; ``form`` is the ``pattern`` in words.
+    """Docstring, on one line, of a function that is being registered.
 
-    Raises ``InvalidInput`` for a bad name or a missing docstring.
+    Raises ``InvalidInput`` if there is none, or for a name that does not match ``pattern`` (``form``: in words).
     """
     if not isinstance(name, str) or re.fullmatch(pattern, name) is None:
         raise InvalidInput(f"{kind} {name!r:.80}: the name must be 1 to 64 characters {form}")
@@ -25,7 +25,7 @@ def described(kind: str, name: object, function: object, pattern: str, form: str
 
 
 def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *shapes: tuple[int, ...]) -> Floats:
-    """Numbers that ``function(*given)`` returns, in one of the ``shapes``. Raises ``InvalidInput``."""
+    """Result of ``function(*given)``, as numbers. Raises ``InvalidInput`` if it fails or has none of the ``shapes``."""
     try:
         value = np.asarray(function(*given))
     except InvalidInput as error:
@@ -41,7 +41,7 @@ def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *sha
 
 
 def check_finite(what: str, value: Floats, times_s: Floats) -> None:
-    """Raise ``InvalidInput`` unless all values, [n] or [n, N], are finite. ``times_s`` [n] are the worlds' times."""
+    """Raise ``InvalidInput`` unless all values, [n] or [n, N], are finite."""
     for row, *vehicle in np.argwhere(~np.isfinite(value))[:1]:
         whose = "".join(f" for vehicle_{i + 1}" for i in vehicle)
         raise InvalidInput(

@@ -1,4 +1,4 @@
-"""A game: everything of an episode that is not its state. It never changes."""
+"""A game: everything that stays the same in an episode. It has no state of its own."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
 
 class Script(Protocol):
-    """Drives one vehicle: a script, a policy, a search. It sees the whole state, and decides when the learners do."""
+    """Drives one vehicle by a script, policy or search. It sees the whole state, and decides when the learners do."""
 
     def begin(self, alert: State, body: int) -> Any:
-        """Memory for new episodes: None, an array with one row per world, or a tuple of memories."""
+        """Memory of the script at the alert: None, an array with one row per world, or a tuple of memories."""
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
         """Commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the new memory."""
 
 
 class Shield(Protocol):
-    """Decides which of the proposed actions are applied."""
+    """Decides which proposed actions are applied, and which are replaced."""
 
     def begin(self, game: Game, alert: State, state: State) -> Any:
-        """Memory for new episodes, whose first decision is ``state``."""
+        """Memory of the shield for new episodes, at their first decision ``state``."""
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Any]:
         """Actions to apply, [n, L], and the new memory.
 
-        ``proposed`` [n, L] are in [-1, 1]; NaN: nothing is proposed. None: its own agents propose.
+        ``proposed`` [n, L] are actions in [-1, 1], or NaN for no proposal. None: the shield's own agents propose.
         """
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Values to report: name -> [n]."""
+        """Values for the infos: name -> [n] or [n, N]."""
 
 
 class Game(NamedTuple):
-    """Worlds to draw, rules, scripts, what is observed and rewarded, and perhaps a shield.
+    """Worlds to draw, rules, scripts, observations, rewards, and perhaps a shield.
 
-    ``draw`` returns worlds at the alert, ``reset`` their episodes at the first decision, ``step`` the next decision.
-    Environments, evaluation, search and shields share one game and its one step.
+    ``draw`` returns worlds at the alert; ``reset`` moves them to the first decision, and ``step`` to the next one.
+    Environments, evaluation, search and shields all use this ``step``.
 
     >>> import numpy as np
     >>> import ethbrake_marl as eb
@@ -63,14 +63,13 @@ class Game(NamedTuple):
     rules: Rules
     rewarding: Rewarding
     views: tuple[View, ...]  # what each body observes; entry 0 belongs to the obstacle and is not used
-    deciders: Ints  # bodies whose shortest latency is the time of the first decision
-    scripts: Mapping[int, Script] = MappingProxyType(
-        {}
-    )  # body -> script that looks at the state; all others hold their first command
+    deciders: Ints  # bodies; the first decision is when the shortest of their latencies has elapsed
+    # body -> script that looks at the state; a vehicle that is neither here nor a learner holds its first command
+    scripts: Mapping[int, Script] = MappingProxyType({})
     shield: Shield | None = None
 
     def reset(self, alert: State) -> State:
-        """Episodes of these worlds at their first decision. Scripts have decided once, at the alert."""
+        """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert."""
         wanted, memories = alert.wanted, dict(alert.memories)
         if self.scripts:
             wanted = wanted.copy()
@@ -86,11 +85,11 @@ class Game(NamedTuple):
         return state._replace(memories=memories)
 
     def step(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """State after one step of all worlds, and what the step did.
+        """State after one step of all worlds, and what happened in the step.
 
-        ``actions`` [n, L] of the learners, in [-1, 1]; behind a shield they are proposals, NaN where there is none,
-        and None lets the shield's own agents propose. ``donate``: the memory of ``state`` may be reused. An error
-        leaves ``state`` as it was. Raises ``InvalidInput`` for bad actions.
+        ``actions`` [n, L] of the learners are in [-1, 1]. With a shield they are proposals: NaN for none, and None lets
+        the shield's own agents propose. ``donate``: the arrays of ``state`` may be overwritten. Raises ``InvalidInput``
+        for bad actions; after any error ``state`` is unchanged.
         """
         if self.shield is not None:
             if actions is not None:
@@ -103,36 +102,36 @@ class Game(NamedTuple):
         return self.rewarding.complete(state, step, after)
 
     def first_decision(self, alert: State) -> State:
-        """Episodes at their first decision, before shaping and shield. Scripts have decided.
+        """Episodes at their first decision, before shaping and shield begin. The scripts have decided already.
 
-        Raises ``InvalidInput`` for worlds of a scenario with another physics.
+        Raises ``InvalidInput`` for worlds of another physics.
         """
         check_exact(alert, f"scenario {self.name!r}")
         return one_step.first_decision(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """``step`` without shield and without terms of the reward."""
+        """``step`` without the shield, and without reward terms other than harm and terminal."""
         return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
-        """Agents of some vehicles, body -> agent, so that each sees what it may see."""
+        """The agents, body -> agent, each limited to what its vehicle may know. Here they see everything."""
         return drivers
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Bodies of which vehicle ``body`` does not know everything at its first decision, [n, N + 1]."""
+        """Whether vehicle ``body`` does not know everything about each body at its first decision, [n, N + 1]."""
         return alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
 
     def own_infos(self, state: State) -> dict[str, Any]:
-        """Infos that only this game has: name -> [n] or [n, N]."""
+        """Infos of this game's shield: name -> [n] or [n, N]."""
         if self.shield is None:
             return {}
         return {f"shield_{name}": value for name, value in self.shield.infos(self, state).items()}
 
     def observe(self, state: State, bodies: Ints) -> list[Observations]:
-        """Observation of each of the ``bodies``, [n, F] each."""
+        """Observations of each body, a list of arrays [n, F]."""
         return [self.views[i].observe(state, np.array([i]), self.rules.time_step_s)[:, 0] for i in bodies.tolist()]
 
     def observe_alike(self, state: State, bodies: Sequence[int] | Ints) -> Observations:
-        """Observations of the ``bodies``, which have one view, [n, len(bodies), F]."""
+        """Observations, [n, len(bodies), F], of ``bodies`` that observe the same features."""
         bodies = np.asarray(bodies, np.int64)
         return self.views[bodies[0]].observe(state, bodies, self.rules.time_step_s)

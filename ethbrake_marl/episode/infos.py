@@ -1,4 +1,4 @@
-"""Infos: the same flat numbers after a reset and after every step, whatever the interface.
+"""Infos of a vehicle: the same numbers after a reset and after every step, in all environments.
 
 ========================  ==========================================================================================
 time_s                    time since the alert, s
@@ -10,10 +10,10 @@ total_harm                the same over all impacts
 world_first_impact_harm   harm of the whole line so far, first impact of each pair, m2/s2
 world_total_harm          the same over all impacts
 collided                  whether the world has had an impact
-cost                      harm that the last step has added to the line, as the reward counts it, m2/s2
-reward_NAME               term NAME of the reward in the last step, before it is weighted
-world_seed, world         seed and number of the world; the number is -1 if the caller has made the world
-shield_NAME               with a shield: what it reports
+cost                      harm of the line in the last step, in the reward's count, m2/s2
+reward_NAME               term NAME of the reward in the last step, without its weight
+world_seed, world         seed and number of the world; the number is -1 for a world made by the caller
+shield_NAME               values that a shield reports
 ========================  ==========================================================================================
 """
 
@@ -64,14 +64,13 @@ def report(line, car, clock, wanted, bodies, borne, out):
 
 
 def numbers(state: State, bodies: Ints) -> Floats:
-    """NUMBERS of the bodies in every world, [n, bodies, len(NUMBERS)]."""
     out = np.empty((state.n, len(bodies), len(NUMBERS)))
     report(state.line, state.car, state.clock, state.wanted, bodies, np.empty((2, state.vehicles)), out)
     return out
 
 
 def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str, Any]:
-    """Infos of a world, and terms of vehicles: name -> [n] or [n, N]. ``step`` None: a reset."""
+    """Cost, seed, world number and reward terms: name -> [n] or [n, N]. ``step`` is None after a reset."""
     counted = game.rewarding.counted
     worlds = {"world_seed": np.full(state.n, seed), "world": state.clock[:, NUMBER].astype(np.int64)}
     if step is None:
@@ -82,7 +81,7 @@ def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str,
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
-    """One dictionary for each world and body, world by world."""
+    """Infos, one dictionary for each world and body, world by world."""
     infos = []
     shared = per_body(of_step(game, state, step, seed) | game.own_infos(state), state.n, bodies)
     for values, common in zip(numbers(state, bodies).reshape(-1, len(NUMBERS)).tolist(), shared, strict=True):
@@ -93,7 +92,7 @@ def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies:
 
 
 def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, Any]]:
-    """Columns, [n] or [n, N], as one dictionary for each world and body, world by world."""
+    """Split columns, [n] or [n, N], into one dictionary for each world and body, world by world."""
     shared = {name: value.tolist() for name, value in columns.items() if value.ndim == 1}
     own = {name: value[:, bodies - 1].tolist() for name, value in columns.items() if value.ndim == 2}
     rows = []
@@ -104,7 +103,7 @@ def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, An
 
 
 def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) -> dict[str, Any]:
-    """Infos of one body in every world: name -> [n]."""
+    """Infos of one body in all worlds, name -> [n]."""
     columns = dict(zip(NUMBERS, numbers(state, np.array([body]))[:, 0].T, strict=True))
     columns["collided"] = columns["collided"] == 1.0
     for name, value in (of_step(game, state, step, seed) | game.own_infos(state)).items():

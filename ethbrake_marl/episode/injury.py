@@ -1,4 +1,4 @@
-"""Injuries that would be expected if the same impacts happened in 1,000 lines of vehicles."""
+"""Expected number of injuries if the same impacts happened in 1,000 lines of vehicles."""
 
 from __future__ import annotations
 
@@ -47,19 +47,19 @@ CURVES = {
 
 
 def risks(changes: Floats, curve: str) -> Floats:
-    """Each vehicle's probability of an injury, [n, 2, N], by changes of speed at its front and rear (m/s).
+    """Probability of an injury in each vehicle by an impact at its front, and at its rear, [n, 2, N].
 
-    It is 0 on a side that was not hit, where the logistic curves would be above 0.
+    ``changes`` [n, 2, N] are the vehicle's changes of speed there (m/s). Where it was not hit the probability is 0.
     """
     each = [CURVES[curve].front(changes[:, 0].copy()), CURVES[curve].rear(changes[:, 1].copy())]
     return np.where(changes > 0.0, np.stack(each, axis=1), 0.0)
 
 
 def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
-    """Expected injuries in 1,000 lines, [n], as if one impact had done each pair's harm [n, N + 1] (m2/s2).
+    """Expected injuries in 1,000 lines, [n], as if a single impact had done each pair's harm [n, N + 1] (m2/s2).
 
     A vehicle that is hit on both sides counts with the larger of its two risks. Exact for first impacts of two
-    vehicles; too large where several impacts of a pair add up.
+    vehicles; too large if several impacts of a pair add up.
     """
     rebound = (1.0 + car[:, RESTITUTION, :-1]) * np.sqrt(pairs[:, :-1])
     mass = car[:, MASS, 1:]
@@ -73,7 +73,7 @@ def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
 def speed_changes(before: State, after: State) -> Floats:
     """Each vehicle's largest change of speed by one impact between two states, at its front and rear, [n, 2, N] m/s.
 
-    No decision lies between the states. A push by a vehicle in contact is no impact.
+    There must be no decision between the states. Pushing in contact is not an impact.
     """
     out = np.zeros((after.n, 2, after.vehicles))
     struck = np.asarray((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
@@ -83,9 +83,9 @@ def speed_changes(before: State, after: State) -> Floats:
 
 
 def injured(changes: Floats, curve: str) -> Floats:
-    """Expected injuries of each vehicle in 1,000 lines, [n, N], from its largest changes [n, 2, N] (m/s).
+    """Expected injuries of each vehicle in 1,000 lines, [n, N], from ``speed_changes`` [n, 2, N] (m/s).
 
-    The side with the larger change counts.
+    Only the side (front or rear) with the larger change counts.
     """
     front, rear = np.moveaxis(risks(changes, curve), 1, 0)
     return 1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front)

@@ -10,17 +10,17 @@ social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``: social value orientat
 maximin             ``max_j H_j``
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``, one weight per vehicle, 0 or from 1e-6 to 1e6
-preference          as ``weighted``, with the weights ``harm_weight`` that the scenario declares
-injury:curve        expected injuries in 1,000 lines (``episode.injury``), from each pair's harm as if by one impact
+preference          as ``weighted``, with the scenario's ``harm_weight``
+injury:curve        expected injuries in 1,000 lines (``episode.injury``), as if one impact had done each pair's harm
 first:A,then:B      ``1000 A + B`` for two other objectives: nearly their lexicographic order
 ==================  ================================================================================================
 
-All but ``maximin``, ``injury``, registered ones and a ``first`` with one of these are weighted sums of the vehicles'
-harm.
+All are weighted sums of the vehicles' harm, except ``maximin``, ``injury``, registered ones, and a ``first`` that
+contains one of these.
 
-``first:A,then:B`` lets B break ties of A. Two actions are in lexicographic order if A differs by more than a thousandth
-of what B differs by. An objective without it may leave an impact without any weight (``free_pairs``), and then to cause
-this impact costs nothing.
+``first:A,then:B`` lets B break ties of A. The order is lexicographic if two actions differ in A by more than a
+thousandth of their difference in B. Other objectives may give an impact no weight (``free_pairs``); then causing it
+costs nothing.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Harm(NamedTuple):
 
     @classmethod
     def of(cls, pairs: Floats, own: Floats, car: Floats) -> Harm:
-        """Harm of pairs, [n, N + 1], of which the vehicle behind bears ``own`` [n, N + 1] alone."""
+        """Harm from that of pairs, [n, N + 1], of which the rear vehicle bears the part ``own`` [n, N + 1] alone."""
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             whole = whole + pairs[:, p]
@@ -67,7 +67,7 @@ class Harm(NamedTuple):
         return cls(pairs, borne + own[:, :-1], whole, car)
 
     def weighted(self, weights: Floats) -> Floats:
-        """``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for the ``weights`` [n, N]; sums from front to rear."""
+        """``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for ``weights`` [n, N]; summed from front to rear."""
         harm, whole = np.zeros(len(self.borne)), np.zeros(len(self.borne))
         for j in range(self.borne.shape[1]):
             harm = harm + weights[:, j] * self.borne[:, j]
@@ -87,12 +87,12 @@ class Kind(NamedTuple):
         return self.form.partition(":")[0]
 
     def __reduce__(self) -> tuple[Callable[[str], Kind], tuple[str]]:
-        """Pickle the name: functions need not be picklable."""
+        """Pickle only the name, because functions may not be picklable."""
         return _kind, (self.name,)
 
 
 class Objective(NamedTuple):
-    """An objective as it is written, such as ``social:45``."""
+    """An objective of one vehicle, such as ``social:45``."""
 
     kind: Kind
     numbers: tuple[float, ...] = ()
@@ -113,7 +113,7 @@ class Objective(NamedTuple):
         return self.kind.amount(harm, vehicle, self)
 
     def weights(self, car: Floats, vehicle: int) -> Floats:
-        """Weight of each vehicle's harm, [n, N]. Raises ``InvalidInput`` unless this is a weighted sum."""
+        """Weight of each vehicle's harm, [n, N]. Raises ``InvalidInput`` unless the objective is a weighted sum."""
         if self.kind.weights is None:
             known = ", ".join(kind.form for kind in OBJECTIVES.loaded.values() if kind.weights)
             raise InvalidInput(
@@ -129,7 +129,7 @@ def _kind(name: str) -> Kind:
 
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
-    """Objective of a text such as ``own``, ``social:45`` or ``weighted:1,4,1``. Raises ``InvalidInput``."""
+    """Objective for a text such as ``own``, ``social:45`` or ``weighted:1,4,1``. Raises ``InvalidInput``."""
     name, (_, colon, argument) = name_of(text), text.partition(":")
     kind = OBJECTIVES[name]
     if name == "vehicle_K":
@@ -171,12 +171,12 @@ def _first_and_then(text: str, argument: str) -> tuple[Objective, ...]:
 
 
 def name_of(text: str) -> str:
-    """Kind of the objective in a text: of ``social:45`` ``social``, of ``vehicle_3`` ``vehicle_K``."""
+    """Name of the kind of objective: ``social`` for ``social:45``, ``vehicle_K`` for ``vehicle_3``."""
     return re.sub("vehicle_[1-9][0-9]?", "vehicle_K", text) if ":" not in text else text.partition(":")[0]
 
 
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
-    """Objective of each vehicle, front to rear. Raises ``InvalidInput`` for a bad text or a wrong number."""
+    """Objective of each vehicle, front to rear. Raises ``InvalidInput`` for a bad text or the wrong number of texts."""
     each = [declared] * vehicles if isinstance(declared, str) else declared
     if not isinstance(each, Sequence) or not all(isinstance(text, str) for text in each):
         raise InvalidInput(
@@ -209,8 +209,8 @@ def _check_vehicles(text: str, objective: Objective, vehicles: int) -> None:
 def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: bool) -> list[int]:
     """Pairs whose impacts cost ``vehicle`` (from 0) nothing: K for Vehicles K and K + 1, 0 for the obstacle.
 
-    Only weights of 0 that somebody wrote count, in ``weighted`` and ``vehicle_K``; that ``own`` is indifferent to
-    others, and ``social:90`` to the vehicle itself, is what they mean.
+    Only for ``weighted`` and ``vehicle_K``, whose weights of 0 may be a mistake. With ``own`` or ``social:90``
+    indifference is intended: the result is empty.
     """
     if objective.kind.name not in ("weighted", "vehicle_K"):
         return []
@@ -219,9 +219,9 @@ def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: b
 
 
 def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: str) -> Floats:
-    """Growth of each vehicle's amount since ``before`` (None: since the alert), [n, N].
+    """Increase of each vehicle's amount since ``before`` (None: since the alert), [n, N].
 
-    A weighted sum is taken of the harm since then; any other amount is the amount after minus the amount before.
+    A weighted sum is computed from the harm since then; other objectives are amount after minus amount before.
     """
     now, own = pair_amounts(after.line, count), own_amounts(after.line, count)
     whole = Harm.of(now, own, after.car)
@@ -238,7 +238,7 @@ def amounts(objectives: Sequence[Objective], before: State | None, after: State,
 
 
 def _cosine_and_sine(angle_deg: float) -> tuple[float, float]:
-    """Cosine and sine with the same bits on every processor: power series in exact fractions."""
+    """Cosine and sine with the same bits on every processor, from power series in exact fractions."""
     if angle_deg == 90.0:
         return 0.0, 1.0
     angle, term, sums = Fraction(math.radians(angle_deg)), Fraction(1), [Fraction(0), Fraction(0)]
@@ -267,8 +267,9 @@ def _joined(first_and_then: Sequence[Floats]) -> Floats:
 def register_objective(name: str, function: Callable[[Harm, int], Floats]) -> None:
     """Register an objective for scenarios and rewards. Entry points: ``ethbrake_marl.objectives``.
 
-    ``function(harm, vehicle)`` returns what ``vehicle`` (from 0) should minimise, [n]; its docstring says what that is.
-    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring.
+    ``function(harm, vehicle)`` returns what ``vehicle`` (from 0) should minimise, [n]; its docstring describes this
+    amount. Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a
+    docstring.
     """
     form = "a-z, 0-9, - and _, beginning with a letter or digit, and no name of a vehicle"
     meaning = described("objective", name, function, r"(?!vehicle_\d+$)[a-z0-9][a-z0-9_-]{0,63}", form)

@@ -1,4 +1,4 @@
-"""Observations: the listed features of every observer, in every world."""
+"""Observations: values of the listed features, for every observer in every world."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class View:
 
 
 def knows(state: State, body: int, other: int) -> NDArray[np.bool_]:
-    """Whether a body may act on news of another one, which exists, [n]."""
+    """Whether a body knows another one already and may react to it, [n]; False if the other one does not exist."""
     if not 0 < other <= state.vehicles:
         return np.zeros(state.n, np.bool_)
     return np.asarray(state.time_s >= state.know[:, body, other])
@@ -141,9 +141,9 @@ def scaled(values: Floats, scaling: Floats) -> Floats:
 
 
 def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[np.bool_]) -> Floats:
-    """Observed value of a feature with a function, [n].
+    """Observed value of a feature that has a function, [n].
 
-    ``offset`` is that of the neighbour, who is ``known`` [n] or not; 0: a feature of the vehicle itself.
+    ``offset`` leads to the neighbour, who is ``known`` [n] or not; 0: the feature describes the vehicle itself.
     """
     what = f"feature {own.feature.name!r} of vehicle_{body}"
     if offset and not known.any():
@@ -158,16 +158,16 @@ def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[n
 
 @kernel
 def full_stop_m(speed, latency_left, capacity):
-    """Distance (m) until a vehicle is at rest whose brakes act at once (``forces.stopping_m``)."""
+    """Distance (m) in which a vehicle stops whose brakes act at once (``forces.stopping_m``)."""
     speed = max(speed, 0.0)
     return speed * latency_left + speed * speed / (2.0 * capacity)
 
 
 @kernel
 def fitting_deceleration(speed, latency_left, room):
-    """Deceleration (m/s2) that stops a vehicle after ``room`` (m): ``v^2 / (2 (room - v tau))``.
+    """Deceleration (m/s2) that stops a vehicle within ``room`` (m): ``v^2 / (2 (room - v tau))``.
 
-    Less than 1 mm after the latency counts as 1 mm, which is clipped in the observation.
+    If less than 1 mm is left after the latency tau, it counts as 1 mm; the observation is clipped there.
     """
     speed = max(speed, 0.0)
     return speed * speed / (2.0 * max(room - speed * latency_left, 1e-3))
@@ -180,10 +180,10 @@ def bounded(value, scaling, f):
 
 @large
 def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out):
-    """Write the features of the groups own, neighbours, role and obstacle, scaled, to ``out`` [n, observers, F].
+    """Write the scaled features of the groups own, neighbours, role and obstacle to ``out`` [n, observers, F].
 
-    They are computed in this order in ``value``, of which ``places`` [F] are written, none where it is -1; all of them
-    in order if ``places`` is empty.
+    All are computed in this order in ``value``. ``places`` [F] are the positions to write (-1: none); if it is empty,
+    all values are written in order.
     """
     bodies = line.shape[2]
     for k in range(len(out)):

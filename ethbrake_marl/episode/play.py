@@ -1,7 +1,7 @@
-"""What would happen? Two functions answer, with the motion of the episode itself.
+"""Predicts what would happen, with the physics of the episode. ``played`` and ``hold`` are the two functions.
 
-``played`` follows a plan, decision by decision, to the same bits as the episode. ``hold`` holds constant commands, in
-one piece: fast, but rounded differently.
+``played`` follows a plan, decision by decision, with the same bits as the episode. ``hold`` keeps constant commands
+without stops at decisions: fast, but rounded differently.
 """
 
 from __future__ import annotations
@@ -24,13 +24,12 @@ if TYPE_CHECKING:
 
 
 def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
-    """Working memory: of the physics, and for one world's line and commands."""
     return scratch_for(bodies), np.zeros((LINE_ROWS, bodies)), np.zeros(bodies)
 
 
 @large
 def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, count, scratch, out):
-    """Follow every plan [T, L], in place; write the harm to ``out`` [n]; stop above ``most`` [n]."""
+    """Follow each plan [T, L], in place; write the harm to ``out`` [n]. An episode stops above ``most`` [n]."""
     for k in range(len(out)):
         harm = amount_so_far(line[k], count)
         while clock[k, ENDED] == 0.0 and harm <= most[k]:
@@ -42,7 +41,7 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, ho
 
 @large
 def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, memory, out):
-    """Write the harm in two counts to ``out`` [2, n, C], if ``bodies`` hold the commands ``tried`` [n, C, B]."""
+    """Write the harm under two counts to ``out`` [2, n, C] if ``bodies`` hold the commands ``tried`` [n, C, B]."""
     scratch, here, commands = memory
     for k in range(tried.shape[0]):
         for i in range(len(commands)):
@@ -62,12 +61,11 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, mem
 def played(
     game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf, *, donate: bool = False
 ) -> tuple[State, Floats]:
-    """Last states of episodes whose learners follow their plans from now on, and their harm, [n] m2/s2.
+    """Last states of episodes whose learners follow plans from ``state`` on, and the harm, [n] m2/s2.
 
-    ``plans`` [n, T, L] are the learners' actions at every decision; the last one repeats. An episode stops where its
-    harm is above ``most`` [n]. The harm is infinite where a check of the physics fails; scripts that look at the state
-    are asked as in the episode, which raises ``PhysicsError`` instead. ``donate``: the memory of ``state`` may be
-    reused.
+    ``plans`` [n, T, L] are the learners' actions at every decision; the last one repeats. An episode stops when its
+    harm is above ``most`` [n]. If a check of the physics fails, the harm is infinite; but in games with scripts that
+    look at the state, ``PhysicsError`` is raised. ``donate``: the arrays of ``state`` may be overwritten.
     """
     most = np.full(len(plans), most)
     if game.scripts or PHYSICS in state.memories:
@@ -88,15 +86,15 @@ def played(
 
 
 def price(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> Floats:
-    """Harm of every episode, [n] m2/s2, if its learners follow their plan from now on; see ``played``."""
+    """Harm of every episode, [n] m2/s2, if its learners follow ``plans`` from now on (arguments of ``played``)."""
     return played(game, state, plans, count, most)[1]
 
 
 def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float, count: Count) -> Floats:
-    """Harm in this count, and in the one that decides ties, [2, n, C] m2/s2, if ``bodies`` hold commands.
+    """Harm if ``bodies`` hold constant commands until the horizon ``until_s``, [2, n, C] m2/s2.
 
-    ``until_s`` is the horizon: what still moves then counts as it does there. ``tried`` [n, C, B] are C commands of the
-    bodies (m/s2); the others hold ``wanted`` [n, N + 1].
+    The first row is the harm in ``count``, the second in the count that decides ties. ``tried`` [n, C, B] are C sets of
+    commands for the B bodies (m/s2); the other bodies hold ``wanted`` [n, N + 1].
     """
     others = "e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping"
     check_exact(state, f"a plan of constant commands ({others})")
@@ -111,9 +109,10 @@ def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, unt
 def descend(
     state: State, bodies: Sequence[int], shares: Floats, rounds: int, horizon_s: float, count: Count
 ) -> tuple[Floats, Floats]:
-    """Let bodies choose constant shares of their brakes, one after the other; all others brake fully.
+    """Choose the best constant share of each body's brakes, one body after the other, while all others brake fully.
 
-    Returns the commands of all bodies, [n, N + 1] m/s2, and the harm of the episode, [n] m2/s2.
+    The bodies take turns in ``rounds`` rounds, each with the others' latest choice. Returns the commands of all bodies,
+    [n, N + 1] m/s2, and the harm of the episode, [n] m2/s2.
     """
     wanted, least = -state.car[:, BRAKING], np.zeros(state.n)
     for body in list(bodies) * rounds:

@@ -1,4 +1,4 @@
-"""Rewards: a weighted sum of terms (``episode.terms``)."""
+"""Rewards: weighted sums of terms (``episode.terms``)."""
 
 from __future__ import annotations
 
@@ -40,11 +40,10 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class WithoutEffect(UserWarning):
-    """A setting has no effect, such as an objective in a reward that gives harm the weight 0."""
+    """A setting has no effect, such as an objective when the weight of harm is 0."""
 
 
 def own_terms() -> list[str]:
-    """Names of registered terms, without loading any."""
     return [name for name in TERMS if name not in RewardParams.model_fields]
 
 
@@ -52,14 +51,17 @@ class RewardParams(FileModel):
     """Weights of the terms of a reward, and their constants. A term of weight 0 is not computed.
 
     Args:
-        harm, collision, risk, jerk, terminal, push, drove, still_moving, shaping: weights. With any but harm, the
-        weight of harm must be given too. harm_count: what the term harm counts: ``first``, ``total`` or ``honest``
-        (``episode.counts``). objective: objective of all vehicles, or a list with one each; None: the scenario's.
-        shaping_discount: discount in the term shaping, in (0, 1]; it should be the learner's own. k_energy: factor of
-        the term collision, or a list with one for each pair of vehicles, front to rear. ttc_scale_s: tau of the term
-        risk, s. safety_buffer_m: d_safe of the term risk, m. target_gap_m: d_target of the term risk, m.
-        distance_slope_per_m: k_d of the term risk, 1/m. terms: name of a registered term -> weight; negative for what
-        should become small.
+        harm: weight of the term harm. Give it whenever you give another weight.
+        harm_count: what the term harm counts: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        objective: objective of all vehicles, or a list with one each; None: the scenario's.
+        collision, risk, jerk, terminal, push, drove, still_moving, shaping: weights of these terms (``episode.terms``).
+        shaping_discount: discount in the term shaping, in (0, 1]; it should be the learner's own.
+        k_energy: factor of the term collision, or a list with one for each pair of vehicles, front to rear.
+        ttc_scale_s: tau of the term risk, s.
+        safety_buffer_m: d_safe of the term risk, m.
+        target_gap_m: d_target of the term risk, m.
+        distance_slope_per_m: k_d of the term risk, 1/m.
+        terms: name of a registered term -> weight; negative for an amount that should become small.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
@@ -125,7 +127,7 @@ class RewardParams(FileModel):
 
     @model_validator(mode="after")
     def _harm_is_meant(self) -> Self:
-        """Refuse weights of other terms without a weight of harm, which would be 1 by default."""
+        """Refuse weights of other terms without a weight of harm, because its default is 1."""
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
         right = (
@@ -177,7 +179,7 @@ def reward_params(reward: Reward) -> RewardParams:
 
 
 class Rewarding(NamedTuple):
-    """A reward, ready to be computed: what the compiled step does not know of it."""
+    """A reward, ready to be computed after each step: everything that the compiled step does not compute itself."""
 
     params: RewardParams
     counted: tuple[str, ...]  # names of the terms whose weight is not 0
@@ -191,8 +193,8 @@ class Rewarding(NamedTuple):
     ) -> tuple[Rewarding, Rules]:
         """The reward, and the rules of a step with its weights.
 
-        ``objective`` is the scenario's; ``times`` are time step and horizon (s); ``vector`` are the components of a
-        vector reward, or None. Warns if an objective has no effect.
+        ``objective`` is the scenario's; ``times`` are time step and horizon (s); ``vector`` lists the components of a
+        vector reward, or is None. Warns if an objective has no effect.
         """
         params = reward_params(reward)
         declared = objective if params.objective is None else params.objective
@@ -236,11 +238,10 @@ class Rewarding(NamedTuple):
 
     @property
     def is_compiled(self) -> bool:
-        """Whether the compiled step computes the whole reward."""
         return not self.terms and self.shaping is None and not self.components
 
     def complete(self, before: State, step: Step, after: State) -> tuple[State, Step]:
-        """State with the memory of the reward, and step with the whole reward."""
+        """State with the reward's new memory, and step with the complete reward."""
         values = {name: function(before, step, after) for name, _, function in self.terms}
         if self.shaping is not None:
             values["shaping"], memory = self.shaping.value(before, step, after)
@@ -262,7 +263,7 @@ class Rewarding(NamedTuple):
         return after, step
 
     def shared(self, step: Step) -> dict[str, Floats]:
-        """Values of the terms that the compiled step knows, [n]."""
+        """Values of the terms that the compiled step computes, name -> [n]."""
         known = {"harm": -step.counted, "terminal": step.out[SAFE_END]}
         return {name: value for name, value in known.items() if name in self.counted}
 

@@ -1,4 +1,4 @@
-"""The state of a batch of episodes, as a value."""
+"""The state of a batch of episodes, as an immutable value."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ PHYSICS = "physics"  # a memory of this name marks worlds whose impacts are not 
 
 
 class State(NamedTuple):
-    """n episodes of N vehicles, one row per world. Nobody changes it; a step returns a new one.
+    """n episodes of N vehicles, one row per world. It is never changed; a step returns a new state.
 
-    The arrays hold bodies 0 to N (``motion.layout``); the properties, which agents and terms read, hold vehicles:
-    column i belongs to ``vehicle_{i + 1}``, in arrays of pairs to it and the vehicle behind. Properties are views: copy
-    before you change them.
+    The arrays have a column for each body 0 to N (``motion.layout``). The properties, for agents and terms, have
+    columns of vehicles: column i belongs to ``vehicle_{i + 1}``, or to the pair of it and the vehicle behind.
+    Properties are views: copy them before a change.
 
     >>> import ethbrake_marl as eb
     >>> worlds = eb.load_scenario("paper-random").sample(2, seed=7)
@@ -61,26 +61,26 @@ class State(NamedTuple):
     memories: Mapping[Any, Any]  # body -> memory of its script; a name -> memory of a shield or term
 
     def take(self, rows: Any) -> State:
-        """The episodes ``rows`` (indices, a mask or a slice)."""
+        """The episodes in ``rows`` (indices, a mask or a slice)."""
         state: State = take(self, rows)
         return state
 
     def put(self, rows: Any, new: State, *, donate: bool = False) -> State:
-        """The state with the episodes ``new`` in ``rows``. ``donate``: its own arrays may be reused."""
+        """The state with the episodes ``new`` in ``rows``. ``donate``: its arrays may be overwritten."""
         state: State = put(self, rows, new, donate)
         return state
 
     @staticmethod
     def join(parts: Sequence[State], merged: Callable[[Sequence[Any]], Any] = np.concatenate) -> State:
-        """Join the episodes of all parts, which have memories of the same kinds.
+        """Join the episodes of several states, whose memories have the same structure.
 
-        ``merged`` returns one array of those of the parts; by default they stand one after the other.
+        ``merged`` turns a list of arrays, one per state, into one array; by default it concatenates them.
         """
         state: State = mapped(lambda *arrays: merged(arrays), *parts)
         return state
 
     def read_only(self) -> State:
-        """The same episodes, whose arrays cannot be changed by mistake."""
+        """The same episodes in arrays that cannot be changed."""
         line, car, clock, know, wanted = (array.view() for array in self[:5])
         for view in (line, car, clock, know, wanted):
             view.setflags(write=False)
@@ -102,7 +102,7 @@ class State(NamedTuple):
 
     @property
     def steps(self) -> Ints:
-        """Number of steps taken, which is the number of the next decision, [n]."""
+        """Number of steps taken, which is also the number of the next decision, [n]."""
         return self.clock[:, STEPS].astype(np.int64)
 
     @property
@@ -112,7 +112,7 @@ class State(NamedTuple):
 
     @property
     def at_rest(self) -> Bools:
-        """Whether every vehicle is at rest and no command would move it, [n]; if not, at the end, the horizon came."""
+        """Whether every vehicle is at rest and no command would move it, [n]."""
         moves = (self.line[:, SPEED] != 0.0) | (self.wanted > 0.0) | (self.line[:, FORCE] > 0.0)
         return ~moves[:, 1:].any(axis=1)
 
@@ -134,12 +134,12 @@ class State(NamedTuple):
 
     @property
     def forces_mps2(self) -> Floats:
-        """Acceleration that brakes or engine alone would cause now, [n, N] m/s2."""
+        """Present acceleration by brakes or engine alone, [n, N] m/s2."""
         return self.line[:, FORCE, 1:]
 
     @property
     def commands_mps2(self) -> Floats:
-        """Last commands, [n, N] m/s2. A command takes effect once the vehicle's latency has elapsed."""
+        """Last commands, [n, N] m/s2. A command takes effect after the vehicle's latency."""
         return self.wanted[:, 1:]
 
     @property
@@ -154,7 +154,7 @@ class State(NamedTuple):
 
     @property
     def driving_capacity_mps2(self) -> Floats:
-        """Largest acceleration forward on this road, [n, N] m/s2."""
+        """Largest forward acceleration on this road, [n, N] m/s2."""
         return self.car[:, DRIVING, 1:]
 
     @property
@@ -164,7 +164,7 @@ class State(NamedTuple):
 
     @property
     def restitution(self) -> Floats:
-        """Coefficient of restitution of all impacts of the world, [n]."""
+        """Coefficient of restitution of the world's impacts, [n]."""
         return self.car[:, RESTITUTION, 0]
 
     @property
@@ -178,7 +178,7 @@ class State(NamedTuple):
         return np.asarray(self.line[:, COUNT].any(axis=1))
 
     def harm(self, count: Count = "first") -> Floats:
-        """Harm of each world so far, [n] m2/s2, as ``count`` says (``episode.counts``)."""
+        """Harm of each world so far, [n] m2/s2; ``count`` says which harm (``episode.counts``)."""
         self._check_count(count)
         out = np.empty(self.n)
         _harm(self.line, weights_of(count), out)
@@ -190,7 +190,7 @@ class State(NamedTuple):
         return pair_amounts(self.line, count)[:, 1:-1]
 
     def borne_harm(self, count: Count = "first") -> Floats:
-        """Harm that each vehicle has borne so far, [n, N] m2/s2; a pair's shares add up to its harm."""
+        """Harm that each vehicle has borne so far, [n, N] m2/s2. The two shares of a pair sum to its harm."""
         self._check_count(count)
         own, out = own_amounts(self.line, count), np.empty((self.n, self.vehicles))
         split_harm(pair_amounts(self.line, count) - own, self.car[:, MASS], out)
@@ -202,7 +202,7 @@ class State(NamedTuple):
 
 
 def check_exact(state: State, what: str) -> None:
-    """Raise ``InvalidInput`` if the impacts of these worlds are not exact: ``what`` needs them."""
+    """Raise ``InvalidInput`` unless impacts in these worlds are exact. ``what`` names the feature that needs this."""
     if PHYSICS in state.memories:
         raise InvalidInput(
             f"{what} needs exact impacts, and these worlds have another physics (key physics of their scenario);"
@@ -211,9 +211,9 @@ def check_exact(state: State, what: str) -> None:
 
 
 def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
-    """A memory with ``function(array, ...)`` in place of each array; ``others`` are memories of the same kind.
+    """A memory with ``function(array, ...)`` in place of each array; ``others`` are memories of the same structure.
 
-    A memory is None, an array with one row per world, or a tuple or mapping of memories, such as a state.
+    A memory is None, an array with one row per world, or a tuple or mapping of memories (a state is one, too).
     """
     if isinstance(memory, np.ndarray):  # first, because the check for a mapping is slow
         return function(memory, *others)
@@ -226,7 +226,7 @@ def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """``rows`` of a memory. A slice is copied: a kernel is compiled again for another layout."""
+    """``rows`` of every array in a memory. A slice is copied, so that compiled code gets the usual array layout."""
     if isinstance(rows, slice):
         return mapped(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)
@@ -255,7 +255,7 @@ def _harm(line, weights, out):
 def front_share(harm, front_mass, rear_mass):
     """Part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)`` (eq. harm).
 
-    The larger part is computed and the smaller one is what is left, so both add up to ``harm`` exactly.
+    The larger part is computed and the smaller one is the rest, so both sum to ``harm`` exactly.
     """
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm
@@ -264,7 +264,7 @@ def front_share(harm, front_mass, rear_mass):
 
 @kernel
 def split_world(pair_harm, mass, borne):
-    """Write the harm that each vehicle of one world bears to ``borne`` [N]; Vehicle 1 bears all with the obstacle.
+    """Write the harm that each vehicle of one world bears to ``borne`` [N]. With the obstacle, Vehicle 1 bears all.
 
     ``pair_harm`` [N + 1] is the harm of each pair (m2/s2), ``mass`` [N + 1] the mass of each body (t).
     """

@@ -49,11 +49,11 @@ TOTAL_HARM = 1  # harm of all impacts of the step (m2/s2)
 TERMINATED = 2  # 1 if all vehicles have come to rest
 TRUNCATED = 3  # 1 if the horizon has come first
 SAFE_END = 4  # 1 if the episode has ended without any impact
-COUNTED = 5  # what the reward counts of the step (m2/s2)
+COUNTED = 5  # harm of the step in the reward's count (m2/s2)
 OUT_ROWS = 6
 
 LARGEST_ACTION = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # counts as 1: the next float32 number
-ROUNDING = 1e-9  # part of a step by which the horizon may lie beyond the last whole step
+ROUNDING = 1e-9  # fraction of a step: a horizon that exceeds whole steps by less needs no further step
 
 
 class Rules(NamedTuple):
@@ -68,7 +68,7 @@ class Rules(NamedTuple):
 
 
 class Step(NamedTuple):
-    """What a step did in n worlds. An episode that had ended before does nothing.
+    """What happened in one step of n worlds. Nothing happens in episodes that ended before.
 
     >>> import numpy as np
     >>> import ethbrake_marl as eb
@@ -82,9 +82,8 @@ class Step(NamedTuple):
     reward: Floats  # [n, N] reward of each vehicle
     out: Floats  # [OUT_ROWS, n] the properties below
     time_step_s: float
-    terms: Mapping[str, Floats] = MappingProxyType(
-        {}
-    )  # name -> term of the reward before it is weighted, [n] or [n, N]
+    # name -> term of the reward without its weight, [n] or [n, N]
+    terms: Mapping[str, Floats] = MappingProxyType({})
     vector: Floats | None = None  # [n, N, K] vector reward of each vehicle, if the game has one
 
     @property
@@ -99,28 +98,28 @@ class Step(NamedTuple):
 
     @property
     def counted(self) -> Floats:
-        """What the reward's count of harm counts in this step, [n] m2/s2."""
+        """Harm of the line in this step in the reward's count, [n] m2/s2."""
         return self.out[COUNTED]
 
     @property
     def terminated(self) -> Bools:
-        """Whether the step ended the episode because every vehicle is at rest and no command would move it, [n]."""
+        """Whether the episode ended in this step with all vehicles at rest and no command to move, [n]."""
         return self.out[TERMINATED] == 1.0
 
     @property
     def truncated(self) -> Bools:
-        """Whether the step ended the episode at the horizon, [n]."""
+        """Whether the episode ended in this step at the horizon, [n]."""
         return self.out[TRUNCATED] == 1.0
 
     @property
     def safe_end(self) -> Bools:
-        """Whether the step ended an episode without any impact, [n]."""
+        """Whether the episode ended in this step without any impact, [n]."""
         return self.out[SAFE_END] == 1.0
 
 
 @kernel
 def command(car, wanted, learners, actions):
-    """Turn the learners' actions, -1 (full braking) to 0 (coasting) to 1 (full driving), into commands."""
+    """Write the learners' commands to ``wanted``, from actions: -1 full braking, 0 coasting, 1 full driving."""
     for j in range(learners.shape[0]):
         i, action = learners[j], min(max(actions[j], -1.0), 1.0)
         wanted[i] = action * car[BRAKING, i] if action < 0.0 else action * car[DRIVING, i]
@@ -137,16 +136,16 @@ def stands(line, wanted):
 
 @kernel
 def note_motion(line):
-    """Store how fast vehicles still move at the horizon, in the row MOVING."""
+    """Store the squared speed of each vehicle at the horizon in the row MOVING."""
     for i in range(1, line.shape[1]):
         line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
 
 
 @kernel
 def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
-    """Advance one running world to its next decision, in place; return what ``drive`` met, and whether all is at rest.
+    """Advance one running world to its next decision, in place; return ``drive``'s result, and whether all is at rest.
 
-    Times of decisions are multiples from the first one, so that an episode has the same times wherever it is played.
+    Decision times are multiples of the time step after the first decision, so that they never differ by rounding.
     """
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
@@ -162,7 +161,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
 
 @kernel
 def beside_harm(line: Floats, count: Floats) -> float:
-    """Amount of one world so far beside first-impact and total harm (m2/s2)."""
+    """What a count adds to first-impact and total harm in one world so far (m2/s2)."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
         amount += count[2] * line[PASSED, p] + count[3] * line[PUSHED, p]
@@ -174,9 +173,9 @@ def beside_harm(line: Floats, count: Floats) -> float:
 def step_worlds(
     line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, horizon_s, harm, terminal, count
 ):
-    """Advance every running episode by one step, in place; return the row of a refused action and of a failed world.
+    """Advance every running episode by one step, in place; return the row of an invalid action and of a failed world.
 
-    -1: there is none. An action is refused if it is no number in [-1, 1]; then nothing has moved.
+    -1 stands for none. An action is invalid if it is not a number in [-1, 1]; then nothing has moved.
     """
     n, bodies = wanted.shape
     for k in range(n):
@@ -224,7 +223,7 @@ def drive_worlds(line, car, time, until, wanted, scratch):
 
 
 def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wanted: Floats, scratch: Floats) -> int:
-    """Advance every world from ``time`` to ``until`` [n] (s), ``line`` in place; return a failed row, otherwise -1."""
+    """Advance every world from ``time`` to ``until`` [n] (s), ``line`` in place; return a failed row, or -1."""
     moved = line.copy()  # arrays of any layout become alike, because a kernel is compiled for each layout
     failed: int = drive_worlds(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
     line[:] = moved
@@ -232,9 +231,9 @@ def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wante
 
 
 def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[int, Floats]]:
-    """Yield the number of each of ``these`` worlds, [n], and the scratch memory of the physics between two states.
+    """Simulate ``these`` worlds [n] again from ``before`` to ``after``; yield each row and the physics' scratch memory.
 
-    No decision lies between the states.
+    There must be no decision between the states.
     """
     check_exact(before, "a quantity of single impacts")
     scratch = scratch_for(after.vehicles + 1)
@@ -245,14 +244,14 @@ def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[in
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:
-    """Worlds at the alert: Vehicle 1 begins to brake, and nobody has decided yet."""
+    """State of worlds at the alert, when Vehicle 1 begins to brake and nobody has decided yet."""
     clock = np.zeros((len(line), CLOCK_COLUMNS))
     clock[:, NUMBER] = numbers
     return State(line, car, clock, know, wanted, {})
 
 
 def advanced(state: State, until_s: Floats) -> State:
-    """State at ``until_s`` [n] if all hold ``state.wanted``."""
+    """State at ``until_s`` [n] if all vehicles hold their commands."""
     line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
     car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others
     failed = drive_worlds(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
@@ -265,7 +264,7 @@ def advanced(state: State, until_s: Floats) -> State:
 def first_decision(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
     """Episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
 
-    Until then ``alert.wanted`` is commanded.
+    Until then all vehicles hold ``alert.wanted``.
     """
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
     state = advanced(alert, first)
@@ -277,10 +276,10 @@ def first_decision(alert: State, deciders: Ints, time_step_s: float, horizon_s: 
 def step(
     rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
 ) -> tuple[State, Step]:
-    """State after one step, and what the step did.
+    """State after one step, and what happened in the step.
 
-    ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` are those that look at the state at every
-    decision. Raises ``InvalidInput`` for a bad action. ``state`` does not change, unless its memory is donated.
+    ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` look at the state at every decision. Raises
+    ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
     actions = numbers_of(rules, actions, state.n)
     line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
@@ -297,7 +296,7 @@ def step(
 
 
 def scripted(scripts: Mapping[int, Any], state: State) -> State:
-    """State with new commands, in memory of their own, and memories of the scripts that look at it."""
+    """State with new commands and memories of the ``scripts``; its commands are a new array."""
     wanted, memories, commands = state.wanted.copy(), dict(state.memories), {}
     for i, script in scripts.items():
         commands[i], memories[i] = asked(script, state, memories[i], i)
@@ -320,7 +319,7 @@ def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Flo
 
 
 def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
-    """Actions as float64 [n, L]. Raises ``InvalidInput``."""
+    """Actions as float64 [n, L]. Raises ``InvalidInput`` for another type or shape."""
     shape = n, len(rules.learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
         raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
@@ -328,7 +327,7 @@ def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
 
 
 def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
-    """Proposed actions in memory of their own, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput``."""
+    """Copy of proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput``."""
     actions = numbers_of(rules, actions, n)
     size = np.abs(actions)
     if not (size > 1.0).any():
@@ -339,14 +338,14 @@ def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
 
 
 def begin(script: Any, alert: State, body: int) -> Any:
-    """Memory of a script for new episodes. Raises ``AgentFailed`` if the script raises something."""
+    """Memory of a script for new episodes. Raises ``AgentFailed`` if the script fails."""
     return _remembered(script, _called(script, "begin", alert, body), alert.n, body)
 
 
 def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
     """Commands of a script, [n] m/s2, and its new memory.
 
-    Raises ``AgentFailed`` if the script raises something, or for commands that are no numbers or beyond a capacity.
+    Raises ``AgentFailed`` if the script fails, or if its commands are not numbers or exceed a capacity.
     """
     name = getattr(script, "name", type(script).__name__)
     answer = _called(script, "act", state, memory, body)
@@ -373,7 +372,7 @@ def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, An
 
 
 def _remembered(script: Any, memory: Any, n: int, body: int) -> Any:
-    """Memory that cannot be changed in place, because plays share it; somebody else's is checked."""
+    """Memory of a script. A user's memory is checked, and made read-only because simulations share it."""
     if type(script).__module__.startswith("ethbrake_marl."):
         return memory
 
@@ -393,7 +392,7 @@ def _remembered(script: Any, memory: Any, n: int, body: int) -> Any:
 
 
 def _called(script: Any, method: str, state: State, *given: Any) -> Any:
-    """Call a method of a script; somebody else's cannot change the state by mistake, and its errors name it."""
+    """Call a method of a script. A user's script gets a read-only state, and its errors become ``AgentFailed``."""
     if not type(script).__module__.startswith("ethbrake_marl."):
         state = state.read_only()
     try:
@@ -414,7 +413,6 @@ def _check_actions(rules: Rules, actions: Floats) -> None:
 
 
 def failure(state: State, row: int, start_s: float, until_s: float) -> PhysicsError:
-    """Error for a world in which a check of the physics failed: a defect of this package."""
     number = int(state.clock[row, NUMBER])
     reason = f"a check of the physics failed between {start_s:g} s and {until_s:g} s"
     return PhysicsError({row if number < 0 else number: reason})

@@ -1,10 +1,10 @@
-"""Terms: named amounts of a step, which can be rewarded, reported, or be components of a vector reward.
+"""Terms: named amounts of a step that can be rewarded, reported, or be components of a vector reward.
 
-A term is a function ``term(before, step, after)`` of two states and what the step did (``State``, ``Step``). It returns
-one number per world, [n], or per vehicle, [n, N]. Built-in terms, here for a vehicle in one step:
+A term is a function ``term(before, step, after)`` of two states and the step between them (``State``, ``Step``). It
+returns one number per world, [n], or per vehicle, [n, N]. Built-in terms, here for one vehicle in one step:
 
 ============  ==========================================================================================================
-harm          minus the harm of the line; with an objective, minus the growth of what the vehicle should minimise
+harm          minus the harm of the line; with an objective, minus the increase of what the vehicle should minimise
 collision     minus ``sum k_energy w^2`` over every impact, with the closing speed w
 risk          minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, with the gap
               d and ``TTC = max(d - d_safe, 0) / closing speed``; the first summand is 0 for a pair that does not close
@@ -56,7 +56,7 @@ class Term(NamedTuple):
     meaning: str
 
     def value(self, before: State, step: Step, after: State) -> Floats:
-        """Value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns something else."""
+        """Value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns anything else."""
         what, given = f"term {self.name!r}", (before.read_only(), step, after.read_only())
         value = called(what, self.function, given, (after.n,), (after.n, after.vehicles))
         running = ~before.ended
@@ -66,15 +66,15 @@ class Term(NamedTuple):
 
 
 def register_term(name: str, function: TermFunction, *, unit: str = "1") -> None:
-    """Register a term: rewards can weigh it and evaluations can report it. Entry points: ``ethbrake_marl.terms``.
+    """Register a term, which rewards can weigh and evaluations can report. Entry points: ``ethbrake_marl.terms``.
 
-    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring,
-    which says what the term means.
+    The docstring of ``function`` describes the term. Raises ``AlreadyExists`` for a name in use, and ``InvalidInput``
+    for a bad name or a missing docstring.
 
     Args:
         name: 1 to 64 characters ``a-z``, ``0-9``, ``_``, beginning with a letter, not ending in ``_`` and a number.
         function: ``function(before, step, after)`` returns [n] or [n, N].
-        unit: of the value.
+        unit: unit of the value.
 
     """
     form = "a-z, 0-9 and _, beginning with a letter and not ending in _ and a number"
@@ -101,7 +101,7 @@ BUILT_IN = {  # name -> (unit, meaning)
 
 
 def collision(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Term collision, [n]; ``params`` are ``RewardParams``. Another physics brings its own."""
+    """Term collision with exact impacts, [n]; ``params`` are ``RewardParams``."""
     check_exact(before, "the sum of the term collision")
     if isinstance(params.k_energy, float):
         return -params.k_energy * step.total_harm
@@ -109,13 +109,12 @@ def collision(params: Any, before: State, step: Step, after: State) -> Floats:
 
 
 def pair_energies(params: Any, vehicles: int) -> Floats:
-    """``k_energy`` of every pair, [N + 1]; the obstacle has that of the first pair of vehicles."""
+    """``k_energy`` of every pair, [N + 1]; the obstacle's is that of the first pair of vehicles."""
     each = params.k_energy if isinstance(params.k_energy, tuple) else (params.k_energy,) * (vehicles - 1)
     return np.array([each[0], *each, 0.0])
 
 
 def jerk(before: State, step: Step, after: State) -> Floats:
-    """Term jerk, [n, N]."""
     rate = (after.forces_mps2 - before.forces_mps2) / step.time_step_s
     return -rate * rate
 
@@ -137,8 +136,8 @@ def risk(params: Any, before: State, step: Step, after: State) -> Floats:
 def potential(rules: Rules, state: State) -> Floats:
     """Minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
 
-    Each learner tries nine shares of its capacity, front to rear (several learners: twice); all others brake fully. The
-    harm is what the reward counts. Nothing follows the end of an episode, whose last step has counted what still moves.
+    Each learner tries nine shares of its braking capacity, front to rear (several learners: twice); all others brake
+    fully. Harm is counted as in the reward. The potential is 0 once an episode has ended.
     """
     learners = rules.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
@@ -151,7 +150,7 @@ def potential(rules: Rules, state: State) -> Floats:
 
 
 class Shaping(NamedTuple):
-    """The term shaping. Its memory in a state is the potential, [n], which is 0 at rest and at the horizon."""
+    """The term shaping. Its memory is the potential of the state, [n]."""
 
     rules: Rules
     discount: float
@@ -160,7 +159,7 @@ class Shaping(NamedTuple):
         return potential(self.rules, state)
 
     def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
-        """Value, [n, N], and new memory, [n]."""
+        """Value of the term, [n, N], and the new memory, [n]."""
         new = potential(self.rules, after)
         value = np.zeros((after.n, after.vehicles))
         value[:, self.rules.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
@@ -168,12 +167,12 @@ class Shaping(NamedTuple):
 
 
 def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
-    """Term harm of vehicles with objectives, [n, N]."""
+    """Term harm for vehicles with objectives, [n, N]."""
     return -amounts(objectives, before, after, count)
 
 
 def component(name: str, count: str) -> TermFunction:
-    """Term ``harm_K``, ``pair_J_K`` or ``obstacle``, [n]."""
+    """Function of the component ``harm_K``, ``pair_J_K`` or ``obstacle``, which returns [n]."""
     number = int(name.rpartition("_")[2]) if "_" in name else 1
     return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, count)
 
@@ -192,7 +191,7 @@ def _grown(amounts_of: Callable[..., Floats], count: str, before: State, after: 
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:
-    """Components of a vector reward: ``vehicles`` stands for the harm of each vehicle.
+    """Names of the components of a vector reward; ``vehicles`` stands for ``harm_1`` to ``harm_N``.
 
     ``counted`` are the terms of the reward, which can be components too. Raises ``InvalidInput`` for an empty list or a
     repeated name, ``UnknownName`` for an unknown one.

@@ -1,4 +1,4 @@
-"""Compare two results on the same worlds: how the harm of each team differs, paired by world."""
+"""Compare two results on the same worlds: the difference in harm for each team, paired by world."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SAME = {  # what two results must have in common -> what differs otherwise
 
 @dataclass(frozen=True)
 class Comparison:
-    """Second result minus first, for every team that both have."""
+    """Second result minus first, for every team in both."""
 
     differences: Mapping[str, Mapping[str, Estimate]]  # team -> count of harm -> difference of the means (m2/s2)
     unpaired_because: str  # why worlds cannot be paired; "": intervals are paired
@@ -70,7 +70,7 @@ class Comparison:
 
 
 def compare_results(first: Saved | Result, second: Saved | Result) -> Comparison:
-    """Return how harm differs, team by team: paired where both results have rows per world, from errors otherwise.
+    """Return the difference in harm, team by team: paired by world if both results have rows per world.
 
     Raises ``InvalidInput`` for results of different worlds or scenarios, and without a common team.
     """

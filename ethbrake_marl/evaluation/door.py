@@ -1,4 +1,4 @@
-"""The door to evaluation: scenarios, agents and measures by their names."""
+"""``eb.evaluate``: evaluation with scenarios, agents and measures by name."""
 
 from __future__ import annotations
 
@@ -30,26 +30,26 @@ def evaluate(
     jobs: int = 1,
     on_done: Callable[[int], None] | None = None,
 ) -> Result:
-    """Let agents drive the same worlds, each once.
+    """Let agents drive the same worlds, each agent once in every world.
 
-    ``eb.evaluate("paper-random", "full_brake,ppo+step")`` is the shortest form. The result is the same, to the last
-    bit, for any number of processes.
+    ``eb.evaluate("paper-random", "full_brake,ppo+step")`` is the shortest form. Results have the same bits for any
+    number of processes.
 
     Args:
-        worlds: a scenario, whose evaluation list is driven (a shipped name, the path of a file, the content of one, or
-            a ``Scenario``); or worlds at the alert, which then need ``scenario``.
-        agents: names, or a mapping from names of your own to names, agents, or mappings from vehicles to agents:
+        worlds: a scenario, whose evaluation list is used (a shipped name, the path or content of a file, or a
+            ``Scenario``); or worlds at the alert, which also need ``scenario``.
+        agents: names, or a mapping from your own names to names, agents, or mappings from vehicles to agents:
             ``{"mine": agent, "both": {"vehicle_2": agent, "vehicle_3": "coast"}}``.
-        scenario: of the worlds.
+        scenario: scenario of the worlds.
         episodes: number of worlds of the list; None: 10,000.
-        seed: of the list; None: 7.
+        seed: seed of the list; None: 7.
         harm_count: what optimising agents minimise: ``first``, as in the paper, ``total``, or ``honest``, under which
             pushing hardly pays (``episode.counts``).
-        measures: names of measures beside the usual ones (``evaluation.named_measures``).
+        measures: names of further measures (``evaluation.named_measures``).
         jobs: number of processes.
-        on_done: called with the number of worlds that have been driven so far.
+        on_done: function that is called with the number of worlds driven so far.
 
-    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for anything else that is wrong.
+    Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for any other mistake.
 
     >>> import ethbrake_marl as eb
     >>> result = eb.evaluate("paper-random", "full_brake", episodes=3)

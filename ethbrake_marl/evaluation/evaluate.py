@@ -1,6 +1,6 @@
-"""Evaluate teams: every team drives every world once; measures turn episodes into columns.
+"""Evaluate teams: every team drives every world once, and measures turn episodes into columns.
 
-The worlds are fixed in advance. Counting the episodes that finish first would favour short ones, often crashes.
+The worlds are fixed in advance. Counting the episodes that finish first would favour short ones, often with impacts.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Columns = dict[str, Values]
 
 @dataclass(frozen=True)
 class Result:
-    """What teams did in the same worlds: columns [n] of every team, and of the worlds. Row k is always the same world.
+    """Results of teams in the same worlds: columns [n] of every team, and of the worlds. Row k is world k for all.
 
     >>> import ethbrake_marl as eb
     >>> result = eb.evaluate("paper-random", "full_brake,coast", episodes=3)
@@ -73,7 +73,7 @@ class Result:
         return team in self.columns
 
     def take(self, rows: Any) -> Result:
-        """Return the result in some of its worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
+        """Return the result restricted to some worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
         columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
         worlds = {name: each[rows] for name, each in self.worlds.items()}
         if not len(worlds["world"]):
@@ -83,7 +83,7 @@ class Result:
         return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
-        """Return a table with one row per team and world: name of a column -> values. A missing number is NaN."""
+        """Return a table with one row per team and world: column name -> values. Missing numbers are NaN."""
         names = list(dict.fromkeys(name for own in self.columns.values() for name in own))
         table: Columns = {"agent": np.repeat([*self.columns], self.n)}
         table |= {name: np.tile(each, len(self.columns)) for name, each in self.worlds.items()}
@@ -111,19 +111,19 @@ def evaluate(
     about: Mapping[str, Any] | None = None,
     on_done: Callable[[int], None] | None = None,
 ) -> Result:
-    """Let every team drive every world once. The result is the same, to the last bit, for any number of processes.
+    """Let every team drive every world once. Results have the same bits for any number of processes.
 
     Args:
-        worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State``, whose recordings are not known.
+        worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State`` (without recordings).
         agents: name in tables -> team, which drives all learners of the game.
         game: game of the worlds' scenario.
-        measures: beside the usual ones, for instance ``measures_called("pushed_m,injury")``.
+        measures: further measures, for instance ``measures_called("pushed_m,injury")``.
         jobs: number of processes.
-        about: what else tables and files should say (``identity.about_scenario``).
-        on_done: called with the number of worlds that all teams have driven so far.
+        about: further entries for tables and files (``identity.about_scenario``).
+        on_done: function that is called with the number of worlds that all teams have driven so far.
 
-    Raises ``InvalidInput`` for worlds that are not at the alert or do not fit the game, for a team that does not fit,
-    for measures whose names clash, and for bad commands of an agent; ``PhysicsError`` if a check of the physics fails.
+    Raises ``InvalidInput`` for worlds that are not at the alert, for worlds or a team that do not fit the game, for
+    measures with the same name, and for bad commands of an agent; ``PhysicsError`` if a check of the physics fails.
 
     """
     if jobs is not None:
@@ -182,7 +182,6 @@ def evaluate(
 def drive_chunk(
     alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]
 ) -> dict[str, Columns]:
-    """Return the columns of every team in these worlds."""
     return {name: _driven(alert, name, team, game, measures) for name, team in agents.items()}
 
 
@@ -214,7 +213,7 @@ def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    """Join the columns of all chunks; one that is missing in a chunk is missing."""
+    """Join the columns of all chunks. A column that a chunk lacks is left out."""
     return {
         name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
     }
@@ -223,7 +222,8 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 def hidden_from(alert: State, game: Game) -> Bools:
     """Return whether the V2X channel hides something from a learner at its first decision, [n].
 
-    It does not know all of a vehicle, or that one reacts later than its messages say, because it waits itself.
+    That is: the learner does not know everything about another vehicle, or a vehicle reacts later than its messages
+    say, because it waits for messages itself.
     """
     late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
     for i in game.rules.learners.tolist():
@@ -232,12 +232,11 @@ def hidden_from(alert: State, game: Game) -> Bools:
 
 
 def known_by(team: Team) -> str:
-    """Return what a team has to know, as one text: ``messages + true model``."""
+    """Return what a team needs to know, as one text such as ``messages + true model``."""
     return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _known(team).values())
 
 
 def _known(team: Team) -> dict[str, str]:
-    """Return vehicle, or ``shield`` -> what it has to know."""
     each = {f"vehicle_{body}": getattr(agent, "knows", UNSTATED) for body, agent in team.drivers.items()}
     return each if team.shield is None else {**each, "shield": getattr(team.shield, "knows", MODEL)}
 

@@ -1,7 +1,4 @@
-"""Identity of a result: digests of worlds, scenario, physics and policies, and versions of software.
-
-Results can be compared if worlds and scenarios are the same. Other physics or versions are reported.
-"""
+"""Identity of a result: digests of worlds, scenario, physics and policies, and versions of software."""
 
 from __future__ import annotations
 
@@ -24,7 +21,7 @@ WORDS = ("name", "title", "description", "source")  # keys of a scenario that do
 
 
 def worlds_sha256(worlds: State) -> str:
-    """Return the SHA-256 of worlds at the alert: all their arrays, little-endian, without the push, which is 0."""
+    """Return the SHA-256 of worlds at the alert, from all arrays, little-endian, without ``line`` from PUSHED on."""
     digest = hashlib.sha256()
     for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
         digest.update(f"{array.shape}".encode())
@@ -33,7 +30,7 @@ def worlds_sha256(worlds: State) -> str:
 
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
-    """Return what a result should say of a scenario and the seed of its worlds; for ``evaluate(about=...)``."""
+    """Return the entries about a scenario, and the seed of its worlds, for ``evaluate(about=...)``."""
     content = json.dumps(scenario.content(without=WORDS), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
     about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
@@ -41,9 +38,9 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return name -> version of Python and of every package that affects a result, those of extensions included.
+    """Return name -> version of Python and of every package that affects a result, including extensions.
 
-    With them the SHA-256 of each Python file of the user that this process ran.
+    It also has the SHA-256 of each Python file of the user that this process ran.
     """
     own = {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
     return own | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}

@@ -1,7 +1,7 @@
-"""Measures of injury: injuries expected if the same impacts happened in 1,000 lines of vehicles.
+"""Measures ``injury_CURVE``: expected injuries if the same impacts happened in 1,000 lines of vehicles.
 
-``injury_CURVE`` sums over the vehicles, each with its largest change of speed; with the number of a vehicle: its own.
-A vehicle without an impact has no injury, even if it is pushed.
+The sum over the vehicles, each with its largest change of speed; ``injury_CURVE_2`` is that of Vehicle 2 alone. A
+vehicle without an impact has no injury, even if it is pushed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ethbrake_marl.registry import Part
 
 
 class Injuries:
-    """Keeps each vehicle's largest change of speed by one impact, at its front and rear."""
+    """Watches each vehicle's largest change of speed by one impact, at its front and rear."""
 
     def __init__(self, curve: str, game: Game, alert: State) -> None:
         self.curve, self.changes = curve, np.zeros((alert.n, 2, alert.vehicles))
@@ -28,7 +28,7 @@ class Injuries:
         self.changes = np.maximum(self.changes, speed_changes(before, after))
 
     def result(self, last: State) -> Given:
-        """Return the injuries of the line and of each vehicle, [n]."""
+        """Return the injuries of the line, and of each vehicle, [n]."""
         each = injured(self.changes, self.curve)
         return {"": each.sum(axis=1), **{f"{i + 1}": column for i, column in enumerate(each.T)}}
 

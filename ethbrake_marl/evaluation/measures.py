@@ -6,12 +6,12 @@ ending -> [n] gives the columns ``NAME_ending``, and ``NAME`` for the ending ``"
 finite numbers, truth values (tables show how often they are true) or texts.
 
 =======================================  ===============================================================================
-of a state                               what it is (``episode.state.State``)
+property of a state                      meaning (``episode.state.State``)
 =======================================  ===============================================================================
 ``speeds_mps``, ``gaps_m``               [n, N] m/s; [n, N - 1] m, front to rear
 ``obstacle_gap_m``                       [n] m; infinite without an obstacle
 ``harm("first")``, ``harm("total")``     [n] m2/s2 of the line so far: first impact of each pair, all impacts
-``borne_harm(...)``                      [n, N] m2/s2, what each vehicle bears of it
+``borne_harm(...)``                      [n, N] m2/s2, each vehicle's share of it
 ``pair_harm(...)``                       [n, N - 1] m2/s2, of each pair
 ``collided``, ``pair_hit``               [n]; [n, N - 1] whether there was an impact
 ``commands_mps2``, ``forces_mps2``       [n, N] m/s2: last commands; what brakes and engines cause
@@ -23,10 +23,10 @@ of a state                               what it is (``episode.state.State``)
 ``car``, ``line``                        [n, rows, N + 1] all parameters, all that changes (``motion.layout``)
 =======================================  ===============================================================================
 
-A ``Watch`` also sees what each step did (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line,
-[n] m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``safe_end``, [n].
+A ``Watch`` also sees each step (``episode.step.Step``): ``first_impact_harm`` and ``total_harm`` of the line, [n]
+m2/s2; ``reward`` [n, N] and its ``terms``; ``terminated``, ``truncated`` and ``safe_end``, [n].
 
-Every evaluation has DEFAULT. Other measures, which cost something, are named: ``evaluation.named_measures``.
+Every evaluation has the measures in DEFAULT. Costly ones are chosen by name: ``evaluation.named_measures``.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ class Watch(Protocol):
     """A measure that sees every state of the episodes."""
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Look at what happened between two states; ``step`` None: between the alert and the first decision."""
+        """Process one step. ``step`` is None from the alert to the first decision."""
 
     def result(self, last: State) -> Given:
-        """Return the value, as a measure does."""
+        """Return the value, in the form that a measure returns."""
 
 
 class Statistic(NamedTuple):
-    """How tables and JSON show a column: its mean, the share of worlds where it is true, or compared with a baseline.
+    """How tables and JSON show a column: as a mean, as the share of worlds in which it is true, or against a baseline.
 
     ``difference`` is the mean difference, ``decrease`` is 1 - (mean) / (mean of the baseline).
     """
@@ -85,7 +85,7 @@ class Measure(NamedTuple):
 
 
 def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
-    """Return the columns of a measure: name -> [n]. Raises ``InvalidInput`` for a value of another shape or kind."""
+    """Return the columns of a measure's value: name -> [n]. Raises ``InvalidInput`` for a wrong shape or type."""
     if given is None:
         return {}
     parts: Mapping[str, Any] = given if isinstance(given, Mapping) else {"": given}
@@ -115,7 +115,7 @@ def collided(game: Game, alert: State, last: State) -> Given:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> Given:
-    """Return the harm of the line, and what each vehicle bears of it; no honest cost where impacts are not exact."""
+    """Return harm of the line, and of each vehicle; None for the honest cost if impacts are not exact."""
     if count == "honest" and PHYSICS in last.memories:
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
@@ -206,7 +206,7 @@ DEFAULT = (
 
 @contextmanager
 def naming(measure: Measure) -> Iterator[None]:
-    """If the block fails, raise ``InvalidInput``, which names the measure."""
+    """Turn an error in the block into an ``InvalidInput`` that names the measure."""
     try:
         yield
     except EthBrakeError:

@@ -39,8 +39,8 @@ def register_measure(
 ) -> None:
     """Register a measure, for ``measures_called``. Entry points: ``ethbrake_marl.measures``.
 
-    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring,
-    which says what the measure means.
+    The docstring of the function describes the measure. Raises ``AlreadyExists`` for a name in use, and
+    ``InvalidInput`` for a bad name or a missing docstring.
 
     Args:
         name: 1 to 64 characters ``a-z``, ``0-9``, ``_``, beginning with a letter, not ending in ``_`` and a number, nor
@@ -48,7 +48,7 @@ def register_measure(
         of: ``of(game, alert, last)`` returns [n] or [n, N].
         unit: unit of the value.
         shown: how tables show it; by default the mean, or the share of worlds in which it is true.
-        watch: in place of ``of``: ``watch(game, alert)`` returns a ``Watch``, which sees every step.
+        watch: instead of ``of``: ``watch(game, alert)`` returns a ``Watch``, which sees every step.
 
     >>> import ethbrake_marl as eb
     >>> def rear_speed(game, alert, last):
@@ -68,7 +68,6 @@ def _checked(
     shown: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> Measure:
-    """Return the measure that ``register_measure`` describes. Raises the same errors."""
     right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
     if not isinstance(name, str) or re.fullmatch(right, name) is None:
         raise InvalidInput(
@@ -109,9 +108,9 @@ def split_names(names: str) -> list[str]:
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
-    """Return the measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
+    """Return the measures, summed terms and objectives with these names, each once. ``FILE.py:NAME`` runs the file.
 
-    A measure of a file is called ``NAME``, or ``FILE.py:NAME`` if another one of ``names`` is called ``NAME``. Raises
+    A measure from a file is called ``NAME``, or ``FILE.py:NAME`` if another one is called ``NAME``. Raises
     ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
     """
     if not isinstance(names, Iterable):
@@ -124,7 +123,6 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
 
 
 def _in_full(name: str, measure: Measure) -> Measure:
-    """Call a measure of a file by its full name ``FILE.py:NAME``."""
     file = name.removesuffix(f":{measure.name}")
     if file == name:
         return measure
@@ -178,7 +176,7 @@ def _summed(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """The term where it is 0 without a shield, so that a table can compare both. Rewards refuse it."""
+    """Term intervention, but 0 without a shield, so that a table can compare both."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)
@@ -192,13 +190,13 @@ def _objective(name: str, game: Game, alert: State, last: State) -> Given:
 
 
 class SummedTerm:
-    """Adds up a term of a reward over all steps."""
+    """Sums a term of a reward over all steps."""
 
     def __init__(self, term: TermFunction, game: Game, alert: State) -> None:
         self.term, self.sum = term, np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the step's term, 0 in episodes that had ended."""
+        """Add the term of one step, 0 in episodes that ended before."""
         if step is not None:
             value = self.term(before, step, after)
             ended = before.ended if value.ndim == 1 else before.ended[:, np.newaxis]

@@ -1,4 +1,4 @@
-"""Measures of what harm does not count: pushes, driving before the first impact, and motion at the end."""
+"""Measures of conduct without harm: pushes, driving before the first impact, and motion at the end."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HARD_MPS2 = 1.0  # a command above this is hard driving
 
 
 def own_way_m(alert: State, body: int, until_s: float) -> Floats:
-    """Return the way of a vehicle until ``until_s``, if nobody touches it, [n] m."""
+    """Return the distance that a vehicle travels until ``until_s`` if nobody touches it, [n] m."""
     check_exact(alert, "pushed_m")
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
@@ -28,16 +28,16 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 def with_post(state: State) -> Floats:
-    """Return a copy of the lines. Where there is no obstacle it has a far post, whose gap shows Vehicle 1's way."""
+    """Return a copy of the lines. Without an obstacle it has a far post, whose gap shows how far Vehicle 1 moves."""
     line = state.line.copy()
     line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
     return line
 
 
 class PushedAway:
-    """Way of a vehicle minus the way that it would drive until the horizon if nobody touched it.
+    """Distance that a vehicle travels, minus the distance until the horizon if nobody touched it.
 
-    Negative if the vehicle ends short of that place, for instance because an obstacle threw it back.
+    It is negative if the vehicle ends nearer, for instance because an obstacle threw it back.
     """
 
     def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
@@ -45,7 +45,7 @@ class PushedAway:
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the way of Vehicle 1. Where there is no obstacle, the step is driven again with a post."""
+        """Add the distance of Vehicle 1. Without an obstacle, the step is simulated again with a post."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         times = np.ascontiguousarray(before.time_s), np.ascontiguousarray(after.time_s)
@@ -53,7 +53,7 @@ class PushedAway:
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> Given:
-        """Return the metres of each vehicle, and whether those of Vehicle 1 are more than 5."""
+        """Return the distance of each vehicle (m), and whether that of Vehicle 1 is above ``PUSHED_FAR_M``."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
             f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - own
@@ -82,7 +82,7 @@ def pushed_mps(game: Game, alert: State, last: State) -> Given:
 
 
 class DroveTowards:
-    """Keeps the time until the first impact of each line, and how long a positive command was in force."""
+    """Watches the time until each line's first impact, and the time with a positive command."""
 
     def __init__(self, game: Game, alert: State) -> None:
         self.learners, self.time_s = game.rules.learners, np.zeros(alert.n)

@@ -1,6 +1,6 @@
 """Record one episode with closely spaced samples, for figures and viewers.
 
-The motion between two decisions is computed again, from the state at the first one.
+The motion between two decisions is computed again from the state at the first one.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SAMPLE_S = 0.02  # usual time between two samples
 
 @dataclass(frozen=True)
 class Impacts:
-    """Impacts of one episode in order of time; several of a pair between two samples are one row."""
+    """Impacts of one episode in order of time. Several impacts of a pair between two samples are one row."""
 
     time_s: Floats  # [m] of the first
     pair: Ints  # [m] 0: Vehicle 1 with the obstacle, p: vehicle_p and the one behind it
@@ -49,7 +49,7 @@ class Impacts:
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """Motion of one world at k times from the alert to the end of its episode.
+    """Motion of one world at k times, from the alert to the end of its episode.
 
     >>> import ethbrake_marl as eb
     >>> scenario, game = eb.open_game("paper-random")
@@ -95,8 +95,8 @@ class EpisodeRecord:
 def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> EpisodeRecord:
     """Let a team drive one world exactly as in ``evaluate``, and record the motion.
 
-    Samples are at most ``sample_s`` apart, and at every decision. Raises ``InvalidInput`` unless there is exactly one
-    world at the alert, and for a ``sample_s`` that is not finite and above 0.
+    Samples are at every decision, and at most ``sample_s`` apart. Raises ``InvalidInput`` unless there is exactly one
+    world at the alert, and ``sample_s`` is finite and above 0.
     """
     if world.n != 1 or world.time_s[0] != 0.0:
         raise InvalidInput(
@@ -109,14 +109,13 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
 
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
-    """Record each of several worlds, which a team drives together; see ``record_episode``."""
+    """Record several worlds, which a team drives together (``record_episode``)."""
     check_exact(worlds, "a record of the motion between decisions")
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_recorded([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
 
 
 def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> EpisodeRecord:
-    """Return the record of one world from its states at the alert, at all decisions and at the end."""
     until = 2 + sum(not state.ended[0] for state in states[1:])
     states, world = states[:until], states[0]
     pieces = [_between(before, after, sample_s) for before, after in pairwise(states)]
@@ -139,7 +138,7 @@ def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> E
 def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
     """Return k pieces of the motion: times [k, 2], lines [k, 2, ...] at both ends, commands [k, N + 1].
 
-    Without an obstacle, a post measures Vehicle 1's way.
+    Without an obstacle, a post far ahead shows how far Vehicle 1 has moved.
     """
     start, end = float(before.time_s[0]), float(after.time_s[0])
     count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
@@ -153,7 +152,7 @@ def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floa
 
 
 def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
-    """Return the impacts. Pieces of the motion with impacts are driven again, for the time of the first."""
+    """Return the impacts. Pieces with impacts are simulated again, for the time of the first one."""
     rows = [FIRST, TOTAL, COUNT]
     made = lines[:, 1, rows] - lines[:, 0, rows]
     piece, pair = np.nonzero(made[:, 2])

@@ -1,4 +1,4 @@
-"""Results in files: ``results.json``, one object per team, and a table with one row per team and world."""
+"""Results in files: ``results.json`` with one object per team, and a table with one row per team and world."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Rows = Literal["csv", "parquet"]
 
 
 class Saved(NamedTuple):
-    """Content of ``results.json`` and of the table beside it."""
+    """Content of ``results.json`` and of its table."""
 
     path: Path
     agents: Mapping[str, Mapping[str, Any]]  # team -> its object
@@ -38,7 +38,7 @@ class Saved(NamedTuple):
 
     @property
     def about(self) -> Mapping[str, Any]:
-        """What is the same for all teams, from the object of the first."""
+        """Entries that are the same for all teams."""
         return next(iter(self.agents.values()))
 
     def estimate(self, agent: str, key: str) -> Estimate:
@@ -58,7 +58,7 @@ def write_results(
 ) -> list[Path]:
     """Write ``FOLDER/results.json`` and, with ``rows``, ``FOLDER/worlds.csv`` or ``.parquet``; return their paths.
 
-    ``name``: other name of the first file. Raises ``AlreadyExists`` if a file exists and ``force`` is false, and
+    ``name`` is another name for the first file. Raises ``AlreadyExists`` if a file exists, unless ``force``, and
     ``MissingExtra`` for Parquet without pyarrow.
     """
     target, objects = Path(folder).expanduser(), table.to_json()
@@ -76,9 +76,9 @@ def write_results(
 
 
 def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None:
-    """Write one row per team and world as CSV or Parquet, as the ending of ``path`` says.
+    """Write one row per team and world as CSV or Parquet, depending on the ending of ``path``.
 
-    Truth values are 1 and 0, a missing value is empty. Raises the errors of ``write_results``.
+    Truth values are 1 and 0, missing values are empty. Raises the errors of ``write_results``.
     """
     path, table = Path(path).expanduser(), result.arrays()
     plain = {name: each.astype(np.int64) if each.dtype == np.bool_ else each for name, each in table.items()}
@@ -105,9 +105,9 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
 
 
 def read_result(path: str | Path) -> Saved:
-    """Read ``results.json`` and the rows beside it, if there are any.
+    """Read ``results.json``, and its table if there is one.
 
-    Raises ``InvalidInput`` for another file, and for one that was edited or damaged.
+    Raises ``InvalidInput`` for any other file, and for one that was edited or damaged.
     """
     file = Path(path).expanduser()
     data = read_plain(file, MOST_BYTES)
@@ -130,7 +130,6 @@ def _digest(objects: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _beside(file: Path, beside: Mapping[str, str] | None) -> tuple[Columns | None, str]:
-    """Return the rows per world, or None and why there are none."""
     if beside is None:
         return None, f"{file} was written without a file that has one row per world; evaluate again with --per-world"
     rows = file.parent / beside["file"]

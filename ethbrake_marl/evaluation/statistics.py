@@ -1,23 +1,23 @@
 """Means, rates and paired comparisons over worlds, each with its 95 % interval.
 
-Worlds are independent draws, and every agent drives the same worlds, so comparisons are paired by world: that removes
-the spread between easy and hard worlds. Sums are exactly rounded, so the order of the worlds does not matter.
+Worlds are independent draws. Every agent drives the same worlds, so comparisons are paired by world, which removes the
+spread between easy and hard worlds. Sums are exactly rounded, so the order of the worlds does not matter.
 
 Worlds of one recording resemble each other. With ``clusters``, the name of each world's recording, [n], only recordings
 are independent. All estimates then come from each recording's sums, and are ratios ``r = sum x / sum y`` (a mean: y
 counts worlds). Recording g has the share ``h_g = y_g / sum y`` and the influence ``d_g = (x_g - r y_g) / sum y``:
 
-- standard error: the jackknife, ``sqrt((G - 1) / G sum e_g^2)``, where ``e_g = d_g / (1 - h_g)`` is the change of r
-  if recording g is left out;
+- standard error: the jackknife, ``sqrt((G - 1) / G sum e_g^2)``, where ``e_g = d_g / (1 - h_g)`` is the change of r if
+  recording g is left out;
 - degrees of freedom: Satterthwaite's, ``tr(K)^2 / tr(K^2)``, where K is the covariance of the ``e_g`` if the deviation
   of each recording is proportional to its share (Bell and McCaffrey 2002; Hansen 2024). They are G - 1 for recordings
   of equal size, and fewer otherwise;
 - skewness ``A = sum e^3 / (sum e^2)^1.5``: Hall's (1992) transformation ``3 / A (cbrt(1 + A (t - A / 6)) - 1)`` of the
   quantile t, where that makes the interval longer.
 
-In simulations these intervals cover the truth in 91 to 99 % with 2 to 66 unequal recordings (plain t intervals: 75 to
-96 %). They cover less if no recording shows what a few others would: where 4 of 66 recordings have nearly all harm, 98
-% with 66 recordings drawn from them, but 83 % with 20 and 73 % with 10.
+In simulations these intervals contain the truth in 91 to 99 % of cases with 2 to 66 unequal recordings (plain t
+intervals: 75 to 96 %). They fail more often if a few recordings have most of the harm: if 4 of 66 recordings have
+nearly all, they contain the truth in 98 % with 66 recordings drawn from them, 83 % with 20 and 73 % with 10.
 
 In all functions ``values`` and ``baseline`` have one number per world, [n], for the same worlds in the same order.
 """
@@ -44,8 +44,8 @@ Clusters = NDArray[Any] | None
 def mean(values: Floats, clusters: Clusters = None) -> Estimate:
     """Return the mean with its t interval, ``mean -+ t s / sqrt(n)``.
 
-    If no value is negative, the interval does not go below 0. If all values are 0, there is no interval: zeros show
-    that more is rare, but not how much more it can be.
+    If no value is negative, the interval does not go below 0. If all values are 0, there is no interval: zeros do not
+    show how large other values can be.
     """
     estimate = _mean(values, clusters)
     if (values < 0.0).any() or estimate.interval is None:
@@ -76,10 +76,10 @@ def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Est
 def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
     """Return the share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
 
-    The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width
-    ``z sqrt(p (1 - p) / n + z^2 / (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds
-    that would have the same standard error, ``1 + p (1 - p) / error^2``, at most the number of worlds, times
-    ``(z / t)^2`` (Korn and Graubard 1998). If all worlds are alike, it is ``1 / sum h_g^2`` times ``(z / t)^2``.
+    The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width ``z sqrt(p (1 - p) / n + z^2 /
+    (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds with the same standard error, ``1 +
+    p (1 - p) / error^2``, at most the number of worlds, times ``(z / t)^2`` (Korn and Graubard 1998). If all worlds are
+    alike, it is ``1 / sum h_g^2`` times ``(z / t)^2``.
     """
     share, n = int(np.count_nonzero(truths)) / len(truths), float(len(truths))
     error: float | None = sqrt(share * (1.0 - share) / n)
@@ -97,7 +97,7 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
 
 
 def wilson(share: float, count: float) -> tuple[float, float]:
-    """Return Wilson's interval for a share of ``count`` independent draws, neither of which need be whole numbers."""
+    """Return Wilson's interval for a share of ``count`` independent draws (``count`` may be a fraction)."""
     shrink = 1.0 + Z * Z / count
     centre = (share + Z * Z / (2.0 * count)) / shrink
     half = Z / shrink * sqrt(share * (1.0 - share) / count + Z * Z / (4.0 * count * count))
@@ -107,8 +107,8 @@ def wilson(share: float, count: float) -> tuple[float, float]:
 def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
     """Return the difference of two means over different worlds, with Welch's interval.
 
-    Its square error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. No interval if one
-    of the standard errors is not known.
+    Its squared error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. If a standard error
+    is unknown, there is no interval.
     """
     apart = value.value - baseline.value
     if value.error is None or baseline.error is None or not value.freedom or not baseline.freedom:
@@ -129,7 +129,7 @@ def _mean(values: Floats, clusters: Clusters) -> Estimate:
 
 
 def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters) -> Estimate:
-    """Return a ratio with its interval; ``residuals`` [n] are x - r y, and ``weights`` [n] are y."""
+    """Return the ratio ``sum x / sum y`` with its interval, from ``residuals`` x - ratio y and ``weights`` y, [n]."""
     n, whole = len(residuals), fsum(weights)
     if clusters is None:
         if n < 2:
@@ -152,7 +152,7 @@ def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> t
 
 
 def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, float, float] | tuple[None, None, None]:
-    """Return standard error, degrees of freedom and skewness of a ratio from sums [G]; None if one has all weight."""
+    """Return standard error, degrees of freedom and skewness of a ratio from sums [G]; None for a dominant cluster."""
     groups, share = len(residuals), weights / whole
     rest = 1.0 - share
     if groups < 2 or not (rest > LEAST_REST).all():

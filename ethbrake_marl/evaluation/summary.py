@@ -38,7 +38,7 @@ HEAD = {
 
 
 class SummaryTable(list[SummaryRow]):
-    """The table of results, which ``print`` and notebooks show.
+    """The table of results. ``print`` and notebooks show it.
 
     >>> import ethbrake_marl as eb
     >>> table = eb.summarise(eb.evaluate("paper-random", "full_brake,coast", episodes=3))
@@ -66,7 +66,7 @@ class SummaryTable(list[SummaryRow]):
         return sheet.only(k for k, name in enumerate(sheet.names) if name in names).html()
 
     def sheet(self) -> Sheet:
-        """Return the table with all columns that have a heading."""
+        """Return the table for documents: all columns that have a heading."""
         columns = [
             Column(each.heading, key, short=each.short, **_FORMATS.get(each.kind, {}))
             for key, (_, each) in self.shown.items()
@@ -79,7 +79,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal: the first columns with intervals below their values, the others without."""
+        """Return the table for a terminal, with intervals only in the first columns, below their values."""
         sheet, agent = self.sheet(), Column("Agent,\nwhat it knows", text=True)
         columns = [
             replace(each, interval="below" if each.name in FIRST_COLUMNS else "hidden")
@@ -91,7 +91,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
-        """Return the table of measures that have no column of their own, or None."""
+        """Return the table of measures without a column of their own, or None."""
         asked = {
             key: f"{key} ({measure.unit})" if measure.unit and each.kind != "decrease" else key
             for key, (measure, each) in self.shown.items()
@@ -104,7 +104,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Return what a reader should know before believing the numbers: rejected worlds, exploits, hidden values."""
+        """Return warnings for a reader: rejected worlds, exploits, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
             drawn = rejected + self.parameters["count"]
@@ -127,7 +127,7 @@ class SummaryTable(list[SummaryRow]):
         return notes
 
     def meanings(self) -> dict[str, str]:
-        """Return heading -> what the column means; of measures without a column, name -> what it means."""
+        """Return heading -> meaning of the column; for measures without a column, name -> meaning."""
         told = {each.heading: each.meaning or measure.meaning for measure, each in self.shown.values() if each.heading}
         for measure, each in self.shown.values():
             if not each.heading and measure not in DEFAULT:
@@ -139,19 +139,19 @@ class SummaryTable(list[SummaryRow]):
         return f"{self.sheet().markdown()}\n\n{self._below()}\n"
 
     def to_latex(self) -> str:
-        """Return the table as LaTeX ``tabular`` with the rules of the package ``booktabs``."""
+        """Return the table as LaTeX ``tabular`` for the package ``booktabs``."""
         return self.sheet().latex()
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return one object per team, with the digests, versions and ``parameters`` of the result."""
+        """Return one object per team, with the result's digests, versions and ``parameters``."""
         identity = {key: self.parameters[key] for key in IDENTITY if key in self.parameters}
         parameters = {key: value for key, value in self.parameters.items() if key not in IDENTITY}
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
 
     def to_pandas(self) -> Any:
-        """Return a ``DataFrame`` with one row per team; ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
+        """Return a ``DataFrame`` with one row per team. ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
 
-        A missing number is NaN. Raises ``MissingExtra`` without pandas.
+        Missing numbers are NaN. Raises ``MissingExtra`` without pandas.
         """
         with naming_extras():
             from pandas import DataFrame
@@ -173,8 +173,8 @@ class SummaryTable(list[SummaryRow]):
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
     """Return the table of a result, one row per team.
 
-    ``baseline``: team that the others are compared with, paired by world. Without full braking, the default, there are
-    no comparisons; any other team must be in the result (``UnknownName``).
+    ``baseline`` is the team with which the others are compared, paired by world. If the default, full braking, is not
+    in the result, there are no comparisons; another missing team raises ``UnknownName``.
     """
     if baseline != BASELINE and baseline not in result:
         raise unknown_name("baseline", baseline, result)
@@ -203,7 +203,7 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
 
 
 def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
-    """Return key of an estimate -> its column, measure and statistic; comparisons and predictions last."""
+    """Return key of an estimate -> its column, measure and statistic, with comparisons and predictions last."""
     shown: dict[str, tuple[str, Measure, Statistic]] = {}
     kinds = {name: column.dtype.kind for own in result.columns.values() for name, column in own.items()}
     minimised = result.about.get("agent_settings", {}).get("harm_count")
@@ -240,7 +240,7 @@ def _estimate(
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
     """Return one table for each group of worlds, in alphabetical order.
 
-    ``by``: ``scenario`` of a mixture, ``recording``, or a vehicle's type such as ``vehicle_2_type``. Raises
+    ``by`` is ``scenario`` (in a mixture), ``recording``, or a vehicle's type such as ``vehicle_2_type``. Raises
     ``InvalidInput`` if the worlds have no groups, ``UnknownName`` for another name.
     """
     kinds = {name: each for name, each in result.worlds.items() if each.dtype.kind == "U"}
@@ -259,7 +259,7 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
 def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Result]) -> Sheet:
     """Return one table of several evaluations, such as the tests of a standard: a section for each, a row per team.
 
-    A team has passed if no vehicle collides in any world.
+    A team passes a test if there is no impact in any world.
     """
     columns: list[Column | str] = [
         Column("Agent", "agent", text=True), Column("Result", "result"),

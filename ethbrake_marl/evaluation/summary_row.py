@@ -1,4 +1,4 @@
-"""What one team did in all worlds: a row of a table of results."""
+"""The results of one team over all worlds: a row of the table of results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOVING = 0.05  # share of worlds moving at the horizon that is an exploit
 
 @dataclass(frozen=True)
 class SummaryRow:
-    """Results of one team. ``row["total_harm"]`` is an estimate by its key in JSON, None where it is not defined.
+    """Results of one team. ``row["total_harm"]`` is the estimate with this key in JSON, or None if it is not defined.
 
     >>> import ethbrake_marl as eb
     >>> (row,) = eb.summarise(eb.evaluate("paper-random", "full_brake", episodes=3))
@@ -47,7 +47,7 @@ class SummaryRow:
 
     @property
     def exploits(self) -> dict[str, str]:
-        """Damage that harm does not count -> its size in words: ``pushes`` Vehicle 1, ``moving`` at the horizon."""
+        """Damage that is not counted as harm -> its size in words: ``pushes`` Vehicle 1, ``moving`` at the horizon."""
         pushed, moving = self.estimates.get("pushed_m_1"), self.horizon_ends / self.episodes
         words = {}
         if pushed is not None and pushed.value > PUSHED_FAR_M:
@@ -58,11 +58,11 @@ class SummaryRow:
 
     @property
     def marked(self) -> str:
-        """Name of the team, followed by ‡ if it has exploits."""
+        """Name of the team, with ‡ if it has exploits."""
         return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return each estimate with interval, standard error and degrees of freedom, null if unknown."""
+        """Return each estimate with interval, standard error and degrees of freedom; None if unknown."""
         plain: dict[str, Any] = {
             "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
             "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,

@@ -1,4 +1,4 @@
-"""Try a scenario before it is used: what its worlds are like, who knows whom, and what there is to learn."""
+"""Try a scenario before use: what its worlds are like, which vehicles know each other, and what can be learned."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COMPARED = {"full braking": "full_brake", "best constant deceleration": "e_v2x_b
 
 
 class Trial(NamedTuple):
-    """What happens in the first worlds of the evaluation list, in which learners brake fully."""
+    """What happens in the first worlds of the evaluation list, where learners brake fully."""
 
     drawn: Drawn
     early: int  # worlds with an impact before a learner can act
@@ -33,7 +33,7 @@ class Trial(NamedTuple):
 def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
     """Simulate 200 worlds. Raises the errors of scripts, which name vehicle, world and time.
 
-    ``count`` is what ``best constant deceleration`` and ``best known`` minimise.
+    ``count`` is the harm that ``best constant deceleration`` and ``best known`` minimise.
     """
     loaded, game = open_game(scenario)
     drawn = loaded.draw(WORLDS, SEED)

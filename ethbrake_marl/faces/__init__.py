@@ -1,1 +1,1 @@
-"""The game for other libraries: PettingZoo, Gymnasium and its vector environments, Stable-Baselines3."""
+"""The game as an environment of other libraries: PettingZoo, Gymnasium (single and vector), Stable-Baselines3."""

@@ -1,4 +1,4 @@
-"""Actions as callers give them: numbers in [-1, 1], or indices of evenly spaced numbers."""
+"""Actions from callers: numbers in [-1, 1], or indices of evenly spaced numbers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from ethbrake_marl.motion.layout import Floats
 
 
 class Indices(Discrete):
-    """Indices of actions that are evenly spaced from -1 to 1. A model's stored spaces keep this class."""
+    """Discrete space whose indices stand for actions evenly spaced from -1 to 1."""
 
     evenly_spaced = True
 
 
 def action_space(count: int | None) -> Any:
-    """Return the space of one learner: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices."""
+    """Return one learner's action space: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices."""
     if count is None:
         return Box(-1.0, 1.0, (1,), np.float32)
     check_whole_number("actions", count, 2)
@@ -27,10 +27,10 @@ def action_space(count: int | None) -> Any:
 
 
 def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:
-    """Return actions as float64 of ``shape``; axes of length 1 may be missing or added.
+    """Return actions as float64 of ``shape``; the input may lack axes of length 1, or have more.
 
-    Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape, for
-    what is not a number, and for a wrong index. The step refuses numbers outside [-1, 1].
+    Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape or
+    index, and for values that are not numbers. The range [-1, 1] is checked later, in ``Game.step``.
     """
     try:
         given = np.asarray(actions)

@@ -1,4 +1,4 @@
-"""What all interfaces share: a game, the stream of its worlds, the running episodes, and pictures of them."""
+"""What all environments share: a game, the sequence of its worlds, the running episodes, and pictures of them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 class Face:
-    """Base of all interfaces. ``bodies`` [B] are the vehicles that an interface shows."""
+    """Base class of all environments. ``bodies`` [B] are the vehicles whose observations and rewards it returns."""
 
     bodies: Ints
     episode: State = None  # type: ignore[assignment]  # until the first reset
-    begins_again = False  # whether an ended episode is followed by the next one, without a reset
+    begins_again = False  # whether the next episode starts by itself when one has ended
 
     def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
-        """Open a game, whose episodes are truncated after ``most_steps``; None: at the horizon alone."""
+        """Set the game of this environment. An episode is truncated after ``most_steps``; None: only at the horizon."""
         if most_steps is not None:
             check_whole_number("number of steps of an episode", most_steps, 1)
         (self.scenario, self.game), self.render_mode, self._most_steps = opened, render_mode, most_steps
@@ -45,7 +45,6 @@ class Face:
         return self.episode
 
     def _advance(self, actions: Floats) -> tuple[State, Step]:
-        """Advance all worlds by one time step with the learners' actions [n, L]."""
         before = self._begun("step")
         if not self.begins_again and before.clock[0, ENDED] == 1.0:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -58,7 +57,7 @@ class Face:
         return state, step
 
     def _rewards(self, step: Step) -> Floats:
-        """Return the rewards of a step, [n, B], or [n, B, K] where they are vectors."""
+        """Return the rewards of a step, [n, B], or vector rewards, [n, B, K]."""
         rewards: Floats = (step.reward if step.vector is None else step.vector).take(self.bodies - 1, axis=1)
         return rewards
 
@@ -66,15 +65,15 @@ class Face:
         return dictionaries(self.game, state, step, self.stream.seed or 0, self.bodies)
 
     def describe_worlds(self) -> dict[str, Any]:
-        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         return self.stream.describe(self._begun("describe_worlds"))
 
     def describe_world(self) -> dict[str, Any]:
-        """Return the values of ``describe_worlds`` for the first world."""
+        """Return ``describe_worlds`` of the first world, as plain numbers and texts."""
         return {name: column[0].item() for name, column in self.describe_worlds().items()}
 
     def render(self) -> Any:
-        """Return what the render mode promises."""
+        """Return pictures in the form that the render mode defines."""
         return self.renderer.render()
 
     def close(self, **kwargs: Any) -> None:

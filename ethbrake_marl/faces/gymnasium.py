@@ -20,12 +20,11 @@ from ethbrake_marl.worlds.game import AnyScenario
 
 
 class OneLearner(Face):
-    """A game with one learner, and its spaces, for both of Gymnasium's interfaces."""
+    """A game with one learner, for Gymnasium's single and vector environments."""
 
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
     ) -> tuple[Any, Any]:
-        """Open the game; return the spaces of observations and actions."""
         self._open(open_game(*game), render_mode, most_steps)
         self.bodies, self.actions = self.game.rules.learners, actions
         names = [self.scenario.vehicle_names[i - 1] for i in self.bodies]
@@ -37,7 +36,6 @@ class OneLearner(Face):
         return FeatureBox(self.game.views[self.bodies[0]].features), action_space(actions)
 
     def _observe(self, state: State) -> Observations:
-        """Return what the learner observes in every world, [n, F]."""
         seen: Observations = self.game.observe_alike(state, self.bodies)[:, 0]
         return seen
 
@@ -45,8 +43,7 @@ class OneLearner(Face):
 class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v1")``).
 
-    Arguments, actions, ends, infos and options of ``reset`` are those of ``EthBrakeParallelEnv``. There must be exactly
-    one learner.
+    Arguments, actions, ends, infos and options of ``reset`` are the same as in ``EthBrakeParallelEnv``.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random")
@@ -74,7 +71,6 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self.observation_space, self.action_space = self._open_one(game, render_mode, actions, None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
-        """Start an episode; see ``EthBrakeParallelEnv.reset``."""
         state = self._begin(1, seed, options)
         super().reset(seed=self.stream.seed if seed is not None else None)
         return self._observe(state)[0], self._infos(state, None)[0]

@@ -27,23 +27,25 @@ Infos = dict[str, dict[str, Any]]
 class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: ignore[misc]  # PettingZoo has no types
     """The vehicles of a line as agents, ``vehicle_1`` (front) to ``vehicle_N``.
 
-    - Action: each learner's, [1] in [-1, 1]: -1 brakes with full capacity, 0 coasts, +1 drives with full capacity.
-      Actions of scripted vehicles are ignored.
+    - Action of a learner, [1] in [-1, 1]: -1 brakes with full capacity, 0 coasts, +1 drives with full capacity. Actions
+      of scripted vehicles are ignored.
     - End: all episodes end together, *terminated* when every vehicle is at rest and no command would move it,
       *truncated* at the horizon.
-    - ``state()`` is the full state of the line, ``episode`` the ``State`` behind it. Infos: ``episode.infos``.
+    - ``state()`` returns the full state of the line as a vector; ``episode`` is the ``State`` object. Infos:
+      ``episode.infos``.
 
     Args:
-        scenario: a shipped name, the path of a YAML file, the content of one, or a ``Scenario``.
+        scenario: a shipped name, the path or content of a YAML file, or a ``Scenario``.
         render_mode: a mode of ``metadata["render_modes"]``; None: no pictures.
         learners: names of the vehicles that learn; None: the scenario's.
         reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``. Under
             ``harm``, the default, pushing is free; under ``honest`` it hardly pays (``episode.counts``).
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
-        max_cycles: number of steps after which an episode is truncated; None: the horizon alone.
-        actions: None: numbers in [-1, 1]. K >= 2: indices of K evenly spaced ones.
-        reward_vector: None: rewards are numbers. ``vehicles``, or a list of components (``episode.terms``): arrays.
+        max_cycles: number of steps after which an episode is truncated; None: only at the horizon.
+        actions: None: numbers in [-1, 1]. K >= 2: indices of K evenly spaced numbers.
+        reward_vector: None: rewards are numbers. ``vehicles``, or a list of components (``episode.terms``): rewards are
+            arrays.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -99,7 +101,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return self.action_spaces[agent]
 
     def reward_space(self, agent: str) -> Any:
-        """Return the space of an agent's vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
+        """Return an agent's space of vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
         if not self.game.rewarding.components:
             raise InvalidInput("reward_space: rewards are numbers here; make the environment with reward_vector")
         return self.reward_spaces[agent]
@@ -107,7 +109,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observations], Infos]:
-        """Start an episode: the first world of a seed, or the next one.
+        """Start an episode in the first world of ``seed``, or without a seed in the next world.
 
         Options: ``{"initial_state": ...}``, or ``{"listed_world": {"seed": 7, "number": 3}}`` of an evaluation list.
         """
@@ -130,12 +132,12 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         )
 
     def state(self) -> Observations:
-        """Return the full state of the line, in the space ``state_space``."""
+        """Return the full state of the line, [S] float32."""
         whole: Observations = full_state(self._begun("state"), *self._of_state)[0]
         return whole
 
     def _columns(self, actions: Mapping[str, Any]) -> Floats:
-        """Return the learners' actions, [1, L]. Behind a shield, a missing one is NaN."""
+        """Return the learners' actions, [1, L]. With a shield an action may be missing: NaN."""
         if not isinstance(actions, Mapping):
             raise InvalidInput(
                 f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
@@ -165,9 +167,9 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
-    """Return the environment in which agents act in turns, front to rear; settings as in ``parallel_env``.
+    """Return the environment in PettingZoo's AEC form (agents act in turns, front to rear), made by ``parallel_env``.
 
-    It is PettingZoo's conversion: a bad action is refused at the turn of the last agent.
+    A bad action is refused at the turn of the last agent.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.raw_env("paper-random")

@@ -1,4 +1,4 @@
-"""Register the environments in Gymnasium and PettingZoo, without importing the modules of the environments."""
+"""Register the environments with Gymnasium and PettingZoo, without importing them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ENTRIES: dict[str, Any] = {
 
 
 def register_environments() -> None:
-    """Register the environments' ids, once. Raises ``MissingExtra`` for an old PettingZoo."""
+    """Register all ids that are not yet registered. Raises ``MissingExtra`` for an old PettingZoo."""
     import gymnasium  # imported here, because the import takes time
     import pettingzoo
 

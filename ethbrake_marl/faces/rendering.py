@@ -1,4 +1,4 @@
-"""Pictures of a running episode, which extensions draw."""
+"""Pictures of a running episode. Extensions register the classes that draw them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FRAMES_PER_SECOND = 10
 
 
 class Renderer:
-    """Draws the episodes of one environment; this one, of render mode None, draws nothing."""
+    """Draws the episodes of one environment. This base class draws nothing (``render_mode=None``)."""
 
     def began(self, state: State) -> None:
         """Called after a reset."""
@@ -22,17 +22,17 @@ class Renderer:
         """Called after a step."""
 
     def render(self) -> Any:
-        """Return what the render mode promises; of many worlds, a list."""
+        """Return pictures in the form that the render mode defines; for many worlds, a list."""
 
     def close(self) -> None:
-        """Give back windows and files."""
+        """Close windows and files."""
 
 
 MakeRenderer = Callable[[Any], Any]  # environment -> object with the methods of Renderer
 
 
 def register_renderer(mode: str, make: MakeRenderer) -> None:
-    """Register a render mode; ``make`` is called with the environment. Entry points: ``ethbrake_marl.renderers``."""
+    """Register a render mode: ``make(environment)`` returns its renderer. Entry points: ``ethbrake_marl.renderers``."""
     RENDERERS.add(mode, make, lambda other: other is make)
 
 
@@ -45,7 +45,7 @@ def render_metadata() -> dict[str, Any]:
 
 
 def make_renderer(environment: Any, mode: str | None) -> Any:
-    """Return the renderer of a mode. Raises ``InvalidInput``."""
+    """Return the renderer for a render mode. Raises ``InvalidInput`` for an unknown mode."""
     if mode is None:
         return Renderer()
     if mode not in RENDERERS:

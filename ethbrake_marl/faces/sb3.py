@@ -43,16 +43,16 @@ def make_sb3_vec_env(
     render_mode: str | None = None,
     actions: int | None = None,
 ) -> EthBrakeVecEnv:
-    """Return ``n_envs`` worlds for Stable-Baselines3, which are simulated together.
+    """Return an environment for Stable-Baselines3 with ``n_envs`` worlds, simulated together.
 
     ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``.
 
-    - ``seed``: of the stream of worlds; None: a random one.
-    - ``horizon_is_end``: report an episode at the horizon as ended, not as truncated: the harm after the horizon is not
-      counted, so a bootstrapped estimate of it could grow without limit.
+    - ``seed``: seed of the training worlds; None: a random one.
+    - ``horizon_is_end``: report an episode that reaches the horizon as ended, not as truncated. Harm after the horizon
+      is not counted, so a bootstrapped value of it could grow without limit.
     - ``appended``: numbers after each observation: the learner's ``number`` in its world, from 0, or the full
       ``state``.
-    - ``step_infos``: infos at every step, not only at the last one.
+    - ``step_infos``: return infos at every step, not only at the last one.
     - ``render_mode``: ``ansi`` or ``rgb_array``; None: no pictures.
 
     >>> import ethbrake_marl as eb
@@ -65,11 +65,11 @@ def make_sb3_vec_env(
 
 
 class EthBrakeVecEnv(Face, VecEnv):
-    """Row ``k L + l`` is learner l of L (front to rear) in world k; the rows of a world share an episode.
+    """Vector environment of Stable-Baselines3: row ``k L + l`` is learner l of L (front to rear) in world k.
 
-    The last step of an episode has the infos ``TimeLimit.truncated``, ``terminal_observation``, ``episode`` (return
-    ``r``, steps ``l``, and ``t``, always 0) and all others. ``reset_infos`` are those of each running episode's first
-    moment. All rows have the same seed, options and attributes.
+    The rows of a world share an episode. Infos at its last step include ``TimeLimit.truncated``,
+    ``terminal_observation`` and ``episode`` (return ``r``, steps ``l``, and ``t``, always 0). ``reset_infos`` belong to
+    the first decision of each running episode. All rows have the same seed, options and attributes.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -122,12 +122,11 @@ class EthBrakeVecEnv(Face, VecEnv):
         raise InvalidInput(f"appended = {self.appended!r}: must be 'number', 'state' or None")
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the worlds for the next reset."""
         self._seeds = [chosen_seed(seed)] * self.num_envs
         return self._seeds
 
     def reset(self) -> Observations:
-        """Start an episode in every world: the next ones, or those of ``set_options``."""
+        """Start an episode in every world: the next worlds, or those of ``set_options``."""
         options = self._options
         self._reset_options()
         if options != options[:1] * self.num_envs:
@@ -160,7 +159,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return self._observe(state), reward.astype(np.float32), over.repeat(len(self.bodies)), infos
 
     def _renew(self, state: State, step: Step, ended: Any, infos: list[dict[str, Any]]) -> State:
-        """Write the last infos of the episodes that have ended, and begin the next ones."""
+        """Add final infos of ended episodes to ``infos``, and start the next episodes in their rows."""
         L, last = len(self.bodies), state.take(ended)
         rows = (ended[:, np.newaxis] * L + np.arange(L)).reshape(-1)
         terms = {name: term[ended] for name, term in step.terms.items()}
@@ -180,7 +179,7 @@ class EthBrakeVecEnv(Face, VecEnv):
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
-        """Infos at the start of each row's running episode."""
+        """Infos at the first decision of each row's running episode."""
         return [] if self._first is None else self._infos(self._first, None)
 
     @reset_infos.setter
@@ -198,19 +197,19 @@ class EthBrakeVecEnv(Face, VecEnv):
         return np.concatenate([rows, more], axis=1, dtype=np.float32)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that ``restore`` needs, between two steps, as arrays and numbers."""
+        """Return everything that ``restore`` needs to continue from here, as arrays and numbers."""
         stream = [self.stream.seed, self.stream.next]
         return copy.deepcopy({"stream": stream, **{name: getattr(self, name) for name in SAVED}})
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Go on from a ``snapshot``, which can be restored again."""
+        """Continue from a ``snapshot``. It can be restored several times."""
         saved = copy.deepcopy(saved)
         self.stream.seed, self.stream.next = saved["stream"]
         for name in SAVED:
             setattr(self, name, saved[name])
 
     def render(self, mode: str | None = None) -> Any:
-        """Return the texts of all worlds (``ansi``), or one picture of all of them."""
+        """Return one text per world (``ansi``), or one picture of all worlds."""
         return self.get_images() if self.render_mode == "ansi" else VecEnv.render(self, mode)
 
     def get_images(self) -> list[Any]:
@@ -220,7 +219,6 @@ class EthBrakeVecEnv(Face, VecEnv):
         return [getattr(self, attr_name) for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute for all rows."""
         self._refuse_some_rows("set_attr", indices)
         setattr(self, attr_name, value)
 
@@ -230,7 +228,6 @@ class EthBrakeVecEnv(Face, VecEnv):
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False once per row: there is nothing to wrap inside."""
         return [False for _ in self._get_indices(indices)]
 
     def _refuse_some_rows(self, what: str, indices: Any) -> None:

@@ -1,4 +1,4 @@
-"""Put a shield around an environment of any interface, or around a team."""
+"""Put a shield around an environment, an agent or a team."""
 
 from __future__ import annotations
 
@@ -33,20 +33,21 @@ def shield(
 ) -> Any:
     """Return a shielded copy of an environment, of the same class, or a shielded team.
 
-    The copy starts with ``reset``; ``env`` stays as it is. The shield decides inside: what wrappers of ``env`` do to an
-    action, they do to the proposal. Infos: ``shield_...`` (docs/shield.md).
+    ``env`` is not changed; the copy starts with ``reset``. The shield acts inside the wrappers of ``env``: a wrapper
+    that changes actions changes what is proposed to the shield. Infos: ``shield_...`` (docs/shield.md).
 
     Args:
-        env: an environment of this package, parallel, in turns, Gymnasium or vector, perhaps in wrappers of its
-            library; a ``VecEnv``; or a ``Team``, or an agent, who propose.
-        policy: proposes the actions that the caller leaves out (NaN, or no entry in a dictionary); the shield also
-            plans with it. A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: without a proposal
-            the shield's own plan is followed.
+        env: an environment of this package (perhaps in wrappers of its library), a ``VecEnv``, a ``Team`` or an agent.
+        policy: proposes where the caller does not (NaN, or no entry in the dictionary); the shield also plans with it.
+            A name, an agent for all learners, a ``Team``, or vehicle -> agent. None: the shield then follows its own
+            plan.
         mode: ``step``, ``episode`` (the paper's Algorithm 1), or another shield, as after the ``+`` in an agent's name.
-        scenario: in which an agent drives; not for environments and teams.
+        scenario: scenario in which an agent drives; only for agents.
         harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
-        options: of the mode: ``allowance`` (m2/s2) and ``cap`` (None or ``baseline``) of ``step``, ``bound``
-            (``coupled`` or ``pairwise``) of ``episode``.
+        options: of the mode: ``allowance`` (m2/s2) and ``cap`` (None or ``baseline``) for ``step``, ``bound``
+            (``coupled`` or ``pairwise``) for ``episode``.
+
+    Raises ``InvalidInput`` for anything else, and for an environment that already has a shield.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.shield(eb.parallel_env(scenario="paper-random"))
@@ -73,7 +74,6 @@ def shield(
 
 
 def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
-    """Return a team with a shield. ``scenario``: of the worlds, if it is known."""
     settings = AgentSettings(f"{team.name}+{mode}", None, scenario, harm_count, options)
     other = wrapped(team, str(mode), settings)
     if other.shield is None:
@@ -82,7 +82,7 @@ def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, o
 
 
 def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
-    """Return a shielded copy of an environment. A policy that is a name minimises ``harm_count``."""
+    """Return a shielded copy of an environment. If ``policy`` is a name, its agent minimises ``harm_count``."""
     if isinstance(env, type) or not isinstance(base, Face):
         raise InvalidInput(
             f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"
@@ -105,7 +105,7 @@ def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Tea
 
 
 def playing(env: Any, game: Game) -> Any:
-    """Return a copy of an environment, with its wrappers, that plays ``game`` and has no running episode."""
+    """Return a copy of an environment and its wrappers that plays ``game``, without a running episode."""
     base = env.unwrapped
     instead = {id(base.game): game, id(base.scenario): base.scenario, id(base.episode): None, id(base.renderer): None}
     other = copy.deepcopy(env, instead)

@@ -12,7 +12,7 @@ from ethbrake_marl.episode.features import Feature
 
 
 class FeatureBox(Box):
-    """A float32 box whose entries have names, ``features``, which a model stores with its spaces."""
+    """A float32 box whose entries have names (``features``), which are saved with a model."""
 
     def __init__(self, features: Sequence[Feature]) -> None:
         self.features = tuple(feature.name for feature in features)
@@ -21,5 +21,5 @@ class FeatureBox(Box):
 
 
 def reward_box(components: Sequence[Any]) -> Box:
-    """Return the space of vector rewards: float64, so that weighted sums equal the scalar reward to the last bit."""
+    """Return the space of vector rewards: float64, so a weighted sum equals the scalar reward to the last bit."""
     return Box(-np.inf, np.inf, (len(components),), np.float64)

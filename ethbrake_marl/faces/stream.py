@@ -1,4 +1,4 @@
-"""Which worlds come next: the training worlds of a seed, one after the other, or those that a reset asks for."""
+"""The sequence of worlds of an environment: the training worlds of a seed, or the worlds that a reset specifies."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class UnknownResetOption(UserWarning):
 
 
 class Stream:
-    """The worlds of a game. World k of a seed is the same, in whatever row it comes."""
+    """The training worlds of a seed, one after the other. World k of a seed is always the same, in any row."""
 
     def __init__(self, scenario: Scenario, game: Game) -> None:
         self.scenario, self.game = scenario, game
@@ -33,9 +33,10 @@ class Stream:
         self.given: Drawn | None = None  # the worlds that the last reset asked for
 
     def reset(self, n: int, seed: int | None, options: Any = None) -> State:
-        """Return new episodes in n worlds. ``seed`` None: go on with the stream, or begin one with a random seed.
+        """Return new episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
 
-        Raises ``InvalidInput`` for a bad seed or option, and changes nothing then; warns of unknown options.
+        The first reset without a seed draws a random one. ``options`` may specify the worlds instead. Raises
+        ``InvalidInput`` for a bad seed or option, and then changes nothing; warns of unknown options.
         """
         first = self.next if seed is None else 0
         seed = chosen_seed(self.seed if seed is None else seed)
@@ -45,14 +46,14 @@ class Stream:
         return state
 
     def next_episodes(self, n: int) -> State:
-        """Return the next n worlds at their first decision, in memory of their own."""
+        """Return new episodes in the next n worlds. They share no memory with other episodes."""
         assert self.seed is not None
         state = self.game.reset(self.game.draw(n, self.seed, self.next))
         self.next += n
         return state
 
     def describe(self, state: State) -> dict[str, Any]:
-        """Return what was drawn for each running world: a name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         numbers, seed = state.clock[:, NUMBER].astype(np.int64), self.seed or 0
         place, parts = np.arange(state.n), [] if self.given is None else [self.given]
         of_stream = np.flatnonzero(numbers >= 0)
@@ -63,7 +64,7 @@ class Stream:
         return {**columns, "world_seed": np.full(state.n, seed), "world": numbers}
 
     def _asked_for(self, n: int, options: Any) -> Drawn | None:
-        """Return the worlds that the options of a reset ask for, or None."""
+        """Return the worlds that ``options`` of a reset specify, or None."""
         if options is None:
             return None
         if not isinstance(options, Mapping):
@@ -95,7 +96,7 @@ class Stream:
 
 
 def chosen_seed(seed: int | None) -> int:
-    """Return the seed, or a random one of 63 bits from the operating system. Raises ``InvalidInput``."""
+    """Return the seed, or for None a random one of 63 bits. Raises ``InvalidInput`` for a bad seed."""
     if seed is None:
         return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:

@@ -31,9 +31,9 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         scenario: as in ``EthBrakeParallelEnv``; so are ``learners``, ``reward``, ``observation``, ``actions`` and
             ``reward_vector``.
         render_mode: a mode of ``metadata["render_modes"]``; ``render`` returns one picture per world.
-        autoreset_mode: Gymnasium's: ``NextStep`` (the step after an episode's last one starts the next episode, ignores
-            the action and rewards 0) or ``SameStep``.
-        max_episode_steps: number of steps after which an episode is truncated; None: the horizon alone.
+        autoreset_mode: Gymnasium's ``NextStep`` (the step after the last one of an episode starts the next episode,
+            ignores the action and has reward 0) or ``SameStep``.
+        max_episode_steps: number of steps after which an episode is truncated; None: only at the horizon.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -71,7 +71,6 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         self.observation_space, self.action_space = (batch_space(space, self.num_envs) for space in spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
-        """Start an episode in every row; see ``EthBrakeParallelEnv.reset``."""
         state = self._begin(self.num_envs, seed, options)
         super().reset(seed=self.stream.seed if seed is not None else None)
         every = np.ones(self.num_envs, np.bool_)
@@ -101,9 +100,10 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         return None if pictures is None else tuple(pictures)
 
     def _columns(self, state: State, step: Step | None, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """Return infos in the form of Gymnasium's vector environments: values, and a mask of the rows that have one.
+        """Return infos in Gymnasium's vector form: arrays of values, each with a mask of the rows that have a value.
 
-        The cost and the terms of rows that have not ``stepped`` are 0: the last step belongs to another episode.
+        The mask is ``rows`` [n]. Cost and reward terms of rows that have not ``stepped`` are 0: their last step belongs
+        to an earlier episode.
         """
         infos: dict[str, Any] = {}
         for name, column in arrays(self.game, state, step, self.stream.seed or 0, self.bodies[0]).items():

@@ -1,1 +1,1 @@
-"""File formats: read files strictly, write them whole or not at all."""
+"""File formats: files are read strictly, and written completely or not at all."""

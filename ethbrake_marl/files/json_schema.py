@@ -1,4 +1,4 @@
-"""JSON Schemas of scenario and recipe files, with which editors complete and check YAML."""
+"""JSON Schemas of scenario and recipe files, which let editors complete and check YAML."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 class FileSchema(GenerateJsonSchema):
-    """JSON Schema generator for files in which no value may be ``null``: a key without a value is left out."""
+    """JSON Schema generator without ``null`` values: in a file, a key without a value is left out."""
 
     def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
         return self.generate_inner(schema["schema"])
@@ -22,12 +22,11 @@ class FileSchema(GenerateJsonSchema):
 
     @staticmethod
     def publish(schema: dict[str, Any]) -> dict[str, Any]:
-        """Return a schema that begins with ``$schema``."""
         return {"$schema": DIALECT, **schema}
 
 
 def schema_lines(kind: str, command: str) -> str:
-    """Return comment lines for a new YAML file that name its schema and the command that prints it.
+    """Return comment lines for a new YAML file that name its JSON Schema and the command that prints it.
 
     ``kind`` is ``scenario`` or ``recipe``; ``command`` is a subcommand such as ``scenario schema``.
     """

@@ -1,4 +1,4 @@
-"""Pydantic models of files, and the error message for the first mistake in a file."""
+"""Pydantic models of file contents, and the error message for the first mistake in a file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ NAME_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,63}$"
 
 
 class FileModel(BaseModel):
-    """Base class of the models of a file's content, which are immutable; unknown keys and wrong types are errors."""
+    """Immutable base class for the content of a file; unknown keys and wrong types are errors."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
@@ -49,9 +49,9 @@ UNSHOWN = object()  # passed as a value, means: do not show the value in the err
 
 
 def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
-    """Raise, in a pydantic validator, the error for an invalid ``value``.
+    """Raise, inside a pydantic validator, the error for an invalid ``value``.
 
-    ``at`` is the path of the value inside the checked field (``()``: the field itself). ``right`` says what would be
+    ``at`` is the path of the value inside the validated field (``()``: the field itself). ``right`` says what would be
     valid, for example ``must be above 0``.
     """
     shown = "" if value is UNSHOWN else flow_text(value, 60)
@@ -64,13 +64,13 @@ def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
 
 
 class Wording:
-    """Texts for error messages about one kind of file, which a subclass may override; an empty text says nothing."""
+    """Parts of error messages for one kind of file; subclasses override them. An empty text is left out."""
 
     def __init__(self, model: type[BaseModel], needed: str = "") -> None:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Return the keys that are possible in place of the last key of ``path``."""
+        """Return the valid keys in place of the last key of ``path``."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -78,24 +78,24 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
-        """Return advice on what to write for the missing key at ``path``."""
+        """Return advice about the missing key at ``path``."""
         return self._needed
 
     def instead(self, key: str) -> str:
-        """Return what to write instead of the unknown ``key``."""
+        """Return advice about what to write instead of the unknown ``key``."""
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair to which the value at ``path`` belongs."""
+        """Return the vehicle or pair that the value at ``path`` describes."""
         return ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return what would be valid instead of the value that pydantic reports; empty: a general text is used."""
+        """Return what would be valid in place of a value that pydantic rejects; empty: a general text is used."""
         return ""
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """Return the error for the first mistake that pydantic found: an unknown key, if there is one."""
+    """Return the error for the first mistake that pydantic reports, or for the first unknown key if there is one."""
     # A default that depends on an invalid field is no mistake of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     shown = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
@@ -114,7 +114,7 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 def read_model(source: str | Path | Document, model: type[Model], wording: Wording, advice: str) -> Model:
     """Read a YAML file or document into ``model``; raise ``InvalidInput`` for the first mistake.
 
-    ``advice`` is the end of the message "must be a mapping ...", for a file that does not contain a mapping.
+    ``advice`` ends the message "must be a mapping ..." for a file without a mapping.
     """
     document = source if isinstance(source, Document) else read_yaml(source)
     if not isinstance(document.content, dict):
@@ -126,10 +126,7 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
-    """Return the content of a JSON file that a program wrote, as plain data and as a ``model``.
-
-    Raises ``ValueError`` with a one-line reason.
-    """
+    """Return a JSON file's content, as plain data and as ``model``. Raises ``ValueError`` with a one-line reason."""
     content = parse_strict_json(data)  # refuses repeated keys and NaN
     try:
         return content, model.model_validate_json(data)
@@ -138,7 +135,7 @@ def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
 
 
 class Mistake(NamedTuple):
-    """A mistake in data from a program; its ``str`` says where it is and what is valid."""
+    """A mistake in data from a program. As text it says where it is and what would be valid."""
 
     place: str  # place of the mistake, keys joined by dots; empty if the data as a whole are invalid
     given: Any  # the invalid value
@@ -157,7 +154,7 @@ def first_mistake(error: ValidationError) -> Mistake:
 def path_of(detail: ErrorDetails) -> YamlPath:
     """Return the path, inside the file, of a mistake that pydantic reports.
 
-    The tags of unions are removed. If ``refuse`` raised the error, its argument ``at`` is appended.
+    Tags of unions are removed. If ``refuse`` raised the error, its ``at`` is appended.
     """
     keys = tuple(key for key in detail["loc"] if not (isinstance(key, str) and key.startswith("#")))
     return (*keys, *detail.get("ctx", {}).get("at", ()))
@@ -180,7 +177,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Return the invalid value, or "" for a whole file. A float in place of a whole number keeps its decimal point."""
+    """Return the text of the invalid value, or "" for a whole file. A float in place of an integer keeps its point."""
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:
         return ""
@@ -194,7 +191,7 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 
 def _unquote(detail: ErrorDetails) -> str:
-    """Return advice for a number in quotes, which is a text in YAML."""
+    """Return advice about a number in quotes, which YAML reads as text."""
     value = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(value, str) and parse_numeral(value) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""
@@ -223,9 +220,9 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Return a hint for an unknown ``key``: "did you mean ...?"; empty if no key is similar.
+    """Return "did you mean ...?" for an unknown ``key``, or "" if no known key is similar.
 
-    A valid key with a wrong or missing unit is also recognised: ``gaps_km``, ``mass``.
+    It also recognises a key with a wrong or missing unit, such as ``gaps_km`` or ``mass``.
     """
     names = sorted(known)
     stems = {name.rsplit("_", 1)[0]: name for name in names if name.rsplit("_", 1)[-1] in UNITS}

@@ -1,4 +1,4 @@
-"""Settings ``key.path=value`` from the command line, with values in YAML."""
+"""Settings ``key.path=value`` from the command line; values are YAML."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ethbrake_marl.files.yaml import flow_text, parse_yaml
 
 @dataclass(frozen=True, slots=True)
 class Override:
-    """A setting such as ``reward.harm=0.5``, split into path and value."""
+    """A setting such as ``reward.harm=0.5``, as a path and a value."""
 
     text: str  # the setting as written
     path: tuple[str, ...]  # keys that lead to the value, the outermost first; indices (from 0) inside lists
@@ -21,21 +21,21 @@ class Override:
 
     @property
     def top(self) -> str:
-        """First key: ``reward``."""
+        """First key, such as ``reward``."""
         return self.path[0]
 
     @property
     def key(self) -> str:
-        """Whole path: ``reward.harm``."""
+        """Whole path, such as ``reward.harm``."""
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """Return the setting without its first key: ``harm=0.5``."""
+        """Return the setting without its first key, such as ``harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
     def parse(texts: Sequence[str]) -> list[Override]:
-        """Parse settings ``key.path=value``, whose values are YAML on one line, such as ``{uniform: [1, 2]}``.
+        """Parse settings ``key.path=value``; a value is YAML on one line, such as ``{uniform: [1, 2]}``.
 
         Raises ``InvalidInput`` for a text without ``=``, an empty key, a repeated path, or a value that is not YAML.
         """
@@ -52,11 +52,10 @@ class Override:
 
     @staticmethod
     def put(content: Mapping[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-        """Apply settings to a copy of ``content``, and return the changed top-level keys with their new values.
+        """Apply settings to a copy of ``content``; return the changed top-level keys with their new values.
 
-        For ``content = {"reward": {"harm": 1}, "seed": 3}`` and the setting ``reward.harm=2`` the result is
-        ``{"reward": {"harm": 2}}``. Raises ``InvalidInput`` if a path leads into a value that is neither a mapping nor
-        a list.
+        With ``content = {"reward": {"harm": 1}, "seed": 3}``, the setting ``reward.harm=2`` gives ``{"reward": {"harm":
+        2}}``. Raises ``InvalidInput`` if a path leads into something other than a mapping or a list.
         """
         changed: dict[str, Any] = {}
         for override in overrides:
@@ -67,10 +66,7 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Return a copy of ``part`` with the value of ``override`` at ``path``, the end of ``override.path``.
-
-    Missing mappings along the path are created.
-    """
+    """Return a copy of ``part`` with the override's value at ``path``; missing mappings are created."""
     if not path:
         return override.value
     key, rest = path[0], path[1:]

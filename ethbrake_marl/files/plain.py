@@ -1,4 +1,4 @@
-"""Safe reading of untrusted files: only plain files (no folders, pipes or devices) of limited size; strict JSON."""
+"""Safe reading of untrusted files: plain files only (no folders, pipes or devices), of limited size; strict JSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """Return the content of a plain file. Raises ``refusal`` as ``open_plain`` does."""
+    """Return the content of a plain file. Raises the errors of ``open_plain``."""
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
         data = stream.read(limit_bytes + 1)  # files of /proc say that they are empty, and a file may grow
     if len(data) > limit_bytes:
@@ -42,9 +42,9 @@ def open_plain(
 ) -> Iterator[BufferedReader]:
     """Open a plain file of at most ``limit_bytes``.
 
-    Kind and size are checked before it is opened, so a pipe or device is not opened. Raises ``refusal`` with path and
-    reason if it does not exist, is not a plain file (or a symbolic link where ``follow_links`` is False), is too large,
-    or cannot be opened.
+    Kind and size are checked first, so pipes and devices are never opened. Raises ``refusal`` with path and reason if
+    the file does not exist, is not plain, is a symbolic link (with ``follow_links=False``), is too large or cannot be
+    opened.
     """
     file = Path(path)
     try:
@@ -72,7 +72,7 @@ def _too_large(file: Path, limit_bytes: int, refusal: type[EthBrakeError]) -> Et
 
 
 def parse_strict_json(data: bytes) -> Any:
-    """Parse UTF-8 JSON. Raises ``ValueError`` with a one-line reason for repeated keys, NaN or invalid text."""
+    """Parse UTF-8 JSON. Raises ``ValueError`` with a one-line reason for repeated keys, NaN, infinity or bad text."""
     try:
         return json.loads(
             data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_not_a_number, parse_float=_finite
@@ -82,7 +82,7 @@ def parse_strict_json(data: bytes) -> Any:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """Return the JSON object in a file of a training run. Raises ``InvalidInput`` if it is missing or damaged."""
+    """Return the JSON object in a file of a training run. Raises ``InvalidInput`` if the file is missing or damaged."""
     data = read_plain(file, LARGEST_OBJECT_BYTES)
     try:
         content = parse_strict_json(data)

@@ -1,7 +1,7 @@
-"""Run Python files of the user, and record their SHA-256.
+"""Runs the user's Python files, and records their SHA-256.
 
-A file runs only if the user names it on the command line (``--agents my_file.py:make_agent``) or in code, never
-because a run's folder, a recipe or a scenario names it.
+A file runs only if the user names it in code or on the command line (``--agents my_file.py:make_agent``), never because
+of a run's folder, a recipe or a scenario.
 """
 
 from __future__ import annotations
@@ -25,9 +25,8 @@ _SHA256: dict[Path, str] = {}  # of each Python file, and of the files that they
 def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
     """Run a Python file, once per process, and return the object ``name`` that it defines.
 
-    The code runs without restrictions. ``reads``: a file that it uses, such as weights, whose SHA-256 is recorded too.
-    Raises ``InvalidInput`` if the Python file is missing, raises an error, has changed since it ran, or does not define
-    ``name``.
+    The code has all rights of the user. ``reads``: a file that it uses, such as weights; its SHA-256 is recorded too.
+    Raises ``InvalidInput`` if the Python file is missing, fails, has changed since it ran, or does not define ``name``.
     """
     module = _run_file(Path(path).expanduser(), f"file {path!r}")
     if not hasattr(module, name):
@@ -43,14 +42,14 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
 def files_run() -> dict[str, str]:
     """Return file name -> SHA-256 of every Python file that this process ran, and of the files that they use.
 
-    Files with the same name: all their hashes, separated by commas.
+    For several files of one name, all their hashes are given, separated by commas.
     """
     names = dict.fromkeys(path.name for path in _SHA256)
     return {name: ", ".join(sorted({sha for path, sha in _SHA256.items() if path.name == name})) for name in names}
 
 
 def _run_file(path: Path, what: str) -> ModuleType:
-    """Return the module of a Python file, which runs unless it has run already. Messages call it ``what``."""
+    """Return the module of a Python file, which runs if it has not run before. ``what`` names it in messages."""
     if not path.is_file():
         raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'does not exist'}")
     content, path = read_plain(path, _LIMIT_BYTES), path.resolve()
@@ -64,7 +63,6 @@ def _run_file(path: Path, what: str) -> ModuleType:
 
 
 def _run(content: bytes, path: Path, sha256: str, what: str) -> None:
-    """Run a file as a new module, whose classes and functions other processes get by value."""
     module = ModuleType(f"ethbrake_file_{path.stem}_{sha256[:12]}")
     module.__file__ = str(path)
     _RUN[path] = sys.modules[module.__name__] = module

@@ -1,4 +1,4 @@
-"""``Sheet``: a table of estimates and texts for terminal, Markdown, LaTeX, HTML, CSV and JSON."""
+"""``Sheet``: a table of numbers, intervals and texts for terminal, Markdown, LaTeX, HTML, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ class Estimate:
 
     @property
     def ends(self) -> tuple[float, float]:
-        """Ends of the interval; both equal the value if there is none."""
+        """Low and high end of the interval; both equal the value if there is none."""
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Return estimate and interval as in a ``Column``: ``24.19 [23.85, 24.53]``."""
+        """Return value and interval as text, such as ``24.19 [23.85, 24.53]``."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """Return ``value``, and ``interval`` as ``[low, high]`` or null."""
+        """Return ``{"value": ..., "interval": [low, high] or None}``."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Return estimates for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; null if unknown."""
+        """Return estimates in flat form for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; None if unknown."""
         cells: dict[str, Any] = {}
         for name, each in estimates.items():
             cells[name] = None if each is None else each.value
@@ -51,7 +51,7 @@ class Estimate:
 
 
 class Shown(NamedTuple):
-    """Text of a cell: the value, and the interval of an estimate."""
+    """Text of a cell: the value, and the interval if it has one."""
 
     value: str  # the number with its unit, or the text
     interval: str = ""  # ``23.85, 24.53``
@@ -66,7 +66,7 @@ Cell = Estimate | Shown | float | int | str | None
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column, with the format of its numbers. Integers and texts are not changed."""
+    """A column, with the format of its numbers. Integers and texts are shown as they are."""
 
     heading: str  # heading in documents
     key: str = ""  # name in CSV and JSON; "": the heading
@@ -80,11 +80,10 @@ class Column:
 
     @property
     def name(self) -> str:
-        """Name in CSV and JSON."""
         return self.key or self.heading
 
     def show(self, cell: Cell) -> Shown:
-        """Format a cell; None becomes a dash."""
+        """Return the text of a cell; a dash for None."""
         if cell is None or isinstance(cell, Shown):
             return cell or Shown(DASH)
         if isinstance(cell, str | int):
@@ -95,7 +94,7 @@ class Column:
         return Shown(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
 
     def in_terminal(self, shown: Shown) -> str:
-        """Return the text of a cell in a terminal; lines after the first are dim."""
+        """Return the text of a cell in a terminal. A second line (the interval) is shown dim."""
         if self.interval == "beside":
             return shown.in_words
         return shown.value + (f"\n{shown.interval}" if shown.interval and self.interval == "below" else "")
@@ -109,7 +108,7 @@ Row = Sequence[Any] | str  # a row of cells, or the name of a section that begin
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A table. If a row has fewer cells than the table has columns, the remaining cells are shown empty.
+    """A table. Rows may be shorter than the list of columns; the other cells are empty.
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
@@ -138,11 +137,10 @@ class Sheet:
 
     @property
     def names(self) -> list[str]:
-        """Names of the columns in CSV and JSON."""
         return [column.name for column in self._columns()]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
-        """Yield each row as its formatted cells, and each section as its name."""
+        """Yield each row as formatted cells, and each section as its name."""
         columns = self._columns()
         for row in self.rows:
             if isinstance(row, str):
@@ -152,13 +150,13 @@ class Sheet:
                 yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """Return the table reduced to these columns (from 0)."""
+        """Return the table with only the given columns (from 0)."""
         names = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Return the indices of the columns in which some row has a value; all if there are no rows."""
+        """Return the indices of the columns that have a value in some row; all indices if there are no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
@@ -167,7 +165,8 @@ class Sheet:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the table, with the note below, for a terminal.
 
-        Names in the first column are never broken: those that do not fit are numbered and listed below the table.
+        Names in the first column are never broken: names that do not fit become numbers, which are explained below the
+        table.
         """
         from rich import box
         from rich.table import Table
@@ -204,7 +203,7 @@ class Sheet:
             yield Text(f"\n{note}", "dim")
 
     def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
-        """Return how many columns a terminal of ``width`` characters shows, and names that do not fit -> numbers."""
+        """Return how many columns fit into ``width`` characters, and the number of each name that does not fit."""
         columns = self._columns()
         texts = [[each.short or each.heading, *(row[k] for row in rows)] for k, each in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
@@ -221,7 +220,7 @@ class Sheet:
     def markdown(self) -> str:
         """Return the table as Markdown, without title and note.
 
-        Markdown tables have no sections, so each row's first cell begins with the section: ``Section: cell``.
+        Markdown tables have no sections, so the first cell of a row begins with its section: ``Section: cell``.
         """
         columns, section = self._columns(), ""
         lines = [[column.heading for column in columns], ["---" if column.text else "---:" for column in columns]]
@@ -234,7 +233,7 @@ class Sheet:
         return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
     def latex(self) -> str:
-        """Return a LaTeX ``tabular`` with the rules of ``booktabs``, without title and note."""
+        """Return a LaTeX ``tabular`` for the package ``booktabs``, without title and note."""
         columns = self._columns()
         lines = [" & ".join(_latex(column.heading) for column in columns) + r" \\", r"\midrule"]
         for row in self.shown():
@@ -244,10 +243,7 @@ class Sheet:
         return "\n".join([rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", *lines, r"\bottomrule", r"\end{tabular}"])
 
     def html(self) -> str:
-        """Return the table as HTML, with the title above and the note below.
-
-        All content is escaped unless it has a method ``__html__``. The first cell of a row is its heading.
-        """
+        """Return the table as HTML, with title and note. Content is escaped, unless it has a method ``__html__``."""
         columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
         kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
         heads = zip(kinds, self.headings, strict=True)
@@ -273,7 +269,7 @@ class Sheet:
         return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
-        """Return a mapping per row, without sections: name of a column -> cell; an interval has its own entry."""
+        """Return one mapping per row, column name -> cell, without sections. An interval has an entry of its own."""
         rows = []
         for row in self.rows:
             if not isinstance(row, str):
@@ -288,7 +284,7 @@ class Sheet:
 
 
 def terminal_text(*shown: RenderableType) -> str:
-    """Return tables and texts as plain text, as wide as this terminal: in a script, a notebook and a file alike."""
+    """Return tables and texts as plain text, as wide as the terminal."""
     from rich.console import Console
 
     text = io.StringIO()
@@ -298,7 +294,7 @@ def terminal_text(*shown: RenderableType) -> str:
 
 
 def flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row with two entries, ``x_low`` and ``x_high``, in place of a pair ``x_interval``."""
+    """Return a row in which each pair ``x_interval`` becomes two entries, ``x_low`` and ``x_high``."""
     line: dict[str, Any] = {}
     for name, value in row.items():
         if name.endswith("_interval"):
@@ -332,6 +328,5 @@ def _latex(text: str) -> str:
 
 
 def _html(value: object) -> str:
-    """Return ``value.__html__()``, or its text escaped for HTML, with control characters as Python escapes."""
     known: Callable[[], str] | None = getattr(value, "__html__", None)
     return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

@@ -1,4 +1,4 @@
-"""Atomic writing of files and folders, which appear whole or not at all, even after a crash; and lock files."""
+"""Atomic writing: files and folders appear completely or not at all, even after a crash. Also lock files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path, whose file is renamed to ``path`` if the block succeeds, else deleted."""
+    """Yield a temporary path; its file is renamed to ``path`` if the block succeeds, otherwise deleted."""
     partial = _temporary(path.parent)
     try:
         yield partial
@@ -39,10 +39,10 @@ def new_file(path: Path) -> Iterator[Path]:
 
 
 def check_target(path: str | Path, *, force: bool = False) -> Path:
-    """Check, before a long computation, that a file can be written to ``path``.
+    """Check, before a long computation, that ``path`` can be written as a file.
 
-    Raises ``AlreadyExists`` if it exists and ``force`` is False. Raises ``InvalidInput`` if it cannot be written, or is
-    a folder, device, pipe or symbolic link, which ``force`` does not replace.
+    Raises ``AlreadyExists`` if it exists, unless ``force``. Raises ``InvalidInput`` if it cannot be written, or is a
+    folder, device, pipe or symbolic link.
     """
     target = Path(path)
     try:
@@ -68,10 +68,10 @@ def check_target(path: str | Path, *, force: bool = False) -> Path:
 
 
 def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False) -> None:
-    """Check that ``path`` can be a folder for results. It need not exist and is not created.
+    """Check that ``path`` can be used as a folder for results. It is not created.
 
-    Raises ``InvalidInput`` if it is not a folder or not writable, and ``AlreadyExists`` if it has one of ``files`` and
-    ``force`` is False.
+    Raises ``InvalidInput`` if it is not a folder or cannot be written to. Raises ``AlreadyExists`` if it contains one
+    of ``files``, unless ``force``.
     """
     try:
         places = (path, *path.absolute().parents)
@@ -88,16 +88,15 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
 
 
 def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
-    """Write a file. Raises the errors of ``check_target``."""
     write_file(check_target(path, force=force), data)
 
 
 @contextmanager
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Yield a temporary folder, which is renamed to ``path`` if the block succeeds, else deleted.
+    """Yield a temporary folder; it is renamed to ``path`` if the block succeeds, otherwise deleted.
 
-    With ``replace`` an existing ``path`` is deleted after the block; without, it raises ``AlreadyExists``, before the
-    block or after it.
+    With ``replace`` an existing ``path`` is deleted after the block; without it, an existing ``path`` raises
+    ``AlreadyExists``.
     """
     if not replace:
         _refuse_existing(path)
@@ -119,14 +118,14 @@ def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
 
 
 def remove_folder(path: Path) -> None:
-    """Delete a folder. It is renamed first, so an interruption leaves no half-deleted ``path``."""
+    """Delete a folder. It is renamed first, so an interruption leaves no half-deleted folder at ``path``."""
     aside = _temporary(path.parent)
     path.rename(aside)
     shutil.rmtree(aside)
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Delete temporary files of killed processes; no other process may be writing in ``folder``."""
+    """Delete temporary files of killed processes in ``folder``. No other process may be writing there."""
     for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
         if left.is_dir() and not left.is_symlink():
             shutil.rmtree(left)
@@ -136,9 +135,9 @@ def remove_unfinished(folder: Path) -> None:
 
 @contextmanager
 def hold_lock(lock: Path, other: str) -> Iterator[None]:
-    """Hold a lock file while the block runs. The end of the process releases it too.
+    """Hold a lock file during the block. If the process ends, the lock is released too.
 
-    Raises ``InvalidInput`` if another process holds it (message ``other``), or if it cannot be used as a lock.
+    Raises ``InvalidInput`` if another process holds it (with the message ``other``), or if the file cannot be locked.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:

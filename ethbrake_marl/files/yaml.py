@@ -1,4 +1,4 @@
-"""Strict reader of YAML files that records the line number of every value."""
+"""A strict reader of YAML files that records the line number of every value."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def parse_numeral(text: str) -> float | None:
-    """Return the number in ``text``, infinity if it is too large; None if it is not a number."""
+    """Return the number in ``text`` (infinity if it is too large), or None if it is not a number."""
     return float(text) if _NUMERAL.fullmatch(text) else None
 
 
@@ -30,10 +30,10 @@ _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """Return ``value`` in YAML's flow style; reading the text gives an equal value.
+    """Return ``value`` as YAML on one line (flow style), which reads back as an equal value.
 
-    ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null. For error
-    messages, the text is cut off after ``longest`` characters.
+    ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null. ``longest``
+    cuts the text off, for error messages.
     """
     text = _flow(value)
     return text if longest is None or len(text) <= longest else f"{text[: longest - 3]}..."
@@ -85,17 +85,14 @@ _PLAIN_VALUES: tuple[tuple[re.Pattern[str], Callable[[str], Any]], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """Content of a YAML file, and the line number of each value."""
+    """Content of a YAML file, with the line number of each value."""
 
     file: str  # path or name of the file, for error messages
     content: Any  # dict, list, str, int, float, bool or None, nested
     lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
     def where(self, path: YamlPath) -> str:
-        """Return file and line number of a value, such as ``my.yaml, line 7``.
-
-        If it does not exist: the line of the innermost mapping or list around the path.
-        """
+        """Return file and line of a value, such as ``my.yaml, line 7``. A missing value has the line of its mapping."""
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
                 return f"{self.file}, line {self.lines[path[:length]]}"
@@ -103,7 +100,7 @@ class Document:
 
     @contextmanager
     def refusing_at(self, path: YamlPath) -> Iterator[None]:
-        """If the block raises ``InvalidInput``, put ``where(path)`` in front of its message."""
+        """Put ``where(path)`` in front of the message of an ``InvalidInput`` that the block raises."""
         try:
             yield
         except InvalidInput as error:
@@ -116,7 +113,7 @@ def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
 
 
 def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT) -> Document:
-    """Parse one YAML document of at most ``limit`` bytes; messages call it ``file``.
+    """Parse one YAML document of at most ``limit`` bytes; ``file`` names it in messages.
 
     Raises ``InvalidInput`` with file, line, column and reason.
     """
@@ -151,11 +148,11 @@ def _parse(text: str, file: str) -> Document:
 
 
 class _Refused(yaml.MarkedYAMLError):
-    """Valid YAML that this reader does not accept."""
+    """Valid YAML that this reader refuses."""
 
 
 class _Loader(yaml.SafeLoader):
-    """Loader that refuses aliases, anchors, tags and deep nesting."""
+    """YAML loader that refuses aliases, anchors, tags and deep nesting."""
 
     yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012  # PyYAML's own are those of YAML 1.1
     depth = 0
@@ -180,7 +177,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
-    """Return the value of a node; add the line numbers of all its values to ``lines``."""
+    """Return the value of a node; add the line numbers of all values in it to ``lines``."""
     lines.setdefault(path, node.start_mark.line + 1)
     if isinstance(node, yaml.ScalarNode):
         return _scalar(node)
@@ -201,7 +198,7 @@ def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
 
 
 def _scalar(node: yaml.ScalarNode) -> Any:
-    """Return a scalar's value. A quoted or block scalar is always text."""
+    """Return the value of a scalar. Quoted and block scalars are always text."""
     if node.style is not None:
         return str(node.value)
     value = next(

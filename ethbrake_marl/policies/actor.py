@@ -1,4 +1,4 @@
-"""From observations to a policy's actions, without torch."""
+"""Computes a policy's actions from observations, without torch."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ BLOCK_ROWS = 256  # observations computed together: what lies between the layers
 
 
 class Actor:
-    """The deterministic actions of a policy. Each observation is computed by itself.
+    """The deterministic actions of a policy; each observation is computed independently of the others.
 
-    ``tensors`` must fit ``spec.tensors``; ``prefix`` stands before their names in a policy among which another chooses.
+    ``tensors`` must fit ``spec.tensors``. ``prefix`` precedes their names if the policy is one of several in a file.
     """
 
     def __init__(self, spec: NetworkSpec, tensors: Mapping[str, Float32s], prefix: str = "") -> None:
@@ -36,7 +36,7 @@ class Actor:
         return actions
 
     def columns(self, x: Float32s) -> Float32s:
-        """Return the actions [1, rows] for observations that stand in columns, [F, rows]."""
+        """Return the actions [1, rows] for observations as columns, [F, rows]."""
         if not self.gate:
             y = self.forward(self.networks[0], x)
             if self.spec.output == "choice":
@@ -57,7 +57,7 @@ class Actor:
         return np.asarray(self.forward(self.gate, x).argmax(axis=0))
 
     def chosen(self, choice: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the actions [1, rows] of the choices [rows]: policies come first, then actions."""
+        """Return the actions [1, rows] for ``choice`` [rows]: numbers of member policies first, then of actions."""
         y = self.actions[np.newaxis, np.maximum(choice - len(self.members), 0)]
         for m, member in enumerate(self.members):
             rows = np.flatnonzero(choice == m)
@@ -66,7 +66,6 @@ class Actor:
         return y
 
     def forward(self, layers: Layers, x: Float32s) -> Float32s:
-        """Return the outputs [outputs, rows] of a network."""
         for number, (weight, bias) in enumerate(layers, 1):
             y = np.empty((len(weight), x.shape[1]), np.float32)
             dense(weight, bias, x, y)
@@ -81,7 +80,7 @@ class Actor:
 
 
 def check_observations(observations: Float32s, size: int) -> None:
-    """Raise ``InvalidInput`` unless observations are finite float32 numbers of the shape [n, size]."""
+    """Raise ``InvalidInput`` unless observations are finite float32 numbers, [n, size]."""
     if observations.ndim != 2 or observations.shape[1] != size or observations.dtype != np.float32:
         raise InvalidInput(
             f"observation: has type {observations.dtype} and shape {observations.shape}; needs type float32 and shape"

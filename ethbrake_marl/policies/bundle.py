@@ -1,4 +1,4 @@
-"""Read policies from folders: a bundle, a shipped policy by its name, the policies of several learners."""
+"""Read policies from folders: a bundle, a shipped policy, the policies of several learners."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a 
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Return the policy of a bundle, or of a training run that has a folder ``policy``.
+    """Return the policy in a bundle, or in the folder ``policy`` of a training run.
 
     Raises ``InvalidInput`` if there is none, and ``CorruptBundle`` with file and reason if it is damaged.
     """
@@ -77,7 +77,7 @@ def _bundle_in(path: Path) -> Path:
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Return name -> folder of every shipped policy: its card, and the folder ``policy``."""
+    """Return name -> folder of every shipped policy. The folder has its card and the bundle ``policy``."""
     return {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob("*/policy"))}
 
 
@@ -90,14 +90,14 @@ def load_shipped(name: str) -> Policy:
 
 
 def load_named_policy(name: str) -> Policy:
-    """Return a shipped policy by its name, or any other by the path of its run or bundle (``./ppo`` for a folder)."""
+    """Return a shipped policy by its name, or another policy by the path of its run or bundle, such as ``./ppo``."""
     return load_policy(shipped_policies().get(name, name))
 
 
 def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], *, replace: bool = False) -> None:
-    """Write the policies of learners, vehicle -> policy: one bundle if they share it, or a folder of one for each.
+    """Write the learners' policies, vehicle -> policy: as one bundle if they share it, else as a folder of bundles.
 
-    Raises ``AlreadyExists``; with ``replace`` an existing folder is deleted once the new one is written.
+    Raises ``AlreadyExists``; with ``replace`` an existing folder is deleted once the new one is complete.
     """
     first = next(iter(drivers.values()))
     if all(policy is first for policy in drivers.values()) and tuple(drivers) == first.manifest.learners:
@@ -109,7 +109,7 @@ def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], 
 
 
 def load_drivers(folder: str | os.PathLike[str]) -> dict[str, Policy]:
-    """Return what ``save_drivers`` wrote, vehicle -> policy, front to rear. Raises the errors of ``load_policy``."""
+    """Return vehicle -> policy, front to rear, of a ``save_drivers`` folder. Raises the errors of ``load_policy``."""
     path = Path(folder)
     names = sorted((each.name for each in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
     if names:

@@ -1,7 +1,7 @@
-"""Layers of a network with the same bits in any batch, on any machine.
+"""Layers of a network whose results have the same bits in any batch, on any machine.
 
-Mathematics libraries round ``tanh`` and sums differently on different machines, and even at different positions of an
-array. Here both are fixed sequences of IEEE operations.
+Libraries round ``tanh`` and sums differently on different machines, and even at different positions of an array. Here
+both are fixed sequences of IEEE operations.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 
 
 def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers:
-    """Return the layers whose tensors are called ``name.0.weight`` to ``name.output.bias``."""
+    """Return (weight, bias) of each layer, from the tensors ``name.0.weight`` to ``name.output.bias``."""
     names = [f"{name}.{k}" for k in range(hidden)] + [f"{name}.output"]
     return [
         (np.ascontiguousarray(tensors[f"{each}.weight"]), np.ascontiguousarray(tensors[f"{each}.bias"]))
@@ -34,8 +34,8 @@ def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers
 def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
     """Write ``weight x + bias`` to ``y`` [O, rows]; ``weight`` is [O, K], ``x`` [K, rows], one column per observation.
 
-    Products are added in groups of four, ``(a + b) + (c + d)``, always in this order: half the rounding error of one
-    after another. A column of ``y`` depends on its own column of ``x`` only.
+    Products are added in groups of four, ``(a + b) + (c + d)``, always in this order, which halves the rounding error
+    of a plain sum. A column of ``y`` depends only on the same column of ``x``.
     """
     inputs = weight.shape[1]
     whole = inputs - inputs % 4
@@ -54,7 +54,7 @@ def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
 
 @large
 def squash(values: Float32s) -> None:
-    """Replace every entry of ``values`` [k, rows] by its tanh. The error is hardly above half a unit in the last place.
+    """Replace every entry of ``values`` [k, rows] by its tanh, with an error of about half a unit in the last place.
 
     ``tanh(a) = 1 - 2 / (e^(2 a) + 1)``
     """

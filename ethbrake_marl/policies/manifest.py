@@ -1,4 +1,4 @@
-"""The manifest of a policy: network, observation, training, versions and hashes."""
+"""The manifest of a policy bundle: network, observation, training, versions and hashes."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ version_of = cache(version)  # reading one takes a millisecond
 
 
 def installed_versions() -> dict[str, str]:
-    """Name -> version of Python, of the physics, and of every package on which a training may depend."""
+    """Name -> version of Python, the physics, and every package that may affect a training."""
     own = {"python": platform.python_version(), PHYSICS: physics_digest()}
     return own | {name: version_of(name) for name in PACKAGES} | versions_used()
 
 
 class Manifest(Finite):
-    """Everything that a file says of a policy, but its tensors."""
+    """Everything that a policy bundle records, except the tensors."""
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
     format_version: Literal[2, 3, 4, 5] = 2  # `NetworkSpec.format_version`
@@ -56,7 +56,7 @@ class Manifest(Finite):
 
     @property
     def time_step_s(self) -> float:
-        """Time between two decisions in training (s); NaN where the file does not say it."""
+        """Time between two decisions in training (s); NaN if the file does not contain it."""
         step = self.scenario.get("time_step_s")
         known = isinstance(step, int | float) and not isinstance(step, bool) and 0.0 < step <= LONGEST_STEP_S
         return float(step) if known else math.nan  # type: ignore[arg-type]  # a number
@@ -79,9 +79,9 @@ class Manifest(Finite):
 
 
 def content_sha256(content: Mapping[str, Any]) -> str:
-    """SHA-256 of a manifest without its key ``manifest_sha256``, as ASCII JSON, sorted and without spaces.
+    """SHA-256 of a manifest without its key ``manifest_sha256``, as sorted ASCII JSON without spaces.
 
-    It shows damage and edits; it is not a signature.
+    It reveals damage and edits, but is not a signature.
     """
     hashed = {key: value for key, value in content.items() if key != "manifest_sha256"}
     return hashlib.sha256(json.dumps(hashed, sort_keys=True, separators=(",", ":")).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""Which networks a policy has: their sizes, and the names and shapes of their tensors."""
+"""The networks of a policy: their sizes, and the names and shapes of their tensors."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Shapes = dict[str, tuple[int, ...]]
 
 
 class NetworkSpec(FileModel):
-    """An actor, and perhaps a critic: multilayer perceptrons on the same observation.
+    """An actor and optionally a critic: multilayer perceptrons with the same input.
 
-    What the actor computes becomes an action in [-1, 1] by its ``output``:
+    ``output`` says how the actor's outputs give an action in [-1, 1]:
 
-    - ``clip``: clipped. In training (PPO) it is the mean of a Gaussian with one noise parameter per action.
-    - ``tanh``: its tanh. In training (SAC) a second head of the actor gives the noise.
-    - ``choice``: it scores ``choices`` actions, evenly spaced from -1 to 1; the highest score acts, the lowest action
-      among equal ones. It may also score other policies (``among``) on the same observation, whose scores come first;
-      one with the highest score chooses the action. There is neither noise nor critic.
+    - ``clip``: the output, clipped. In training (PPO) it is the mean of a Gaussian with one noise parameter per action.
+    - ``tanh``: the tanh of the output. In training (SAC) a second head of the actor gives the noise.
+    - ``choice``: the outputs are scores of ``choices`` actions, evenly spaced from -1 to 1. The action with the highest
+      score is taken, the lowest one in a tie. Before these may come scores of other policies (``among``) on the same
+      observation; if one of them is the highest, this policy chooses the action. No noise, no critic.
 
-    With ``networks`` above 1 the policy is a mixture of experts: as many actors of one shape, and a gating network
-    (hidden layers ``gate_hidden``) that scores them at every decision. The highest score acts, the first among equal
-    ones. There is neither noise nor critic.
+    With ``networks`` above 1 the policy is a mixture of experts: several actors of the same shape, and a gating network
+    (hidden layers ``gate_hidden``) that scores them at every decision. The actor with the highest score acts, the first
+    one in a tie. No noise, no critic.
     """
 
     observation_size: Annotated[int, Field(ge=1, le=4096)]  # F
@@ -71,24 +71,24 @@ class NetworkSpec(FileModel):
 
     @property
     def actors(self) -> tuple[str, ...]:
-        """Beginnings of the names of the actors' tensors."""
+        """Prefixes of the names of the actors' tensors."""
         return ("policy",) if self.networks == 1 else tuple(f"network_{m + 1}" for m in range(self.networks))
 
     @property
     def actions(self) -> Float32s:
-        """The actions that output ``choice`` scores, [choices]."""
+        """Actions whose scores are the outputs under ``choice``, [choices]."""
         return np.linspace(-1.0, 1.0, self.choices or 0).astype(np.float32)
 
     @property
     def format_version(self) -> Literal[2, 3, 4, 5]:
-        """Lowest version of the file format that has what this network needs."""
+        """Lowest version of the file format that supports this network."""
         if self.choices is not None:
             return 5 if self.among else 4
         return 2 if self.networks == 1 else 3
 
     @property
     def tensors(self) -> Shapes:
-        """Name -> shape of every float32 tensor; weights are [outputs, inputs], as in ``y = W x + b``."""
+        """Name -> shape of every float32 tensor; a weight is [outputs, inputs], as in ``y = W x + b``."""
         outputs = 1 if self.choices is None else len(self.among) + self.choices
         shapes: Shapes = {}
         for name in self.actors:

@@ -1,4 +1,4 @@
-"""What a policy observes, as its file says it, and whether this installation still computes the same."""
+"""The features that a policy observes, as its file describes them, and a check that they are still the same here."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ Neighbours = Annotated[int, Field(ge=0, le=64)]
 
 
 class Finite(FileModel):
-    """A part of a file in which every number is finite."""
+    """A part of a file in which infinity and NaN are not allowed."""
 
     model_config = ConfigDict(allow_inf_nan=False)
 
 
 class FeatureDefinition(Finite):
-    """A feature with a function of its own, as it was in training."""
+    """A feature with a function of its own, as it was when the policy was trained."""
 
     name: Annotated[str, Field(max_length=64)]
     of: Of
@@ -64,7 +64,7 @@ class FeatureDefinition(Finite):
 
 
 class ObservationSchema(Finite):
-    """The features that a policy observes, in order, and a hash of their scaling."""
+    """The features that a policy observes, in order, with a hash of their scaling."""
 
     front: Neighbours  # number of observed neighbours ahead
     rear: Neighbours  # and behind
@@ -85,9 +85,10 @@ class ObservationSchema(Finite):
         )  # fmt: skip
 
     def check(self, where: Path, version: str) -> None:
-        """Raise an error unless every feature is what it was in training, with this ``version`` of the package.
+        """Raise an error unless every feature is the same as in training, with ``version`` of this package.
 
-        ``InvalidInput``: a feature that somebody must register, as it was; ``CorruptBundle``: one of this package.
+        ``InvalidInput``: a user's feature is missing or has changed. ``CorruptBundle``: a feature of this package
+        differs.
         """
         for was in self.registered:
             observes = f"{where}: the policy observes the feature {was.name!r:.80}"
@@ -120,12 +121,11 @@ class ObservationSchema(Finite):
 
 
 def _is_ours(own: Own) -> bool:
-    """Return whether this package has the feature, which then never changes by accident."""
     return str(getattr(own.function, "__module__", "")).startswith("ethbrake_marl.")
 
 
 def _tried(own: Own) -> tuple[float, ...]:
-    """Return what vehicles of a line observe of a feature: in one world if this package has it, or in three."""
+    """Return a feature's values in the trial worlds: in one world if this package defines it, else in three."""
     state = _trial_worlds()
     if _is_ours(own):
         state = state.take(slice(1))

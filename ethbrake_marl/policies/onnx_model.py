@@ -1,4 +1,4 @@
-"""A policy as an ONNX model, for other runtimes."""
+"""A policy as an ONNX model, for other programs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CAPACITIES = ("own.braking_capacity", "own.driving_capacity")
 
 
 def onnx_model(manifest: Manifest, observation: View, tensors: Mapping[str, Float32s]) -> bytes:
-    """ONNX model of a policy (``Policy.to_onnx``). Its metadata name the ``features`` of an observation.
+    """Return the ONNX model of a policy (``Policy.to_onnx``). Its metadata list the names of the observed ``features``.
 
     Raises ``InvalidInput`` if the policy does not observe both its capacities, ``MissingExtra`` without onnx.
     """

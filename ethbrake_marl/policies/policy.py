@@ -1,4 +1,4 @@
-"""A policy in memory: manifest, tensors and deterministic action."""
+"""A policy in memory: manifest, tensors and actions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"  # the files of a bun
 
 @dataclass(frozen=True)
 class Policy:
-    """A policy in memory. ``policy(observations)`` gives its deterministic actions.
+    """A policy in memory. ``policy(observations)`` returns its deterministic actions.
 
     >>> from ethbrake_marl.policies.bundle import load_shipped
     >>> import numpy as np
@@ -62,12 +62,12 @@ class Policy:
         return View(self.manifest.observation.features)
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32, each by itself."""
+        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32. A row does not depend on the others."""
         return self.actor(observations)
 
     @classmethod
     def make(cls, tensors: Mapping[str, Float32s], *, network: NetworkSpec, observation: View, **manifest: Any) -> Self:
-        """Return a policy of these tensors. ``manifest``: the other fields of ``Manifest``, but hashes and versions.
+        """Return a policy with these tensors. ``manifest``: all fields of ``Manifest`` except hashes and versions.
 
         Raises ``InvalidInput`` with the bad tensor or field.
         """
@@ -86,7 +86,7 @@ class Policy:
     def save(self, folder: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Write the bundle as a new folder, completely or not at all. Raises ``AlreadyExists``.
 
-        With ``replace`` an existing folder is deleted once the new one is written.
+        With ``replace`` an existing folder is deleted once the new one is complete.
         """
         manifest = self.manifest.model_copy(update={"manifest_sha256": _own_sha256(self.manifest)})
         with new_folder(Path(folder).expanduser(), replace=replace) as partial:
@@ -94,10 +94,10 @@ class Policy:
             write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
 
     def to_onnx(self) -> bytes:
-        """Return the ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+        """Return an ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
-        The acceleration is the action times the capacity to brake or to drive, as the policy observes them. The model
-        adds products in another order than this package. Raises ``MissingExtra`` without the package onnx.
+        The acceleration is the action times the observed braking or driving capacity. Results may differ from this
+        package's by rounding. Raises ``MissingExtra`` without the package onnx.
         """
         return onnx_model(self.manifest, self.observation, self.tensors)
 
@@ -111,9 +111,9 @@ def serialised(tensors: Mapping[str, Float32s]) -> bytes:
 
 
 def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
-    """Return name -> read-only tensor of a file.
+    """Return name -> read-only tensor, from the bytes of a safetensors file.
 
-    Raises ``ValueError`` for a tensor whose name or shape is not the network's, or an entry that is not finite.
+    Raises ``ValueError`` for a tensor of a wrong name, shape or type, or with an entry that is not finite.
     """
     try:
         tensors = safetensors.numpy.load(data)

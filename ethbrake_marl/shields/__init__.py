@@ -1,1 +1,1 @@
-"""Shields: check each proposed action, and replace it where it could break a promise about harm."""
+"""Shields: check each proposed action, and replace it where the harm could rise above a bound."""

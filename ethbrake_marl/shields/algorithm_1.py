@@ -1,9 +1,8 @@
-"""The paper's hybrid (Algorithm 1): at the alert, a policy or E-V2X-BM gets the whole episode, whoever does less harm.
+"""The paper's hybrid (Algorithm 1): at the alert, either a policy or E-V2X-BM gets the whole episode.
 
-The harm of the policy, played from the alert on, is compared with H*, the harm of E-V2X-BM's constant deceleration.
-With the coupled H*, which is the price of this deceleration, the harm of the episode is the smaller of both, to the
-last bit, if the policy drives again as it was played (a policy with random actions does not). With the paper's own
-pairwise H* nothing is bounded: it is about half of the harm that this deceleration does.
+It compares H(policy's rollout) with H*, the harm of E-V2X-BM's constant deceleration, and takes the smaller. With the
+coupled H*, the harm of the episode is this smaller one to the last bit, if the policy is deterministic. The paper's own
+pairwise H* bounds nothing: it is about half of the harm that this deceleration does.
 """
 
 from __future__ import annotations
@@ -31,6 +30,8 @@ ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the a
 
 
 class Memory(NamedTuple):
+    """What the shield remembers between two decisions."""
+
     chosen: Bools  # [n] whether the policy drives
     policy_harm: Floats  # [n] harm of the policy's play (m2/s2)
     bound_harm: Floats  # [n] H* (m2/s2)
@@ -42,7 +43,7 @@ class Memory(NamedTuple):
 
 
 class EpisodeShield:
-    """Algorithm 1 for one learner; what is proposed from outside has no effect.
+    """Algorithm 1 for one learner. Actions proposed from outside have no effect.
 
     Args:
         drivers: body of the learner -> its policy.
@@ -65,7 +66,7 @@ class EpisodeShield:
             )
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision ``state``, with the driver of each episode."""
+        """Return the memory at the first decision ``state``: which driver gets each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
         remembered = begin(game.agents({body: agent})[body], alert, body)
@@ -83,7 +84,6 @@ class EpisodeShield:
         )  # fmt: skip
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Return the action of the driver that was chosen at the alert, [n, 1], and the new memory."""
         memory: Memory = state.memories["shield"]
         (body,) = self.drivers
         own, after = propose(game.agents(self.drivers), state, {body: memory.agent})
@@ -95,7 +95,6 @@ class EpisodeShield:
         )
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Return name -> [n] or [n, N]."""
         memory: Memory = state.memories["shield"]
         return {
             "chosen_policy": memory.chosen,

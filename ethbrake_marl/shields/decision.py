@@ -1,4 +1,4 @@
-"""What every shield reports of its last decision, and the reward term that counts replaced actions."""
+"""What every shield reports after a decision, and the reward term that counts replaced actions."""
 
 from __future__ import annotations
 
@@ -32,24 +32,22 @@ class ShieldReason(IntEnum):
     CONSTANT = 2  # accepted: the bound holds if constant actions follow
     NO_CERTIFICATE = 3  # replaced: the bound holds for no plan that was tried
     NOT_A_NUMBER = 4  # replaced: nothing was proposed
-    ENDED = 5  # the episode is over
+    ENDED = 5  # the episode is over (6 is not used)
     POLICY_ROLLOUT = 7  # accepted: the bound holds if the shield's own agents drive on
 
     @property
     def text(self) -> str:
-        """Such as "no certificate"."""
+        """The reason in words, such as "no certificate"."""
         return self.name.lower().replace("_", " ")
 
 
 def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
-    """Return body -> agent from front to rear. Raises ``InvalidInput`` for what is no agent."""
     for body, agent in (drivers or {}).items():
         check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
     return dict(sorted((drivers or {}).items()))
 
 
 def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:
-    """Raise ``InvalidInput`` unless the agents drive exactly the learners of a game."""
     if list(drivers) != game.rules.learners.tolist():
         theirs, right = (", ".join(f"vehicle_{i}" for i in each) for each in (drivers, game.rules.learners))
         raise InvalidInput(f"shield: has agents for {theirs}; must have one for each learner, {right or 'none'}")
@@ -60,7 +58,7 @@ def check_harm_count(count: str) -> None:
 
 
 def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
-    """Return values of learners [n, L] as values of vehicles, [n, N]; ``other`` for those that follow scripts."""
+    """Return values of vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
     wide = np.full((state.n, state.vehicles), other, columns.dtype)
     wide[:, game.rules.learners - 1] = columns
     return wide

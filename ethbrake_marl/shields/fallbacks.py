@@ -1,7 +1,7 @@
-"""Plans for a shield: what may follow an action, and what the learners do if nobody proposes anything.
+"""Plans that a shield may try: after an action, and where nobody proposes one.
 
-A plan [n, T, L] has the learners' actions at every decision. Nothing here is trusted: the shield asks for the price
-of each plan.
+A plan [n, T, L] has the learners' actions at every decision. The bound does not depend on this file: the shield
+computes the harm of each plan before it follows it.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ ALONE = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried w
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
-    """Return the plans at the alert, constant actions: [n, T, L] each.
+    """Return the plans of constant actions from which a shield chooses at the alert, [n, T, L] each.
 
-    One learner: E-V2X-BM. Several: full braking, E-V2X-BM of one while the others brake fully, and for each the best
-    share of its brakes, one after the other.
+    One learner: E-V2X-BM. Several: full braking; E-V2X-BM of one learner while the others brake fully; and each
+    learner's best share of its brakes, chosen one after the other.
     """
     learners, n, horizon_s = game.rules.learners, state.n, game.rules.horizon_s
     full = alert._replace(wanted=state.wanted.copy())
@@ -46,18 +46,17 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
 
 
 def held(game: Game, actions: Floats) -> Floats:
-    """Return the plans that repeat actions [n, L] up to the horizon."""
+    """Return plans [n, T, L] that repeat the actions [n, L] up to the horizon."""
     decisions = int(np.ceil(game.rules.horizon_s / game.rules.time_step_s)) + 1
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
 def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
-    """Return the best of some constant actions, [n, 1, L], and their harm in one piece, [n] m2/s2.
+    """Return the constant actions that do the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
-    Their harm is the largest over the states that a world may be in, which stand one after the other in ``states``.
-    Tried are the plan's next actions, and all of them a little harder or softer: small changes mend deviations from a
-    good plan far more often than constants that span all brakes. With several learners, also these actions with
-    another one of a single learner, from all of its brakes.
+    It tries the plan's next actions, all of them a little harder or softer, and, with several learners, one learner's
+    other actions while the rest follow the plan.  ``states`` may have several possible states of each world, one after
+    the other: then the largest harm counts.
     """
     learners, rows, each = game.rules.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]
@@ -77,9 +76,9 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
 def rollout(
     game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: str, most: Any = np.inf
 ) -> Floats:
-    """Return the plans with the actions of agents that drive from now on, as long as the harm is at most ``most`` [n].
+    """Return ``plans`` with the actions of agents that drive from ``state`` on, until the harm is above ``most`` [n].
 
-    ``state`` has the agents' memories.
+    ``state`` contains the agents' memories.
     """
     plans, rows, drivers = plans.copy(), np.arange(state.n), game.agents(drivers)
     while (~state.ended & (state.harm(count) <= most)).any():

@@ -1,4 +1,4 @@
-"""Shields by name: what stands after a ``+`` in an agent's name, and the mode of ``eb.shield``."""
+"""Shields by name, such as ``step`` in the agent ``ppo+step`` or in ``eb.shield(env, mode="step")``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 
 
 class NamedShield(NamedTuple):
-    """Makes a shield of a class, and puts it around a team."""
+    """Makes a shield of one class for a team."""
 
     shield: Callable[..., Shield]  # (drivers, harm_count=..., **options); one called ``scenario`` is the worlds'
     argument: str | None = None  # the option that is the text after the colon
@@ -20,7 +20,7 @@ class NamedShield(NamedTuple):
     def __call__(self, team: Team, text: str | None, settings: Any) -> Team:
         """Return the team with the shield. Raises ``InvalidInput`` for bad options, and for a team that has a shield.
 
-        ``settings`` are ``names.AgentSettings``.
+        ``text`` follows the colon of the shield's name; ``settings`` are ``names.AgentSettings``.
         """
         if team.shield is not None:
             raise InvalidInput(f"shield: team {team.name!r} already has a shield")

@@ -1,32 +1,32 @@
-"""The step shield: the harm of an episode is at most the bound announced at the alert, whatever is proposed.
+"""The step shield: the harm of an episode never exceeds the bound announced at the alert, whatever is proposed.
 
 **Claim.** Let B be the price of the plan made at the alert. Whatever actions are proposed, the harm at the end of the
 episode is at most B, and the bound that is announced never rises. An episode ends at rest or at the horizon; the claim
 does not cover what happens later.
 
 **Induction.** A *plan* is an action of every learner for every decision up to the horizon. Its *price* is the harm of
-the whole episode if it is followed from now on. The price is computed by the episode's own step, so it is this harm to
-the last bit. Between two decisions the shield holds a plan; let c be its price. At the first decision c = B.
+the whole episode if it is followed from now on. The episode's own step computes the price, so it is this harm to the
+last bit. Between two decisions the shield holds a plan; let c be its price. At the first decision c = B.
 
-1. *Proposals are applied* only if some plan that begins with them has a price of at most c. This plan is now held.
-2. *Otherwise the plan's own actions are applied.* Its play, which gave c, went through this very step, so the rest of
-   the plan still costs c.
+1. *Proposals are applied* only if some plan that begins with them has a price of at most c. The shield now holds this
+   plan.
+2. *Otherwise the plan's own actions are applied.* The simulation that gave c made this very step, so the rest of the
+   plan still costs c.
 
-So c never rises. At the end no action is left, and c is the harm of the episode. The proof asks nothing of who
-proposes, or of how plans are found: a bad search replaces more actions, and does no more harm. ∎
+So c never rises. At the end no action is left, and c is the harm of the episode. The proof does not depend on who
+proposes, or on how plans are found: a bad search replaces more actions, and does no more harm. ∎
 
-**Several learners.** An action is then one number per learner. The shield first tries all proposals together. If they
-are rejected it tries them one by one, front to rear, and keeps those that are accepted. Before and after each trial it
-holds a plan with a price of at most c.
+**Several learners.** The shield first tries all proposals together. If they are rejected it tries them one by one,
+front to rear, and keeps those that are accepted. Before and after each trial it holds a plan with a price of at most c.
 
-**Caps.** With a cap, a plan must also keep the harm that each vehicle bears within what it bears under the best
-constant actions of the alert, which is the first plan. A play knows both, so the induction holds for all numbers at
-once.
+**Caps.** With a cap, a plan must also keep the harm that each vehicle bears within what it bears under the baseline
+plan, the best constant actions at the alert. The simulation of a plan gives both numbers, so the induction holds for
+each of them.
 
 **Allowance.** With an allowance A > 0, a plan may cost up to max(c, B + A), which is then the bound until the end.
 
-It assumes that the physics of the state is true, and that all others follow the game's scripts; a script may look at
-the state, but must decide alike whenever it is asked alike. Every learner is shielded: a game has one shield.
+**Assumptions.** The physics of the state is true, and all other vehicles follow the game's scripts. A script may look
+at the state, but must always decide the same in the same state. Every learner is shielded: a game has one shield.
 """
 
 from __future__ import annotations
@@ -52,41 +52,44 @@ from ethbrake_marl.shields.named import NamedShield
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
 
 
+# the reasons as plain integers, for arrays
 NO_DECISION, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER, ENDED, POLICY_ROLLOUT = map(
     int, ShieldReason
 )
 
 
 class Memory(NamedTuple):
+    """What the shield remembers between two decisions."""
+
     plan: Floats  # [n, T, L] actions at every decision; only those from now on count
-    price: Floats  # [n] harm of the episode under the plan (m2/s2)
-    first: Floats  # [n] price at the alert (m2/s2)
+    price: Floats  # [n] c, harm of the episode under the plan (m2/s2)
+    first: Floats  # [n] B, price at the alert (m2/s2)
     caps: Floats | None  # [n, N] harm that each vehicle may bear (m2/s2)
     settles: Bools  # [n] whether all vehicles come to rest under the plan of the alert
     agents: tuple[Any, ...]  # memory of each agent of the shield's own team
     proposed: Floats  # [n, L] last proposals; NaN: none
     applied: Floats  # [n, L] last actions
-    reason: Ints  # [n, L] why
+    reason: Ints  # [n, L] `ShieldReason` of each last action
     margin: Floats  # [n, L] bound minus the least price or estimate tried after the proposal (m2/s2)
     intervened: Bools  # [n, N] whether the last proposal was replaced
     replaced: Ints  # [n] number of actions that have been replaced
-    members: Any = None  # what a subclass remembers of the states that a world may be in
+    members: Any = None  # for subclasses: the possible states of each world
 
 
-# What may follow an action: its reason, and (shield, game, states after the action, plans, most) -> actions of every
-# decision, [n, T or 1, L], and their harm, [n], or less where it is not known yet. What seems to cost more than `most`
-# is not priced.
+# A way to continue after an action: its `ShieldReason`, and a function (shield, game, states after the action, plans,
+# most) -> actions at every decision, [n, T or 1, L], and an estimate of their harm, [n], never too high (0: unknown).
+# Actions with an estimate above `most` are not priced.
 Fallback = tuple[int, Callable[["StepShield", Game, State, Floats, Floats], tuple[Floats, Floats]]]
 
 
 class StepShield:
-    """Shield of all learners of a game.
+    """The step shield of all learners of a game.
 
     Args:
-        drivers: body -> agent: the learners' agents, for a shield that proposes by itself or rolls them out; or empty.
+        drivers: body -> agent, for a shield that proposes actions itself or simulates its agents; may be empty.
         harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
-        cap: ``baseline``: no vehicle bears more harm than under the best constant actions of the alert; None: no caps.
+        cap: ``baseline``: no vehicle bears more harm than under the best constant actions at the alert; None: no caps.
 
     """
 
@@ -113,13 +116,14 @@ class StepShield:
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the states that the worlds may be in now, M rows for each world, the nominal one first."""
+        """Return the M possible states of each world, M rows per world, the nominal one first. Here M = 1."""
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Return the harm of plans, [n] m2/s2: the largest over the M ``states`` of each world, or above ``most``.
+        """Return the harm of each plan, [n] m2/s2: the largest over the M possible states of a world.
 
-        It is infinite where a vehicle would bear more than its cap (``caps`` [n, N] m2/s2).
+        A simulation stops where its harm is above ``most``. The harm is infinite if a vehicle would bear more than its
+        cap (``caps`` [n, N] m2/s2).
         """
         last, harm = played(game, states, plans, self.count, most)
         if caps is not None:
@@ -127,7 +131,7 @@ class StepShield:
         return harm
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
-        """Return the plans if the shield's agents drive on from the nominal ``state``, as long as harm <= ``most``."""
+        """Return the plans in which the shield's agents drive on until the harm is above ``most`` [n]."""
         return rollout(game, self.drivers, state, plans, self.count, most)
 
     def bound(self, memory: Memory) -> Floats:
@@ -137,15 +141,13 @@ class StepShield:
         return self.first_memory(game, alert, state, state, self.agents_at(game, alert))
 
     def agents_at(self, game: Game, alert: State) -> dict[int, Any]:
-        """Return body -> memory of the shield's agents for new episodes."""
         return {body: begin(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Return the constant actions from which the first plan is chosen, [n, T, L] each."""
         return first_plans(game, alert, state, self.count)
 
     def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
-        """Return the memory at the first decision: the best constant actions, or the agents' own play."""
+        """Return the memory at the first decision; its plan is the best constant actions or the agents' rollout."""
         rows, plans = np.arange(state.n), self.plans(game, alert, state, states)
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         plan, harm = np.stack(plans)[prices.argmin(axis=0), rows], prices.min(axis=0)
@@ -166,7 +168,6 @@ class StepShield:
         )  # fmt: skip
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Return the actions to apply, [n, L], and the new memory."""
         memory: Memory = state.memories["shield"]
         proposed, state = self.asked(game, state, proposed)
         if not donate:
@@ -203,9 +204,10 @@ class StepShield:
         )  # fmt: skip
 
     def asked(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
-        """Return the proposals, [n, L], NaN for none, and the state with the memories of the shield's agents.
+        """Return the proposals [n, L], NaN for none, and the state with the new memories of the shield's agents.
 
-        The agents propose where nobody else does. If one has a memory, they are asked at every decision.
+        The agents propose where nobody else does. An agent with a memory is asked at every decision, so it stays up to
+        date.
         """
         memories = {who: kept for who, kept in state.memories.items() if who != "shield"}
         own = dict(zip(self.drivers, state.memories["shield"].agents, strict=True))
@@ -221,15 +223,18 @@ class StepShield:
     def accept(
         self, game: Game, state: State, memory: Memory, rows: Ints, actions: Floats, now: Ints, rests: list[Fallback]
     ) -> tuple[Ints, Floats]:
-        """Hold a plan that begins with the ``actions`` in each of the worlds ``rows`` where one keeps the bound.
+        """Look for a plan that begins with ``actions`` and keeps the bound, in each world of ``rows``; store it if
+        there is one.
 
-        Returns the reasons and the least price that was tried, [len(rows)] each.
+        It tries the rest of the present plan first, then the fallbacks ``rests``. Returns the reasons, and the smallest
+        price or estimate among the plans tried, [len(rows)] each.
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
         seen = self.seen(state, memory)
         M = seen.n // state.n
         before = part(seen, rows, M)
+        # First the actions with the rest of the present plan, then, where this is rejected, with each fallback.
         least = self.price(game, before, plans, most, take(memory.caps, rows))
         reason = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE)
         for code, rest in rests:
@@ -239,6 +244,7 @@ class StepShield:
             here = part(before, left, M)
             after, _ = game.follow(here, actions[left].repeat(M, axis=0))
             later, value = rest(self, game, after, plans[left], most[left])
+            # Only plans that the estimate does not rule out are priced.
             hopeful = (value <= most[left] + NEARLY).nonzero()[0]
             if len(hopeful):
                 at = left[hopeful]
@@ -256,7 +262,6 @@ class StepShield:
         return reason, least
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Return name -> [n] or [n, N]."""
         memory: Memory = state.memories["shield"]
         borne = {}
         if memory.caps is not None:
@@ -275,7 +280,6 @@ class StepShield:
 
 
 def part(states: State, rows: Ints, M: int) -> State:
-    """Return the M states of each of the worlds ``rows``, which increase."""
     if len(rows) * M == states.n:
         return states
     return states.take(rows if M == 1 else (rows[:, np.newaxis] * M + np.arange(M)).ravel())
@@ -283,19 +287,19 @@ def part(states: State, rows: Ints, M: int) -> State:
 
 @cache
 def trials(learners: int) -> Bools:
-    """Return which of L proposals are tried together, [1 or 1 + L, L]: all of them, then one by one from the front."""
+    """Return which of the L proposals each trial includes, [1 + L, L]: all, then one by one; [1, 1] for one learner."""
     alone = np.eye(learners, dtype=np.bool_)
     return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
 
 
 def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback: the best constant actions. Where scripts look at the state, nothing is known before the play."""
+    """Fallback: the best constant actions. If scripts look at the state, the estimate is 0 (unknown)."""
     plans, estimate = best_constant(game, after, plans, shield.count)
     return plans, np.zeros(len(plans)) if game.scripts else estimate
 
 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback: the shield's own agents drive on, from the nominal state."""
+    """Fallback: the shield's own agents drive on from the nominal state. The estimate is 0 (unknown)."""
     nominal = after if after.n == len(plans) else after.take(np.arange(0, after.n, after.n // len(plans)))
     return shield.rolled_out(game, nominal, plans, most), np.zeros(len(plans))
 

@@ -1,1 +1,1 @@
-"""Train policies, and go on with a training. torch and Stable-Baselines3 are imported where a training begins."""
+"""Train policies, and resume trainings. torch and Stable-Baselines3 are imported only when a training starts."""

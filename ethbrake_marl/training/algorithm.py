@@ -1,4 +1,4 @@
-"""What a learning algorithm is: it builds a model of Stable-Baselines3, which can then be trained."""
+"""Base class of learning algorithms: each builds a model of Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -19,15 +19,14 @@ ACTIVATIONS: dict[Activation, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Ta
 
 
 class Algorithm(ABC):
-    """Base class of learning algorithms. Only ``build`` must be written if the networks are PPO's or SAC's.
+    """Base class of learning algorithms. A subclass needs only ``build`` if its networks are like PPO's or SAC's.
 
-    Checkpoints save the part of the model that its method ``_get_torch_save_params`` names; a model with further
-    memory names it there.
+    Checkpoints save the parts of the model that its method ``_get_torch_save_params`` names.
     """
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
-        """Return a new model on the CPU, whose random numbers depend on the recipe's seed only.
+        """Return a new model on the CPU, with random numbers from the recipe's seed only.
 
         ``environment`` has one row for each learner in each world.
         """
@@ -37,7 +36,7 @@ class Algorithm(ABC):
         return [model.policy]
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of the weights: name in a policy file -> tensor. If actions are clipped, they are PPO's."""
+        """Return a copy of an actor's weights, name in a policy file -> tensor, for networks like PPO's or SAC's."""
         if network.output != "clip":
             inner = actor.actor
             return tensors_of("policy", [*inner.latent_pi, inner.mu]) | _of_layer("policy.log_std", inner.log_std)

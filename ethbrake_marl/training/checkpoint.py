@@ -1,7 +1,7 @@
-"""Checkpoints: everything on which the rest of a training depends, between two updates.
+"""Checkpoints: everything that determines the rest of a training, between two updates.
 
-A checkpoint is a file of ``torch.save`` with plain data and tensors only, read with ``weights_only=True``: no code
-runs. The CRC-32 of its parts, which torch writes and does not check, shows damage.
+A checkpoint is a file of ``torch.save`` with plain data and tensors only, read with ``weights_only=True``, so no code
+runs. The CRC-32 of its parts, which torch writes but does not check, reveals damage.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def capture(model: BaseAlgorithm) -> dict[str, Any]:
 
 
 def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
-    """Let a new model, which has a logger, go on from ``saved``. Errors of Python, NumPy or torch: it does not fit."""
+    """Put ``saved`` into a new model that has a logger. Raises errors of Python, NumPy or torch if it does not fit."""
     environment: Any = model.env
     model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs, np.bool_)
     new = capture(model)
@@ -87,9 +87,9 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
 
 
 def like(new: Any, saved: Any) -> Any:
-    """Return saved data with the types of ``new``: arrays in place of tensors, named tuples in place of plain ones.
+    """Return saved data with the types of ``new``: arrays instead of tensors, named tuples instead of plain ones.
 
-    Raises ``ValueError`` if the entries differ, or the shape or type of an array.
+    Raises ``ValueError`` if entries, or shape or type of an array, differ.
     """
     if isinstance(new, np.ndarray):
         array = saved.numpy().copy()
@@ -118,7 +118,7 @@ def to_tensors(tree: Any) -> Any:
 
 
 def files_in(folder: Path) -> list[Path]:
-    """Return the checkpoints, newest first."""
+    """Return the checkpoints in a folder, newest first."""
     return sorted(folder.glob("step_*.pt"), reverse=True)
 
 
@@ -133,7 +133,7 @@ def write(folder: Path, saved: Mapping[str, Any]) -> None:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read a checkpoint. Raises ``CorruptBundle`` if it is damaged or something else."""
+    """Read a checkpoint. Raises ``CorruptBundle`` if the file is damaged or not a checkpoint."""
     with open_plain(path, LARGEST_BYTES, refusal=CorruptBundle, follow_links=False) as stream:
         try:
             damaged = zipfile.ZipFile(stream).testzip()
@@ -147,7 +147,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def newest(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
-    """Return the newest checkpoint that is whole, or None, and what is wrong with newer ones, which are deleted."""
+    """Return the newest undamaged checkpoint, or None, and the errors of newer ones, which are deleted."""
     reasons: list[str] = []
     for path in files_in(folder):
         try:

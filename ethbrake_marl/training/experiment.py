@@ -1,4 +1,4 @@
-"""The main experiment: train, and compare what was learned, its shield and the baselines in the same worlds."""
+"""The main experiment: train, then compare the trained policy, its shield and the baselines in the same worlds."""
 
 from __future__ import annotations
 
@@ -43,7 +43,6 @@ class Experiment(NamedTuple):
     def in_another(
         self, scenario: Scenario, episodes: int, baselines: Sequence[str], measures: Sequence[str]
     ) -> Compared:
-        """Repeat the comparison in another scenario."""
         count = self.compared.harm_count
         teams = compared_teams(self.trained, scenario, count, baselines)
         seed = self.compared.result.about["seed"]
@@ -51,7 +50,7 @@ class Experiment(NamedTuple):
 
 
 class Report(Protocol):
-    """Writes something about an experiment into the run's folder; extensions have their own."""
+    """Writes a report about an experiment into the run's folder; extensions provide others."""
 
     measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
 
@@ -60,7 +59,7 @@ class Report(Protocol):
 
 
 class Tables:
-    """The report without an extension: the tables of the evaluation."""
+    """The simplest report: only the tables of the evaluation."""
 
     measures: tuple[str, ...] = ("pushed_m",)
 
@@ -84,13 +83,12 @@ def run_experiment(
 ) -> tuple[Experiment, Sequence[Any], str]:
     """Train, compare, and write ``results.json``, ``worlds.csv`` and a report into the run's folder.
 
-    Agents that optimise minimise the count of harm that is trained for (``reward.harm_count``). Ctrl-C stops the
-    training after the current update, and what was learned so far is compared; a second Ctrl-C raises
-    ``KeyboardInterrupt``. ``run.json`` records how the run ended. Other arguments and errors: as in ``train`` and
-    ``evaluate``.
+    Optimising agents minimise the count of harm used in training (``reward.harm_count``). Ctrl-C stops the training
+    after the current update, and the policy so far is compared; a second Ctrl-C raises ``KeyboardInterrupt``. Other
+    arguments and errors are as in ``train`` and ``evaluate``.
 
-    Returns the experiment, and the tables and the text of the report. Raises ``InvalidInput``, before any work, for a
-    scenario without exact impacts, which shields and reports need.
+    Returns the experiment, and the tables and text of the report. Raises ``InvalidInput`` at once for a scenario
+    without exact impacts, which shields and reports need.
     """
     if scenario.physics is not None:
         raise InvalidInput(
@@ -127,7 +125,7 @@ def run_experiment(
 
 
 def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
-    """Return the names that can be used, and report why others cannot. Raises what ``use`` raises for full braking."""
+    """Return the names for which ``use`` works, and report why others fail. Raises the error if full braking fails."""
     found = []
     for number, name in enumerate(names):
         try:
@@ -143,9 +141,9 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 def compared_teams(
     trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
-    """Return the teams to compare: baselines, then what was learned, without and with a shield.
+    """Return the teams to compare: baselines, then the trained policies, without and with a shield.
 
-    With several learners there is also a team for each learner in which this one brakes fully.
+    With several learners there is also a team for each learner in which this learner brakes fully.
     """
     agents: dict[str, Any] = {name: name for name in baselines}
     if len(trained.policies) == 1:

@@ -25,11 +25,11 @@ OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Return the function that measures policies on the recipe's fixed list of worlds (key ``evaluation``).
+    """Return a function that measures policies on the recipe's fixed list of worlds (key ``evaluation``).
 
-    Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (of exact impacts only),
-    ``collision_rate``, ``horizon_rate`` (a vehicle still moves at the horizon) and, where a learner's objective is not
-    the harm of the line, the ``objective`` of each learner (``objective_vehicle_2``) and the mean of these.
+    Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (for exact impacts),
+    ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's objective is not the
+    harm of the line, there is also each learner's objective (``objective_vehicle_2``), and their mean ``objective``.
     """
     plan, (scenario, game) = training.recipe.evaluation, open_game(training.scenario)
     worlds = scenario.sample(plan.worlds, plan.seed)

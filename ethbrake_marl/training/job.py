@@ -1,4 +1,4 @@
-"""One training of many, as sweeps and studies run them: it is begun, resumed or read, whichever is left to do."""
+"""One training of many, for sweeps and studies: it is started, resumed or read, as needed."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ MEASURED = (*COLUMN.values(), "collision_rate")
 
 @contextmanager
 def folder_of_many(folder: Path, *results: str) -> Iterator[None]:
-    """Create the folder of many trainings and lock it. The files ``results`` may be replaced.
+    """Create and lock a folder for many trainings. Its files ``results`` may be replaced.
 
-    Raises ``InvalidInput`` if another process works in it, or if it cannot be used.
+    Raises ``InvalidInput`` if another process uses it, or if it cannot be written to.
     """
     check_folder(folder, results, force=True)
     folder.mkdir(parents=True, exist_ok=True)
@@ -41,9 +41,9 @@ class Job(NamedTuple):
     settings: tuple[str, ...] = ()  # ``KEY=VALUE``, by which it differs from files, for ``config.json``
 
     def finish(self, on_progress: OnProgress | None = None) -> bool:
-        """Do what is left of the training; return False if Ctrl-C stopped it.
+        """Do the rest of the training; return False if Ctrl-C stopped it.
 
-        Raises the errors of ``train``, and ``InvalidInput`` if the folder has something else.
+        Raises the errors of ``train``, and ``InvalidInput`` if the folder contains another training.
         """
         recipe, scenario = self.training.recipe, self.training.scenario
         if not self.folder.exists():
@@ -58,7 +58,7 @@ class Job(NamedTuple):
         return resume(self.folder, on_progress=on_progress).status == "finished"
 
     def attempt(self) -> str:
-        """Do what is left of the training; return why it failed, or an empty text."""
+        """Do the rest of the training; return the error message, or ""."""
         try:
             if not self.finish():
                 raise KeyboardInterrupt
@@ -67,7 +67,7 @@ class Job(NamedTuple):
         return ""
 
     def result(self) -> dict[str, float]:
-        """Return the measurement of a finished training's policy: ``steps``, ``harm`` (which is minimised), ..."""
+        """Return the best measurement of a finished training: ``steps``, ``harm`` (the minimised count), and others."""
         count = self.training.recipe.reward.harm_count
         evaluations = read_object(RunFolder(self.folder).status)["evaluations"]
         best = min(evaluations, key=lambda each: deciding(each, count))

@@ -1,4 +1,4 @@
-"""Save the actors of your own training loop, for ``policy@FOLDER`` or ``team@FOLDER``."""
+"""Save actors of your own training loop, for use as ``policy@FOLDER`` or ``team@FOLDER``."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def save_team(
 ) -> None:
     """Save actors, learner -> actor, as the policies of a run. Learners with the same actor object share one policy.
 
-    An actor draws its action from a normal distribution, which the environment clips to [-1, 1]: ``mean`` is an
-    ``nn.Sequential``, ``log_std`` [1] the logarithm of the standard deviation.
+    An actor's action is drawn from a normal distribution and clipped to [-1, 1] by the environment. Its mean is the
+    output of ``mean``, an ``nn.Sequential``; ``log_std`` [1] is the logarithm of the standard deviation.
 
     Args:
         folder: new folder, or one without policies.
         actors: the actor of each learner of ``env``, by the vehicle's name.
         env: environment of the training. Its scenario, observations and reward are recorded.
-        seed: of the training.
+        seed: seed of the training.
         steps: number of decisions of the training.
 
-    Raises ``InvalidInput`` for other learners or other actors, and ``AlreadyExists``.
+    Raises ``InvalidInput`` for other learners or other kinds of actors, and ``AlreadyExists``.
 
     """
     scenario, game = env.unwrapped.scenario, env.unwrapped.game
@@ -67,7 +67,6 @@ def save_team(
 
 
 def network_of(name: str, actor: Any) -> NetworkSpec:
-    """Return the network of an actor. Raises ``InvalidInput`` for another kind of actor."""
     mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
     layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
     linear, between = layers[::2], layers[1::2]

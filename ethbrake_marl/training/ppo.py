@@ -1,4 +1,4 @@
-"""PPO: one policy for all learners, perhaps with a central critic, or one for each learner (``training.several``)."""
+"""PPO: one policy for all learners, with or without a central critic, or one for each (``training.several``)."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Ppo(Algorithm):
-    """PPO of Stable-Baselines3. Actor and critic are separate networks."""
+    """PPO of Stable-Baselines3, with separate networks for actor and critic."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> PPO:
         recipe = training.recipe

@@ -1,4 +1,4 @@
-"""``TrainingRecipe``: the settings of a training, read from a YAML file, and those of PPO and SAC."""
+"""``TrainingRecipe``: the settings of a training, from a YAML file; and the recipes of PPO and SAC."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class LearningRate(FileModel):
     def at(self, remaining: float) -> float:
         """Return ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
 
-        ``remaining`` is the fraction (1 to 0) of the training's steps that is not yet done.
+        ``remaining`` is the fraction (1 to 0) of the training's steps that remains.
         """
         done = min(max(1.0 - remaining, 0.0), 1.0)
         return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
@@ -78,7 +78,7 @@ class EvaluationPlan(FileModel):
 
 
 class TrainingRecipe(FileModel):
-    """Settings that all algorithms have; each algorithm has a subclass with more.
+    """Settings that all algorithms share; each algorithm has a subclass with more.
 
     An *update* collects decisions and learns from them. The text in ``Field(description=...)`` explains a key in new
     recipe files, in the JSON Schema and in the documentation.
@@ -148,7 +148,7 @@ class TrainingRecipe(FileModel):
 
     @property
     def rounds(self) -> int:
-        """Decisions of each learner in each world between two updates: the key ``n_steps``."""
+        """Decisions of each learner in each world between two updates (key ``n_steps``)."""
         return int(vars(self)["n_steps"])
 
     @property
@@ -157,7 +157,7 @@ class TrainingRecipe(FileModel):
         return 1
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the networks of a policy. Override it if the actor is not PPO's: one action, clipped to [-1, 1]."""
+        """Return the networks of a policy. Override this unless the actor has one action, clipped to [-1, 1]."""
         shape = vars(self)["network"]
         return NetworkSpec(
             observation_size=observation_size,
@@ -168,10 +168,10 @@ class TrainingRecipe(FileModel):
         )
 
     def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not fit the number of learners."""
+        """Raise ``InvalidInput`` if the recipe does not support this number of learners."""
 
     def replace(self, **changes: Any) -> Self:
-        """Return the recipe with other values: ``replace(seed=3)``. Raises ``InvalidInput`` as ``load_recipe`` does."""
+        """Return the recipe with changed values, such as ``replace(seed=3)``. Raises the errors of ``load_recipe``."""
         content = {**self.model_dump(mode="json"), **{key: plain(value) for key, value in changes.items()}}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         return changed  # type: ignore[return-value]  # another class only with another algorithm
@@ -254,12 +254,12 @@ class SacRecipe(TrainingRecipe):
         return self.log_every_updates
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the actor's network; critics are not part of a policy."""
+        """Return the actor's network; a SAC policy is saved without critics."""
         return super().network_spec(observation_size).model_copy(update={"value_hidden": (), "output": "tanh"})
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Return name -> file of all recipes in the package, those of extensions included."""
+    """Return name -> file of all recipes in the package, including those of extensions."""
     files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
     return {file.stem: file for file in files}
 
@@ -270,10 +270,11 @@ def usable_recipes() -> dict[str, Path]:
 
 
 def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> TrainingRecipe:
-    """Load a recipe by name, by the path of its file, or from the content of such a file.
+    """Load a recipe by its name, by the path of its file, or from a file's content.
 
-    What ends in ``.yaml`` or has a path separator is a path; ``~`` is the user's home. Raises ``UnknownName`` for an
-    unknown name, and ``InvalidInput`` with file, line, key, value and what would be right for bad content.
+    A text that ends in ``.yaml`` or contains a path separator is a path; ``~`` is the home folder. Raises
+    ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key, value and what would be right for
+    bad content.
     """
     if isinstance(recipe, TrainingRecipe):
         return recipe
@@ -306,7 +307,7 @@ def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Return the keys that are possible in place of the last key of ``path``; a reward also has own terms."""
+        """Return the valid keys in place of the last key of ``path``, including registered terms inside ``reward``."""
         inside = super().known(path)
         return [*inside, *own_terms()] if path[:-1] == ("reward",) else inside
 
@@ -314,14 +315,14 @@ class _RecipeWording(Wording):
 def register_algorithm(name: str, recipe: type[TrainingRecipe], algorithm: type[Any] | str) -> None:
     """Register a learning algorithm, which recipes select with ``algorithm: NAME``.
 
-    A package declares an entry point of the group ``ethbrake_marl.algorithms`` instead: a ``Part`` with recipe
-    class and algorithm.
+    A package may instead declare an entry point in the group ``ethbrake_marl.algorithms``: a ``Part`` with recipe class
+    and algorithm.
 
     Args:
         name: 1 to 64 letters ``a-z``, digits, ``-`` and ``_``.
-        recipe: class of the algorithm's recipes, which checks their YAML files.
-        algorithm: a subclass of ``training.algorithm.Algorithm``, or the text ``"module:class"``, whose module (and
-            torch, which takes seconds) is imported only when a training begins.
+        recipe: class of the algorithm's recipes, which validates their YAML files.
+        algorithm: a subclass of ``training.algorithm.Algorithm``, or the text ``"module:class"``; then the module (and
+            torch, which takes seconds) is imported only when a training starts.
 
     Raises ``InvalidInput`` for an invalid name or class, and ``AlreadyExists`` if another algorithm has the name.
 
@@ -359,7 +360,7 @@ VARIANTS: Registry[type[Any]] = Registry(
 
 
 def algorithm_of(recipe: TrainingRecipe) -> Any:
-    """Return a new ``Algorithm``. Raises ``InvalidInput`` if it has no variant for the recipe's device."""
+    """Return a new ``Algorithm`` for a recipe. Raises ``InvalidInput`` if it cannot use the recipe's device."""
     if recipe.device == "cpu":
         algorithm = ALGORITHMS[recipe.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()

@@ -1,4 +1,4 @@
-"""The folder of a training run and its logs. Each file is written whole or not at all."""
+"""The folder of a training run, and its logs. Each file is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ class RunFolder:
         self.checkpoints = self.path / "checkpoints"  # until the training has finished
 
     def create(self, config: Mapping[str, Any], *, force: bool = False) -> None:
-        """Create the folder. With ``force`` it replaces another run.
+        """Create the folder. With ``force`` it replaces an earlier run.
 
-        Raises ``AlreadyExists`` for any other path that exists, ``InvalidInput`` if a process trains in that run.
+        Raises ``AlreadyExists`` for any other existing path, ``InvalidInput`` if a process is training in that run.
         """
         exists = os.path.lexists(self.path)
         if exists and (self.path.is_symlink() or not self.status.is_file()):
@@ -60,7 +60,6 @@ class RunFolder:
         return hold_lock(self.path / "run.lock", "another process is training in this folder")
 
     def write_status(self, status: Status, **more: Any) -> None:
-        """Change keys of ``run.json``."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
         before = read_object(self.status) if self.status.exists() else {"format": FORMAT, "format_version": 1}
         times = {"started_utc": before.get("started_utc", now), "ended_utc": None if status == "running" else now}
@@ -68,9 +67,9 @@ class RunFolder:
 
     @contextmanager
     def stage(self, name: str, status: Status) -> Iterator[None]:
-        """Record a stage after the training in ``run.json``: its name, how it ends, and the files it has written.
+        """Record a stage after the training in ``run.json``: its name, how it ended, and the files that it wrote.
 
-        ``status``: of the training, if nothing goes wrong.
+        ``status`` is recorded if the stage succeeds.
         """
         with self.held():
             self.write_status("running", stage=name)
@@ -88,9 +87,9 @@ class RunFolder:
                 self.write_status(ended, reason=reason, written=written)
 
     def training(self) -> Training:
-        """Return the training that a run records.
+        """Return the training that is recorded here.
 
-        Raises ``InvalidInput`` if this is no run, if a file is damaged, or if a folder is a link.
+        Raises ``InvalidInput`` if this is not a run, if a file is damaged, or if a folder is a link.
         """
         if not (os.path.lexists(self.status) or os.path.lexists(self.config)):
             raise InvalidInput(
@@ -112,7 +111,7 @@ class RunFolder:
             raise InvalidInput(f"{self.config}: {error}") from None
 
     def clear(self) -> None:
-        """Delete half-written files of killed processes, and the results so far."""
+        """Delete unfinished files of killed processes, and the results so far."""
         for folder in (self.path, self.checkpoints):
             remove_unfinished(folder)
         written = read_object(self.status).get("written", ())
@@ -121,9 +120,9 @@ class RunFolder:
                 path.unlink()
 
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
-        """Return the writers of ``progress.csv``, which begins with the text ``progress``, and of TensorBoard's events.
+        """Return the writers of ``progress.csv``, which starts with the text ``progress``, and of TensorBoard's events.
 
-        ``steps``: number of steps before the next row if a training goes on; None: the events begin anew.
+        ``steps``: number of steps so far, if a training is resumed; None: delete old events.
         """
         self.progress.unlink(missing_ok=True)  # it may be a link, whose target must not be overwritten
         if steps is None:

@@ -1,4 +1,4 @@
-"""SAC: one policy for all learners, which learns from stored decisions."""
+"""SAC: one policy for all learners, trained on stored decisions."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from ethbrake_marl.training.training import Training
 
 
 class Sac(Algorithm):
-    """SAC of Stable-Baselines3."""
-
     def build(self, training: Training, environment: EthBrakeVecEnv) -> SAC:
         recipe = training.recipe
         assert isinstance(recipe, SacRecipe)

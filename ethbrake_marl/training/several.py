@@ -1,7 +1,7 @@
-"""Several learners with PPO: a policy for each of them (independent), or one with a critic that sees the whole line.
+"""PPO with several learners: a policy for each (independent), or one policy with a critic that sees the whole line.
 
-Independent learners drive in the same worlds and learn each from its own rows, with Stable-Baselines3's
-``PPO.train``. The last entry of an observation is the number of the learner, from 0 (``appended="number"``).
+Independent learners drive in the same worlds. Each learns from its own rows, by Stable-Baselines3's ``PPO.train``. The
+last entry of an observation is the number of the learner, from 0 (``appended="number"``).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ethbrake_marl.training.training import Training
 
 
 class CentralCriticPolicy(ActorCriticPolicy):
-    """PPO policy whose actor sees the first ``own`` entries of an observation, and whose critic sees all of it."""
+    """PPO policy whose actor sees the first ``own`` entries of an observation, and whose critic sees all."""
 
     def __init__(self, *arguments: Any, own: int, **settings: Any) -> None:
         self.own = own  # set before ``super().__init__``, which builds the networks
@@ -34,7 +34,7 @@ class CentralCriticPolicy(ActorCriticPolicy):
 
 
 class _OwnPartForTheActor(MlpExtractor):
-    """Hidden layers of an actor, which sees the first ``own`` of ``whole`` entries, and of a critic, which sees all."""
+    """Hidden layers of an actor that sees the first ``own`` of ``whole`` entries, and of a critic that sees all."""
 
     def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:
         super().__init__(own, net_arch, activation_fn, device="cpu")
@@ -46,9 +46,9 @@ class _OwnPartForTheActor(MlpExtractor):
 
 
 class SeparatePolicies(BasePolicy):
-    """A policy with its own optimiser for each learner, behind the interface of a single policy.
+    """Policies with an optimiser each, one per learner, behind the interface of a single policy.
 
-    ``columns``: for each learner the columns of an observation that it sees. ``network``: further arguments of
+    ``columns`` lists the columns of an observation that each learner sees. ``network``: further arguments of
     Stable-Baselines3's ``ActorCriticPolicy``.
     """
 
@@ -77,7 +77,6 @@ class SeparatePolicies(BasePolicy):
 
     @property
     def policies(self) -> list[ActorCriticPolicy]:
-        """Policies of the learners, front to rear."""
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
@@ -108,7 +107,7 @@ class SeparatePolicies(BasePolicy):
 
 
 class IndependentPPO(PPO):
-    """PPO with a separate policy for each learner. The columns of its log are ``vehicle_2/loss`` and so on."""
+    """PPO with a separate policy for each learner. Columns of its log are called ``vehicle_2/loss`` and so on."""
 
     policy: SeparatePolicies  # type: ignore[assignment]  # has the parts of an actor-critic policy that PPO uses
 

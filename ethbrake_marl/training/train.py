@@ -1,4 +1,4 @@
-"""Train policies, or resume a training."""
+"""``eb.train`` and ``eb.resume``: train policies, or resume a training."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _ONE_TRAINING = threading.Lock()
 
 @dataclass(frozen=True)
 class TrainResult:
-    """Policies, and how they came about.
+    """The trained policies, and how the training went.
 
     >>> import ethbrake_marl as eb
     >>> short = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_epochs": 1}
@@ -59,7 +59,7 @@ class TrainResult:
 
     @property
     def agent(self) -> str:
-        """Name of the trained agent for ``--agents``: ``policy@runs/mine``."""
+        """Name of the trained agent, such as ``policy@runs/mine``."""
         return agent_of(self.training, self.directory)
 
     @property
@@ -95,24 +95,24 @@ def train(
 ) -> TrainResult:
     """Train the learners of a scenario, and write the folder of the run.
 
-    Ctrl-C stops after the current update (status ``interrupted``), a second one at once. After Ctrl-C or an error
-    ``policy/`` has the best policy so far and ``policy-last/`` the latest; ``resume`` goes on. The same recipe,
-    scenario and seed lead to the same policy on the same machine, to the bit.
+    Ctrl-C stops after the current update (status ``interrupted``); a second Ctrl-C stops at once. Then, or after an
+    error, ``policy/`` has the best policy so far and ``policy-last/`` the latest; ``resume`` continues. The same
+    recipe, scenario and seed give the same policy on the same machine, to the bit.
 
     Args:
-        recipe: a recipe, its name, the path of its file, or the content of one.
+        recipe: a recipe, its name, the path of its file, or a file's content.
         scenario: likewise. Its roles say which vehicles learn.
         directory: new folder of the run.
-        scheme: how several learners train together. Where this or one of the next three is None, the recipe decides.
-        seed: of worlds, networks and exploration.
-        steps: decisions of all learners together. A training ends with a whole update, so there may be a few more.
-        device: ``cpu``, or another one for which the algorithm has a variant, such as ``cuda``.
+        scheme: how several learners train together; None: as in the recipe.
+        seed: seed of worlds, networks and exploration; None: as in the recipe.
+        steps: decisions of all learners together, rounded up to whole updates; None: as in the recipe.
+        device: ``cpu``, or another one for which the algorithm has a variant, such as ``cuda``; None: as in the recipe.
         force: replace an earlier run in ``directory``.
-        settings: ``KEY=VALUE`` by which recipe and scenario differ from their files, for ``config.json``.
-        measure: takes a ``Training``, and returns a function of policies, learner -> policy, that returns metrics. It
-            is called before the first update, every few updates and at the end. By default policies are measured on
-            the recipe's fixed list of worlds; None: not at all.
-        on_progress: is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
+        settings: ``KEY=VALUE`` in which recipe and scenario differ from their files, for ``config.json``.
+        measure: function of a ``Training`` that returns a function from policies (learner -> policy) to metrics. The
+            latter is called before the first update, every few updates and at the end. Default: measure on the recipe's
+            fixed list of worlds; None: never measure.
+        on_progress: function that is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
 
     Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe, scenario and device do not fit
     each other or another thread is training, ``TrainingDiverged`` if a loss or a weight is not finite.
@@ -134,9 +134,9 @@ def resume(
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
-    """Continue a training that was stopped or killed, from its newest checkpoint, or from the beginning.
+    """Continue a stopped or killed training from its newest checkpoint, or from the beginning if there is none.
 
-    Policies, evaluations and logs are the same as without the interruption, to the bit. Results of ``ethbrake run`` are
+    Policies, evaluations and logs have the same bits as without the interruption. Results of ``ethbrake run`` are
     deleted.
 
     Args:
@@ -180,10 +180,10 @@ def _only(policies: Policies) -> Policy:
 def _prepared(
     training: Training, folder: RunFolder, measure: Measure | None, on_progress: Told
 ) -> Iterator[BetweenUpdates]:
-    """Build environment and model; nothing is written yet.
+    """Build environment and model for a training, without writing anything; at the end restore the random generators.
 
-    Inside, Ctrl-C asks to stop, and torch has one thread: with networks so small a second one makes training 3 to 15
-    times slower if another process uses the cores. At the end the global random generators are as before.
+    Inside the block, Ctrl-C only sets a flag, and torch uses one thread: a second thread makes training 3 to 15 times
+    slower if another process uses the cores.
     """
     if not _ONE_TRAINING.acquire(blocking=False):
         raise InvalidInput(
@@ -205,7 +205,7 @@ def _prepared(
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv:
-    """Return the environment, with one row for each learner in each world."""
+    """Return the environment of a training, with one row for each learner in each world."""
     recipe = training.recipe
     scenario, game = open_game(training.scenario, reward=recipe.reward, observation=list(training.row.names))
     appended = APPENDED.get(training.scheme)
@@ -213,7 +213,7 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 
 
 def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainResult:
-    """Train to the end, or until somebody stops it; save the policies, also after an error."""
+    """Train until the end or a stop; save the policies, also after an error."""
     model, training, folder = updates.model, updates.training, updates.folder
     if saved is not None:
         updates.restore(saved)

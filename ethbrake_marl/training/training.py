@@ -1,4 +1,4 @@
-"""``Training``: a recipe and a scenario, and what follows: who learns, which policy drives whom, who observes what."""
+"""``Training``: a recipe with a scenario, and what follows from both: learners, policies, observations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 class Training(NamedTuple):
-    """A recipe and a scenario that fit each other (``Training.of``). Equal ones lead to equal policies."""
+    """A recipe and a scenario that fit each other (``Training.of``). Equal trainings give equal policies."""
 
     recipe: TrainingRecipe
     scenario: Scenario
@@ -30,10 +30,10 @@ class Training(NamedTuple):
 
     @classmethod
     def of(cls, recipe: Any, scenario: AnyScenario, **changes: Any) -> Training:
-        """Return the training of a recipe in a scenario, both as ``load_recipe`` and ``load_scenario`` take them.
+        """Return the training for a recipe and a scenario, given in any form that their ``load_...`` functions accept.
 
-        Learners observe what the recipe lists, else what the scenario lists. ``changes``: other values for keys of the
-        recipe. Raises ``InvalidInput`` if recipe and scenario do not fit each other.
+        Learners observe what the recipe lists, or else what the scenario lists. ``changes``: other values for keys of
+        the recipe. Raises ``InvalidInput`` if recipe and scenario do not fit each other.
         """
         recipe, scenario = load_recipe(recipe), load_scenario(scenario)
         recipe = recipe.replace(**changes) if changes else recipe
@@ -57,7 +57,7 @@ class Training(NamedTuple):
 
     @property
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """Learners that share a policy, one group for each policy, front to rear."""
+        """Groups of learners that share a policy, front to rear."""
         return tuple((name,) for name in self.learners) if self.scheme == "independent" else (self.learners,)
 
     @property
@@ -70,7 +70,7 @@ class Training(NamedTuple):
 
     @property
     def row(self) -> View:
-        """Features in a row of the environment: all that some learner observes."""
+        """Features in a row of the environment: all features that some learner observes."""
         return View(list(dict.fromkeys(name for view in self.views for name in view.names)))
 
     @property
@@ -81,7 +81,7 @@ class Training(NamedTuple):
 
     @property
     def objective(self) -> str:
-        """What the learners minimise, such as ``own``; empty if it is the harm of the whole line."""
+        """What the learners minimise, such as ``own``; "" if it is the harm of the whole line."""
         declared = self.recipe.reward.objective or self.scenario.objective
         objectives = objectives_of(declared, self.scenario.vehicles)
         whole = all(each.kind is OBJECTIVES["total"] for each in objectives)
@@ -92,7 +92,7 @@ class Training(NamedTuple):
         return ", ".join(dict.fromkeys(declared[body - 1] for body in self.scenario.learners))
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Return everything that affects the training, defaults included, without titles and descriptions."""
+        """Return everything that affects the training, including defaults, without titles and descriptions."""
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
 
@@ -102,7 +102,6 @@ class Training(NamedTuple):
         return hashlib.sha256(json.dumps(self.content(), sort_keys=True).encode()).hexdigest()
 
     def config(self, settings: Sequence[str] = ()) -> dict[str, Any]:
-        """Return the content of ``config.json``."""
         return {
             "recipe": self.recipe.model_dump(mode="json"),
             "scenario": self.scenario.declared(),
@@ -112,7 +111,7 @@ class Training(NamedTuple):
         }
 
     def who_drives(self) -> str:
-        """Return, for instance, ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Return a text such as ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         parts = (f"{self.drivers[group[0]]} drives {', '.join(group)}" for group in self.groups)
         return f"scheme {self.scheme}: {'; '.join(parts)}"
 

@@ -29,7 +29,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Stopped(Exception):
-    """Leaves Stable-Baselines3's loop between two updates."""
+    """Ends Stable-Baselines3's training loop between two updates."""
 
 
 class TrainingDiverged(EthBrakeError, ArithmeticError):
@@ -37,7 +37,7 @@ class TrainingDiverged(EthBrakeError, ArithmeticError):
 
 
 class BetweenUpdates(BaseCallback):
-    """The work before the first update, between updates and at the end."""
+    """Callback for the work before the first update, between updates and at the end of a training."""
 
     model: BaseAlgorithm
 
@@ -61,23 +61,23 @@ class BetweenUpdates(BaseCallback):
             )
         self.model.set_logger(Logger(str(folder.path), []))
         self.count = 0  # updates so far
-        self.policies: Policies = {}  # the last ones whose weights are finite
-        self.steps = self.updates = 0  # of `policies`
-        self.best: Policies = {}  # on the fixed list; empty if nothing was measured
-        self.best_value = math.inf
+        self.policies: Policies = {}  # the latest policies with finite weights
+        self.steps = self.updates = 0  # decisions and updates when `policies` was copied
+        self.best: Policies = {}  # best policies on the fixed list; empty if nothing was measured
+        self.best_value = math.inf  # the metric of `best`
         self.evaluations: list[dict[str, float]] = []
-        self.note = ""
-        self.restored = False  # the work after this update was done before the checkpoint
+        self.note = ""  # text for the next progress report
+        self.restored = False  # True just after `restore`: this update's work was done before the checkpoint
         self.wall_start, self.cpu_start = time.monotonic(), time.process_time()
 
     @property
     def wall_s(self) -> float:
-        """Time of this training, without the time between a stop and ``resume``."""
+        """Time spent on this training (s), without breaks before ``resume``."""
         return time.monotonic() - self.wall_start
 
     @property
     def chosen(self) -> Policies:
-        """The best policies so far; without measurements the latest."""
+        """The best policies so far, or the latest if nothing was measured."""
         return self.best or self.policies
 
     def _on_step(self) -> bool:
@@ -103,7 +103,7 @@ class BetweenUpdates(BaseCallback):
         self.work(last=True)
 
     def work(self, *, last: bool = False) -> None:
-        """Measure, log and report if it is time to."""
+        """Measure, log and report, each if it is due."""
         recipe = self.training.recipe
         measured = self.evaluate is not None and (last or self.count % recipe.evaluation.every_updates == 0)
         if last or measured or self.count % recipe.updates_per_row == 0:
@@ -114,7 +114,7 @@ class BetweenUpdates(BaseCallback):
             self.report()
 
     def take_policies(self) -> None:
-        """Keep a copy of the current policies. Raises ``TrainingDiverged``."""
+        """Store a copy of the current policies. Raises ``TrainingDiverged``."""
         check_finite(self.model)
         actors, networks = self.algorithm.actors(self.model), self.training.networks
         tensors = [self.algorithm.tensors(*pair) for pair in zip(actors, networks, strict=True)]
@@ -122,7 +122,7 @@ class BetweenUpdates(BaseCallback):
         self.steps, self.updates = self.model.num_timesteps, self.count
 
     def measure(self) -> None:
-        """Measure the policies, and keep them if they are the best so far."""
+        """Measure the stored policies, and remember them if they are the best so far."""
         assert self.evaluate is not None
         begun = time.process_time()
         metrics = {name: float(value) for name, value in self.evaluate(self.policies).items()}
@@ -156,7 +156,6 @@ class BetweenUpdates(BaseCallback):
         )
 
     def write_checkpoint(self) -> None:
-        """Raises ``TrainingDiverged``."""
         check_finite(self.model)
         best = [self.best[learners[0]] for learners in self.training.groups] if self.best else []
         course = {
@@ -175,7 +174,7 @@ class BetweenUpdates(BaseCallback):
         checkpoint.write(self.folder.checkpoints, {**marks, "course": course, "model": checkpoint.capture(self.model)})
 
     def restore(self, saved: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint. Raises ``CorruptBundle`` if it does not fit this training."""
+        """Continue from a checkpoint. Raises ``CorruptBundle`` if it does not fit this training."""
         course = saved["course"]
         try:
             checkpoint.restore(self.model, saved["model"])
@@ -214,7 +213,7 @@ class BetweenUpdates(BaseCallback):
 
 
 def check_finite(model: BaseAlgorithm) -> None:
-    """Raise ``TrainingDiverged`` unless losses and weights are finite, and the exploration noise finite and above 0."""
+    """Raise ``TrainingDiverged`` unless losses, weights and exploration noise are finite, and the noise is above 0."""
     losses = torch.tensor([value for name, value in model.logger.name_to_value.items() if name.endswith("loss")])
     noise = getattr(model.policy, "log_std", torch.zeros(1)).detach().exp()
     if not all(bool(torch.isfinite(each).all()) for each in (losses, *model.policy.parameters(), noise, 1.0 / noise)):

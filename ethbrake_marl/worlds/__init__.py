@@ -1,1 +1,1 @@
-"""Worlds: what a scenario file says, and the worlds that are drawn from it or given by the user."""
+"""Worlds: scenario files, and the worlds that are drawn from a scenario or given by the user."""

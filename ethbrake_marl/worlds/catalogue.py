@@ -1,4 +1,4 @@
-"""The catalogue: shipped and registered scenarios by name, and other scenario files by path."""
+"""The catalogue of scenarios: shipped and registered ones by name, other files by path."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def shipped_folder(folder: Literal["scenarios", "train"] = "scenarios") -> Path:
 
 
 def register_scenarios(folder: str | os.PathLike[str]) -> None:
-    """Register the scenarios of a folder by name: its file ``my-name.yaml`` becomes ``--scenario my-name``.
+    """Register the scenarios in a folder: its file ``my-name.yaml`` becomes ``--scenario my-name``.
 
-    A file is checked when its scenario is used. Raises ``InvalidInput`` for a folder without such files, and
-    ``AlreadyExists`` for a name in use.
+    Files are checked only when used. Raises ``InvalidInput`` for a folder without YAML files, and ``AlreadyExists`` for
+    a name in use.
     """
     path = Path(folder).expanduser().resolve()
     files = sorted(path.glob("*.yaml"))
@@ -61,7 +61,7 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
 
 
 def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenario:
-    """Load a scenario by name, by the path of its file (``scenario_path``), or from the content of such a file.
+    """Load a scenario by its name, by the path of its file (``scenario_path``), or from a file's content.
 
     Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` with file, line, key and value for a bad file, or
     one whose key ``name`` differs from its file name.
@@ -84,8 +84,8 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
 def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
     """Path of a scenario's file, which need not exist.
 
-    Names ending in ``.yaml`` or ``.yml`` are paths. Otherwise shipped and registered names come first, so that no file
-    changes the meaning of a command. ``my/folder/mine`` means ``my/folder/mine.yaml`` or ``mine.yml`` below ``folder``.
+    A text that ends in ``.yaml`` or ``.yml`` is a path. Otherwise it is a shipped or registered name, or else
+    ``my/folder/mine`` stands for ``my/folder/mine.yaml`` or ``mine.yml`` below ``folder``.
     """
     text, paths = str(name_or_path), _known_paths()
     path = folder / Path(text).expanduser()
@@ -100,14 +100,14 @@ def scenario_path(name_or_path: str | Path, folder: Path = Path()) -> Path:
 
 
 def group_of_scenarios(name: str) -> list[str]:
-    """Names in a group: ``benchmark``, or a folder of shipped scenarios; empty for an unknown group."""
+    """Names in a group: ``benchmark``, or a folder of shipped scenarios; [] for an unknown group."""
     if name == "benchmark":
         return list(BENCHMARK)
     return sorted(path.stem for path in shipped_folder().glob("*/*.yaml") if path.parent.name == name)
 
 
 def list_scenarios() -> list[CatalogueEntry]:
-    """Shipped and registered scenarios, sorted by name; their files are not checked."""
+    """Shipped and registered scenarios, sorted by name. Their files are not checked."""
     entries = []
     for name, path in sorted(_known_paths().items()):
         content = read_yaml(path).content

@@ -1,17 +1,18 @@
-"""The V2X channel: when each vehicle first knows of each other vehicle, by a message or because it sees a neighbour.
+"""The V2X channel: when each vehicle first knows of each other vehicle, by a message or by seeing a neighbour.
 
-A link is the way from a sender j to a receiver i. The first message of j can be used from (s after the alert)
+A link leads from a sender j to a receiver i. The first message of j can be used after (s since the alert)
 
     tau_ij = U(0, T) + k T + L_radio + t_proc + t_act
 
 with the message period T, the random wait ``U(0, T)`` for the next message, the number k of periods in which a burst of
-losses destroys every message, the time of transmission L_radio, of processing t_proc, and until the brakes respond
-t_act. In each period a burst begins with probability p, and an ongoing burst ends with probability r; in the stationary
-state of this Gilbert-Elliott channel ``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With probability
-``lost`` no message ever arrives on a link. A direct neighbour in sight is seen after a *hop*, drawn from ``sensing_s``.
+losses destroys every message, and the times for transmission L_radio, for processing t_proc, and until the brakes
+respond t_act. In each period a burst begins with probability p, and an ongoing burst ends with probability r; in the
+stationary state of this Gilbert-Elliott channel ``P(k >= m) = (p / (p + r)) (1 - r)^(m - 1)`` for m = 1, 2, ... With
+probability ``lost`` a link never delivers a message. A direct neighbour in sight is seen after a delay, the *hop*,
+drawn from ``sensing_s``.
 
 Vehicle i can react from ``latency_i = max(own latency_i, min(tau_i1, latency_(i-1) + hop_(i, i-1)))`` on: its own
-latency is over, and it has the message of Vehicle 1 or has seen the vehicle ahead brake. It acts on news of j from
+latency is over, and it has the message of Vehicle 1 or has seen the vehicle ahead brake. It reacts to vehicle j from
 ``max(latency_i, min(tau_ij, hop_ij))`` on. With the preset ``paper`` it knows everything once its own latency is over.
 """
 
@@ -70,7 +71,8 @@ class Equipage(Part):
 def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     """Number k of periods that a burst of losses lasts, for uniform numbers ``u``.
 
-    k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``. No logarithm: every machine gets the same k.
+    With p = ``loss_begins`` and r = ``loss_ends``, k is at least m exactly if ``u < (p / (p + r)) (1 - r)^(m - 1)``.
+    Without a logarithm every machine gets the same k.
     """
     bound, bounds = loss_begins / (loss_begins + loss_ends), []
     while bound > 2.0**-53:
@@ -81,32 +83,32 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
 
 
 class Extension(Protocol):
-    """What a package adds to the knowledge of vehicles, declared by keys of ``v2x``."""
+    """What an extension adds to the V2X channel, declared by keys of ``v2x``."""
 
     name: str  # of its memory in `State.memories`
     schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
 
     def read(self, key: str, value: Any) -> Any:
-        """Value of a key as plain data; a bad value is refused (``files.model.refuse``)."""
+        """Value of a key as plain data. Refuses a bad value (``files.model.refuse``)."""
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Keys of messages that have an effect because of this extension; keys without effect are refused."""
+        """Keys about messages that this extension uses. Keys that nobody uses are refused."""
 
     def is_random(self, v2x: V2X) -> bool:
         """Whether it draws random numbers of its own."""
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse a scenario in which these keys cannot be used."""
+        """Refuse a scenario that cannot have these keys."""
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
-        """Memory of n worlds at the alert."""
+        """Memory of this extension for n worlds at the alert."""
 
     def game(self, game: Game) -> Game:
-        """Game with this extension."""
+        """The game, changed by this extension."""
 
 
 def register_v2x_extension(key: str, extension: Extension) -> None:
-    """Register what the key ``key`` of ``v2x`` declares. Entry points: ``ethbrake_marl.v2x_extensions``."""
+    """Register the extension for a key of ``v2x``. Entry points: ``ethbrake_marl.v2x_extensions``."""
     EXTENSIONS.add(key, extension, lambda other: other is extension)
 
 
@@ -183,14 +185,14 @@ class V2X(Part):
 
     @model_serializer(mode="wrap")
     def _as_written(self, dump: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
-        """Keys of the file; those that the preset sets are null or left out."""
+        """Keys of the file; keys that the preset sets are null or left out."""
         whole = not (info.exclude_unset or info.exclude_none)
         return {
             key: each if key in self._keys else None for key, each in dump(self).items() if whole or key in self._keys
         }
 
     def _check(self) -> None:
-        """Refuse keys without effect, and a channel that may leave a vehicle without any news."""
+        """Refuse keys without effect, and a channel that may never tell a vehicle anything."""
         used = [key for extension in self.extensions for key in extension.uses(self)]
         unused = [key for key in OF_MESSAGES if key not in used]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)
@@ -224,26 +226,26 @@ class V2X(Part):
 
     @property
     def timing(self) -> Literal["latency", "fixed", "messages"]:
-        """Whether a message can be used after the receiver's latency, after ``link_latency_s``, or is drawn."""
+        """How the time of a message is set: by the receiver's latency, by ``link_latency_s``, or by a random draw."""
         if self.link_latency_s is not None:
             return "fixed"
         return "latency" if PRESETS[self.preset].get("preset", self.preset) == "paper" else "messages"
 
     @property
     def by_link(self) -> bool:
-        """Whether the channel differs from that of the paper: each vehicle knows everything after its own latency."""
+        """Whether the channel is not the paper's, in which each vehicle knows everything after its own latency."""
         return self.timing != "latency" or (self.hears, self.senses, self.lost) != ("all", "none", 0.0)
 
     @property
     def drawn(self) -> bool:
-        """Whether random numbers determine what vehicles know, or when."""
+        """Whether random numbers decide what vehicles know, or when."""
         heard = self.hears != "none" and (self.timing == "messages" or 0.0 < self.lost < 1.0)
         seen = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
         own = any(extension.is_random(self) for extension in self.extensions)
         return self.by_link and (heard or seen or own)
 
     def first_message_s(self, u: Floats) -> Floats:
-        """Waiting time tau of links (s) for uniform numbers ``u`` [..., PER_LINK]; infinite: no message arrives."""
+        """Delay tau of each link's first message (s), for uniform numbers ``u`` [..., PER_LINK]; infinite: none."""
         delay = np.full(u.shape[:-1], -np.inf if self.link_latency_s is None else self.link_latency_s)
         if self.timing == "messages":
             periods = burst_periods(u[..., 1], self.loss_begins, self.loss_ends)
@@ -253,10 +255,10 @@ class V2X(Part):
         return delay
 
     def heard_and_seen(self, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """When i can use the first message of j, and the delay until i sees j, [n, N, N] s each.
+        """Time until i can use the first message of j, and delay until i sees j, [n, N, N] s each.
 
-        ``u`` [n, PER_LINK N^2] are the uniform numbers of the links, ``unheard`` [n or 1, N, N] says whose equipment
-        lets no message through (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
+        ``u`` [n, PER_LINK N^2] are uniform numbers for the links. ``unheard`` [n or 1, N, N] says which links the
+        vehicles' equipment excludes (``Scenario.unheard``). Infinite: never. Minus infinite: at once.
         """
         N = unheard.shape[1]
         links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
@@ -268,7 +270,7 @@ class V2X(Part):
         return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
 
     def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """When each vehicle can react, [n, N] s, and from when it acts on news of each other, [n, N, N] s."""
+        """Times from which each vehicle can react, [n, N] s, and from which i reacts to j, [n, N, N] s."""
         N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, unheard)
         latency = own_latency.copy()
         for i in range(1, N if self.timing != "latency" else 0):
@@ -286,10 +288,10 @@ class V2X(Part):
 
 
 def register_preset(name: str, settings: Mapping[str, Any]) -> None:
-    """Register a channel that every scenario can then use: ``v2x: name``.
+    """Register a channel under a name, for ``v2x: name`` in scenarios.
 
-    ``settings`` is the content of ``v2x`` in a scenario, such as ``{"preset": "nominal", "lost": 0.1}``. Raises
-    ``AlreadyExists`` if the name belongs to another channel, ``InvalidInput`` for a bad name or bad settings.
+    ``settings`` is a content of ``v2x``, such as ``{"preset": "nominal", "lost": 0.1}``. Raises ``AlreadyExists`` if
+    another channel has the name, ``InvalidInput`` for a bad name or bad settings.
     """
     if not isinstance(name, str) or re.fullmatch(NAME_PATTERN, name) is None:
         raise InvalidInput(

@@ -1,4 +1,4 @@
-"""Checks of a scenario that concern several keys; each refuses the first mistake, with its place."""
+"""Checks of a scenario that involve several keys. Each refuses the first mistake, with its place."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_whole(scenario: Scenario) -> None:
-    """Refuse a scenario, which is no mixture, whose keys contradict each other."""
+    """Refuse a scenario (other than a mixture) whose keys contradict each other."""
     if scenario.types is not None:
         check_types(scenario.types, scenario.vehicle_types, scenario.vehicles)
     _check_declared_once(scenario)
@@ -42,7 +42,7 @@ def check_whole(scenario: Scenario) -> None:
 
 
 def _check_declared_once(scenario: Scenario) -> None:
-    """Refuse a quantity that is declared twice, or not at all, for some vehicle."""
+    """Refuse a quantity that is declared twice, or missing, for some vehicle."""
     for key, rule in RULES.items():
         value = getattr(scenario, key)
         kinds = scenario.vehicle_types or {} if key in OF_A_TYPE else {}
@@ -113,11 +113,9 @@ _EXAMPLES = {"name": "name: my-scenario", "scenario": "{scenario: paper-random, 
 
 class ScenarioWording(Wording):
     def instead(self, key: str) -> str:
-        """What to write instead of a wrong or former key."""
         return _INSTEAD.get(key, "")
 
     def needed(self, path: YamlPath) -> str:
-        """Advice on what to write at ``path``, with an example."""
         rule, key = RULES.get(str(path[-1])), str(path[-1])
         if rule is None:
             return f"write, for instance, {_EXAMPLES[key]}" if key in _EXAMPLES else f"write {_DISTRIBUTION}"

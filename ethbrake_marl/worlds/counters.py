@@ -22,7 +22,7 @@ _PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 
 def world_numbers(n: int, seed: int, first: int, channel: str) -> Ints:
-    """``first`` to ``first + n - 1``, [n]."""
+    """Checked numbers of worlds, ``first`` to ``first + n - 1``, [n]."""
     check_whole_number("number of worlds", n, 1, MOST_AT_ONCE)
     check_whole_number("seed of the list", seed, 0)
     check_whole_number("first world", first, 0, _MOST_WORLDS)
@@ -32,7 +32,7 @@ def world_numbers(n: int, seed: int, first: int, channel: str) -> Ints:
 
 
 def numbers_of(seed: int, channel: str, attempt: int, index: Ints) -> Numbers:
-    """Random numbers of the worlds ``index`` [n], ascending, in one attempt to draw them (from 0).
+    """Function for the random numbers of the worlds ``index`` [n], ascending, in one attempt (from 0) to draw them.
 
     A number is the upper 53 bits of an integer from Philox, divided by 2^53. The key of Philox comes from seed,
     channel, attempt and stream; world k has the counters from ``k width / 4`` on. A width is a multiple of 4.

@@ -1,4 +1,4 @@
-"""Quantities that follow from the declared ones, and what must hold of them."""
+"""Quantities that are computed from the declared ones, and checks of all of them."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def world_values(
 ) -> Values:
     """All quantities of k worlds except the distance of the obstacle, from the declared ones.
 
-    ``speed = line speed + own deviation``, ``gap = time gap x speed of the rear vehicle`` and ``latency = own latency +
-    time of the alert`` grow with what is declared: bounds of the declared quantities give bounds of these. Friction
-    limits capacities to friction x gravity. ``settle`` may replace the values of a key, before others follow from it.
+    ``speed = line speed + own deviation``, ``gap = time gap x speed of the rear vehicle``, ``latency = own latency +
+    time of the alert``. These increase with the declared quantities, so bounds give bounds. Friction limits capacities
+    to friction x gravity. ``settle(key, values)`` may replace values before others are computed from them.
     """
     keys = [key for key in (*USUAL, *OPTIONAL) if key != "obstacle_gap_m" and key in scenario.sources]
     values = {key: declared(key) for key in keys}
@@ -50,8 +50,9 @@ def world_values(
 def obstacle_gap(scenario: Scenario, values: Values, declared: Callable[[str], Floats]) -> Floats:
     """Distance from Vehicle 1 to the obstacle, [k, 1] m, in a scenario with an obstacle.
 
-    It is declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)``: the margin is what is left if Vehicle 1 brakes fully
-    (longer while its brakes build up: ``motion.forces.stopping_m``).
+    It is declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)`` from speed, latency and braking capacity of Vehicle 1.
+    The margin is the distance left after full braking (which takes longer if brakes build up:
+    ``motion.forces.stopping_m``).
     """
     if "obstacle_gap_m" in scenario.sources:
         return declared("obstacle_gap_m")
@@ -62,9 +63,9 @@ def obstacle_gap(scenario: Scenario, values: Values, declared: Callable[[str], F
 
 
 def mistakes(scenario: Scenario, low: Values, high: Values) -> Iterator[tuple[str, int, int, str]]:
-    """Contradictions in k worlds whose quantities are from ``low`` to ``high``, each [k, entries].
+    """Contradictions in k worlds whose quantities lie between ``low`` and ``high``, each [k, entries].
 
-    Each has the key of a quantity (``v2x``: of news), the vehicle's index, the row of the first such world, and what
+    Yields the quantity's key (``v2x``: the channel), the vehicle's index, the row of the first such world, and what
     would be right.
     """
 

@@ -1,4 +1,4 @@
-"""Drawn worlds as columns of a table: quantities, vehicle types, member, recording."""
+"""Drawn worlds as columns of a table: quantities, vehicle types, scenario, recording."""
 
 from __future__ import annotations
 
@@ -26,9 +26,8 @@ def columns_of(drawn: Drawn) -> dict[str, NDArray[np.generic]]:
 def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str, Floats]:
     """Quantities of worlds at the alert, name -> [n], as ``worlds_from_table`` reads them.
 
-    Capacities are those on the road, whose ``friction`` [n] is a column if every world has one. An obstacle, rates and
-    weights are columns if a world has them; a distance is NaN where there is no obstacle, and what is infinite is the
-    largest value that can be declared.
+    Capacities include the road's ``friction`` [n]. Friction is a column if every world has one; obstacle, rates and
+    weights if some world has them. A missing obstacle is NaN; an infinite rate becomes the largest valid number.
     """
     values = {"gaps_m": worlds.gaps_m, "speeds_mps": worlds.speeds_mps, "restitution": worlds.car[:, RESTITUTION, 1:2]}
     values |= {key: worlds.car[:, row, 1:] for key, row in CAR_ROWS.items()}
@@ -46,14 +45,14 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
 
 
 def fixed_columns(scenario: Scenario) -> set[str]:
-    """Columns of ``quantities_of`` that are the same in every world; gaps and speeds never are."""
+    """Columns of ``quantities_of`` that are equal in all worlds, apart from gaps and speeds."""
     keys = [key for key in CAR_ROWS if key in USUAL or key in scenario.sources] + ["restitution"]
     ends = {RULES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
     return {name for name, (low, high) in ends.items() if low == high}
 
 
 def kinds_of(drawn: Drawn) -> dict[str, Texts]:
-    """Columns of texts: ``scenario`` of a mixture, ``recording``, ``vehicle_1_type`` and so on."""
+    """Columns of texts: ``scenario`` (in a mixture), ``recording``, ``vehicle_1_type`` and so on."""
     columns = {"scenario": drawn.scenarios, RECORDING: drawn.recordings}
     types = drawn.types.T if (drawn.types != "").any() else ()
     columns = {name: column for name, column in columns.items() if (column != "").any()}
@@ -63,8 +62,8 @@ def kinds_of(drawn: Drawn) -> dict[str, Texts]:
 def clusters_of(columns: Mapping[str, NDArray[Any]]) -> Texts | None:
     """Name of each world's cluster, [n]; None if all worlds are independent.
 
-    Worlds of one recording, named before the last ": " of a cell, depend on each other. A world without a recording is
-    a cluster of its own.
+    Worlds of one recording (the text before the last ": " of the column) depend on each other. A world without a
+    recording is its own cluster.
     """
     if RECORDING not in columns:
         return None

@@ -1,4 +1,4 @@
-"""A scenario in words: its keys with ranges and defaults, sentences about it, a new file, and the JSON Schema."""
+"""A scenario in words: its keys with ranges and defaults, sentences about it, a new file, the JSON Schema."""
 
 from __future__ import annotations
 
@@ -84,9 +84,9 @@ def check_file_name(kind: str, name: str) -> None:
 
 
 def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: str = "") -> str:
-    """Commented text of a new scenario file with the values of ``based_on``.
+    """Text of a new scenario file, with comments and the values of ``based_on``.
 
-    A key that is not used stands in a comment, with an example. ``rows_file`` names a copy of the table's CSV file.
+    Unused keys are comments with an example. ``rows_file``: name of a copy of the table's CSV file.
     """
     check_file_name("scenario", name)
     base, values = load_scenario(based_on), dict(read_yaml(scenario_path(based_on)).content)

@@ -1,4 +1,4 @@
-"""From a scenario to a game: its worlds, rules, scripts, observations and rewards."""
+"""Makes a game from a scenario: worlds, rules, scripts, observations and rewards."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ AT_ONCE = 1024  # training worlds that are drawn together: drawing one alone cos
 
 
 class Pool:
-    """The training worlds of a scenario, drawn many at a time."""
+    """The training worlds of a scenario. It draws many at a time and keeps the rest."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario, self.seed, self.first = scenario, -1, 0
         self.worlds: State | None = None
 
     def __call__(self, n: int, seed: int, first: int) -> State:
-        """Worlds ``first`` to ``first + n - 1`` of the seed, in memory of their own."""
+        """Copies of the worlds ``first`` to ``first + n - 1`` of the seed."""
         worlds = self.worlds
         if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
             worlds = self.scenario.sample(max(4 * n, AT_ONCE), seed, first=first, channel="training")
@@ -47,17 +47,10 @@ def game_of(
     observation: Any = None,
     reward_vector: Any = None,
 ) -> tuple[Scenario, Game]:
-    """The scenario, with the observation, and its game. ``names.open_game`` also finds both by names.
+    """The scenario (with the given observation) and its game. ``names.open_game`` does the same from names.
 
-    Warns (``FreeImpacts``) of a learner's objective in which an impact costs nothing.
-
-    Args:
-        scenario: of the worlds.
-        scripts: body -> script, for each vehicle whose role is an agent that looks at the state.
-        reward: ``harm``, ``total-harm``, ``honest``, ``paper``, a mapping of settings, or ``RewardParams``.
-        observation: features of all vehicles, or vehicle -> features; None: the scenario's.
-        reward_vector: components of a vector reward (``episode.terms``).
-
+    ``scripts``: body -> script, for vehicles whose role is an agent that looks at the state. The other arguments are
+    those of ``EthBrakeParallelEnv``. Warns (``FreeImpacts``) if an impact costs nothing under a learner's objective.
     """
     if observation is not None:
         now = {name: view.names for name, view in zip(scenario.vehicle_names, views_of(scenario), strict=True)}
@@ -95,15 +88,15 @@ def _warn_of_ties(scenario: Scenario, declared: Declared) -> None:
 
 @cache
 def _warn_once(message: str) -> None:
-    """Warn once of each message: a training opens its game several times, and Python forgets what it has shown."""
+    """Warn once of each message, although a training opens its game several times."""
     warnings.warn(message, FreeImpacts, stacklevel=2)
 
 
 def views_of(scenario: Scenario) -> tuple[View, ...]:
     """What each vehicle observes, front to rear.
 
-    Default: itself and one neighbour on each side; where there may be an obstacle, also its place in the line and the
-    obstacle.
+    Default: itself and one neighbour on each side, and if there may be an obstacle also the vehicle's role in the line
+    and the obstacle.
     """
     usual = View(["own", "front_1", "rear_1", *(["role", "obstacle"] if scenario.has_obstacle else [])])
     listed = scenario.observation

@@ -1,4 +1,4 @@
-"""Worlds of the user: one state, columns of a table, or a CSV file; the scenario fixes the rest."""
+"""Worlds from the user: one state, columns of a table, or a CSV file. The scenario supplies the rest."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from ethbrake_marl.worlds.table import CsvFile
 
 
 def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> State:
-    """One world from ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; one number is for all vehicles.
+    """One world from ``{"gaps_m": [7, 7], "speeds_mps": [20, 18, 20], ...}``; a single number is for all vehicles.
 
-    A key that is left out has the scenario's value, which must be fixed. Raises ``InvalidInput`` with key and index.
+    A missing key takes the scenario's value, which must be fixed. Raises ``InvalidInput`` with key and index.
     """
     where = "initial_state"
     if not isinstance(initial_state, Mapping):
@@ -44,9 +44,9 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
 def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """Worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
-    ``columns`` may also be a pandas or polars data frame, or a pyarrow table. Rows are paired by position. A quantity
-    without a column (``given_columns``) has the scenario's value, which must be fixed. Raises ``InvalidInput`` with
-    column and row (from 0).
+    ``columns`` may also be a pandas or polars data frame, or a pyarrow table; rows are matched by position. A missing
+    column (``given_columns``) takes the scenario's value, which must be fixed. Raises ``InvalidInput`` with column and
+    row (from 0).
     """
     scenario, where = load_scenario(scenario), "initial states"
     names = getattr(columns, "column_names", None) or getattr(columns, "columns", columns)  # of pyarrow, or a frame
@@ -71,7 +71,7 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
 
 
 def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
-    """Worlds of a CSV file with the columns of ``worlds_from_table``; ``InvalidInput`` names file, line and column."""
+    """Worlds from a CSV file with the columns of ``worlds_from_table``. Errors name file, line and column."""
     scenario, file = load_scenario(scenario), CsvFile.read(Path(path).expanduser())
     entries = _entries(file.header, scenario, f"{file.path}, line 1")
     table = np.array(file.cells(file.header), np.float64)
@@ -80,13 +80,13 @@ def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
 
 
 def given_keys(scenario: Scenario) -> tuple[str, ...]:
-    """Quantities of the worlds of this scenario: ``gaps_m`` and so on."""
+    """Keys of the quantities that worlds of this scenario have, such as ``gaps_m``."""
     there = {"obstacle_gap_m": scenario.has_obstacle}
     return USUAL + tuple(key for key in OPTIONAL if there.get(key, key in scenario.sources))
 
 
 def given_columns(scenario: Scenario) -> dict[str, Entry]:
-    """Possible columns of a table of worlds: ``{"gap_1_m": ("gaps_m", 0), ...}``."""
+    """Possible columns of a table of worlds, such as ``{"gap_1_m": ("gaps_m", 0)}``."""
     return table_columns(given_keys(scenario), scenario.vehicles)
 
 
@@ -107,7 +107,7 @@ def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entr
 def _worlds(
     scenario: Scenario, given: Mapping[Entry, Floats], where: str, row_text: Callable[[int], str] | None = None
 ) -> State:
-    """Checked worlds of the columns ``given``, each [n], filled in with what the scenario fixes.
+    """Checked worlds from the columns ``given``, [n] each, and the scenario's fixed values.
 
     ``row_text`` names a row in error messages; None: there is one world, whose values are named by their keys.
     """
@@ -160,7 +160,7 @@ def _worlds(
 
 
 def _numbers(what: str, value: Any) -> Floats:
-    """Refuse what numpy would convert: booleans, masks, texts."""
+    """Array of numbers. Refuses booleans, masks and texts, which numpy would convert."""
     try:
         cells = np.asarray(value)
         kinds = {type(cell) for cell in np.asarray(value, object).flat} if isinstance(value, list | tuple) else set()

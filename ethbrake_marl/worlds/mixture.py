@@ -22,9 +22,9 @@ _SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them if all
 
 
 def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Content of a scenario file with other values; a new way to declare gaps replaces the old way.
+    """Content of a scenario file with changed values; a key that becomes None is left out.
 
-    A key that becomes None is left out.
+    A new way to declare gaps, speeds or an obstacle replaces the old one.
     """
     old = {key for pair in ALTERNATIVES.items() for key in pair if changes.keys() & set(pair)}
     if "speeds_mps" in changes:
@@ -34,9 +34,10 @@ def changed_content(content: Mapping[str, Any], changes: Mapping[str, Any]) -> d
 
 
 def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str, Any]:
-    """Content of a mixture with a ``Scenario`` for each member, and with what all members share.
+    """Content of a mixture with a ``Scenario`` object for each member, and with the values that all members share.
 
-    Keys beside ``mixture`` replace the same keys of every member. A malformed list is left to the schema.
+    Keys beside ``mixture`` replace the same keys of every member. A malformed list is returned as it is, for the schema
+    to refuse.
     """
     listed = content["mixture"]
     if (
@@ -66,7 +67,6 @@ def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str,
 
 
 def _check_alike(members: Sequence[Scenario]) -> None:
-    """Refuse members that cannot be drawn together."""
     first, *others = members
     extended = any(member.v2x.extensions for member in members)
     for k, other in enumerate(others, 1):

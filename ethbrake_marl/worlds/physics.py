@@ -1,4 +1,4 @@
-"""Physics other than exact impacts, by the key ``physics`` of a scenario."""
+"""Other kinds of physics than exact impacts, chosen by the key ``physics`` of a scenario."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
 
 
 class Physics(Protocol):
-    """How the vehicles of a game move, in place of the exact physics."""
+    """How vehicles move and collide in a game, instead of the exact physics."""
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse (``files.model.refuse``) a scenario that this physics cannot play."""
+        """Refuse (``files.model.refuse``) a scenario that this physics cannot simulate."""
 
     def game(self, game: Game) -> Game:
-        """The game with this physics: a subclass with its own ``follow``."""
+        """The game with this physics: a subclass of ``Game`` with its own ``follow``."""
 
 
 def register_physics(name: str, physics: Physics) -> None:

@@ -1,4 +1,4 @@
-"""Quantities: a number or a distribution, which turns one uniform number u in [0, 1) into a value.
+"""Quantities of a scenario: a number, or a distribution that turns a uniform number u in [0, 1) into a value.
 
 Every distribution uses its inverse cumulative distribution function. ``exp``, ``log`` and the normal quantile come from
 ``motion.elementary``, so a seed gives the same worlds on every machine.
@@ -34,7 +34,7 @@ PositiveEnds = Annotated[tuple[Positive, Positive], Field(strict=False), AfterVa
 
 
 def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
-    """For each ``u``, the first index whose cumulative share of the ``weights`` is above it."""
+    """Index for each ``u``: the first one whose cumulative share of the ``weights`` is above it."""
     cumulative = np.cumsum(np.asarray(weights, np.float64))
     return np.searchsorted(cumulative / cumulative[-1], u, side="right")
 
@@ -50,7 +50,7 @@ class Part(FileModel):
 
 
 class Distribution(Part):
-    """A distribution; its first field has its name, and its shape."""
+    """A distribution. Its first field has the distribution's name and contains its shape."""
 
     @property
     def support(self) -> tuple[float, float]:
@@ -64,7 +64,7 @@ class Uniform(Distribution):
     uniform: Ends = Field(description="[low, high]")
 
     def value(self, u: Floats) -> Floats:
-        """No value is above high, because u is at most 1 - 2^-53."""
+        """Value in [low, high]: it is never above high, because u is at most 1 - 2^-53."""
         low, high = self.uniform
         return low + (high - low) * u
 
@@ -93,7 +93,7 @@ class NormalShape(Part):
         return self
 
     def shares(self) -> tuple[float, float]:
-        """Probabilities of a value below ``low`` and below ``high`` before truncation."""
+        """Probabilities of a value below ``low``, and below ``high``, before truncation."""
         low, high = (normal_probability((end - self.mean) / self.sd) for end in (self.low, self.high))
         return low, high
 
@@ -169,7 +169,6 @@ DISTRIBUTIONS = ("uniform", "loguniform", "normal", "lognormal", "choice")
 
 
 def _tag(value: object) -> str | None:
-    """Tag of the class that checks a value from a file; None if no class can."""
     if isinstance(value, Distribution):
         return f"#{next(iter(type(value).model_fields))}"
     if isinstance(value, dict):

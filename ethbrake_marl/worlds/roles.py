@@ -1,4 +1,4 @@
-"""Roles: ``learner``, the scripts ``full_brake``, ``coast`` and ``constant:a``, or the name of an agent."""
+"""Roles of vehicles: ``learner``, the scripts ``full_brake``, ``coast`` and ``constant:a``, or the name of an agent."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ _FORM = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 
 
 def names_of(vehicles: int) -> tuple[str, ...]:
-    """``vehicle_1`` (front) to ``vehicle_N`` (rear)."""
     return tuple(f"vehicle_{i + 1}" for i in range(vehicles))
 
 
@@ -32,7 +31,7 @@ def check_vehicle(name: str, vehicles: int, at: YamlPath, value: Any) -> None:
 
 
 def check_role(role: str) -> str:
-    """Refuse a role that is not ``name[:argument]``, or names a Python file: a scenario must not run code."""
+    """Refuse a role that is not ``name[:argument]``, or names a Python file: scenarios must not run code."""
     match = _FORM.fullmatch(role)
     if match is None:
         raise InvalidInput(
@@ -56,13 +55,13 @@ def check_role(role: str) -> str:
 
 
 def deceleration_of(role: str) -> float | None:
-    """Deceleration a of a role ``constant:a`` (m/s2, negative: drives); None for another role."""
+    """Deceleration a (m/s2; negative: drives) of a role ``constant:a``; None for another role."""
     name, _, argument = role.partition(":")
     return parse_numeral(argument) if name == "constant" else None
 
 
 def first_command(role: str, braking_capacity: Floats) -> Floats:
-    """Command (m/s2) that a role holds, or until its agent decides, for capacities [n]."""
+    """Command (m/s2) that a role holds, or that applies until its agent decides, for braking capacities [n]."""
     deceleration = deceleration_of(role)
     if deceleration is not None:
         return np.full(braking_capacity.shape, 0.0 - deceleration)
@@ -70,7 +69,7 @@ def first_command(role: str, braking_capacity: Floats) -> Floats:
 
 
 class Roles(dict[str, str]):
-    """Vehicle -> role; read-only."""
+    """Read-only mapping vehicle -> role."""
 
     def _refuse(self, *args: object, **kwargs: object) -> NoReturn:
         raise InvalidInput(
@@ -86,5 +85,5 @@ class Roles(dict[str, str]):
 
     @classmethod
     def complete(cls, given: Mapping[str, str], vehicles: int) -> Roles:
-        """Role of each vehicle; one without a role brakes fully."""
+        """Roles of all vehicles; a vehicle that is not in ``given`` brakes fully."""
         return cls({name: given.get(name, "full_brake") for name in names_of(vehicles)})

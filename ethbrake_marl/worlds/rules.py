@@ -30,7 +30,7 @@ RECORDING = "recording"  # column of a table with texts: the recording and the v
 
 
 class Rule(NamedTuple):
-    """Meaning, unit and range of a quantity, and which random number draws it."""
+    """Meaning, unit and range of a quantity, and the random number that draws it."""
 
     key: str
     unit: str  # a key of UNITS; "": a plain number
@@ -47,20 +47,20 @@ class Rule(NamedTuple):
 
     @property
     def interval(self) -> str:
-        """Allowed range for messages: ``finite and in (0, 1000] t (tonnes)``."""
+        """Valid range, for messages, such as ``finite and in (0, 1000] t (tonnes)``."""
         symbol = {"mps": "m/s", "mps2": "m/s2", "mps3": "m/s3"}.get(self.unit, self.unit)
         unit = f" {symbol} ({UNITS[self.unit]})" if self.unit else ""
         return f"finite and in {'(' if self.positive else '['}{self.low:g}, {self.high:g}]{unit}"
 
     @property
     def schema(self) -> dict[str, Any]:
-        """JSON Schema of the range, in lists and distributions too, as ``#/$defs/range_KEY`` of a file's schema."""
+        """JSON Schema of the valid range, also inside lists and distributions (``range_KEY`` in a file's schema)."""
         inside = {"$ref": f"#/$defs/range_{self.key}"}
         limits = {"exclusiveMinimum" if self.positive else "minimum": self.low, "maximum": self.high, "items": inside}
         return {**limits, "properties": dict.fromkeys(("low", "high", "with_load", *DISTRIBUTIONS), inside)}
 
     def allows(self, low: float, high: float) -> bool:
-        """Whether all values from ``low`` to ``high`` are allowed; False for NaN."""
+        """Whether all values from ``low`` to ``high`` are valid; False for NaN."""
         return (low > 0.0 if self.positive else low >= self.low) and high <= self.high
 
     def check(self, quantity: Any, at: YamlPath = ()) -> None:
@@ -69,19 +69,18 @@ class Rule(NamedTuple):
         require(self.allows(low, high), at, quantity, f"must be {self.interval}{overlap}")
 
     def count(self, vehicles: int) -> int:
-        """Number of values in a world."""
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Which random number draws the value of vehicle or pair ``index``."""
+        """Stream and column of the random number that draws the value of vehicle or pair ``index``."""
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
-        """Column of vehicle or pair ``index``: ``gap_1_m``."""
+        """Name of the column of vehicle or pair ``index``, such as ``gap_1_m``."""
         return self.column.format(index + 1)
 
     def owner(self, index: int) -> str:
-        """``vehicle_1``, or ``vehicle_1 to vehicle_2`` for a pair, or an empty text for the world."""
+        """``vehicle_1``, or ``vehicle_1 to vehicle_2`` for a pair, or "" for a world."""
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
 
@@ -194,7 +193,7 @@ CAR_ROWS = {
 
 
 def width_of(stream: tuple[int, ...], vehicles: int) -> int:
-    """How many numbers a world has in a stream of quantities."""
+    """Number of random numbers of a world in a stream."""
     return BLOCK * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 
@@ -205,5 +204,5 @@ def check_count(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
 
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, Entry]:
-    """Columns of a table with these quantities: ``{"gap_1_m": ("gaps_m", 0), ...}``."""
+    """Columns of a table with these quantities, such as ``{"gap_1_m": ("gaps_m", 0)}``."""
     return {RULES[key].column_of(i): (key, i) for key in keys for i in range(RULES[key].count(vehicles))}

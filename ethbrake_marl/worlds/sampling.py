@@ -1,4 +1,4 @@
-"""Draw worlds from a scenario. World k of a seed is always the same, bit for bit, however many are drawn with it."""
+"""Draws worlds from a scenario. World k of a seed always has the same bits, whatever else is drawn with it."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ Texts = NDArray[np.str_]
 
 
 class Drawn(NamedTuple):
-    """Worlds at the alert, and what was drawn that their state does not contain."""
+    """Worlds at the alert, with drawn values that their state does not contain."""
 
     worlds: State
     friction: Floats  # [n] of the road; NaN where it has none
@@ -62,8 +62,7 @@ class Drawn(NamedTuple):
 def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) -> Drawn:
     """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
 
-    World k of a mixture is world k of the member that is chosen for it. Raises ``InvalidInput`` for bad arguments, and
-    for a world that is rejected in ``MOST_ATTEMPTS`` draws.
+    Raises ``InvalidInput`` for bad arguments, and for a world that is rejected ``MOST_ATTEMPTS`` times.
     """
     index = world_numbers(n, seed, first, channel)
     if not scenario.members:
@@ -76,13 +75,13 @@ def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) ->
 
 
 def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel = "list") -> Ints:
-    """Member, from 0, from which each of the worlds ``index`` [n], ascending, is drawn, [n]."""
+    """Number (from 0) of the member from which each of the worlds ``index`` [n], ascending, is drawn, [n]."""
     u = numbers_of(seed, channel, 0, index)(OF_WORLD, MIXTURE)[:, 0]
     return pick([member.weight for member in scenario.mixture or ()], u)
 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
-    """Worlds of these random numbers, early impacts included; the scenario is no mixture."""
+    """Worlds from these random numbers, which may have early impacts; the scenario is not a mixture."""
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
     if line is not None:
@@ -101,17 +100,18 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
 
 
 def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, load: Floats) -> Callable[[str], Floats]:
-    """Function: key -> values of a declared quantity, [n, entries]. ``kind`` and ``load`` are [n, N]."""
+    """Function key -> values of a declared quantity, [n, entries]. ``kind`` (vehicle type) and ``load`` are [n, N]."""
 
     def declared(key: str) -> Floats:
         entries = scenario.sources[key]
         drawn = np.empty((n, len(entries)))
         for i, possible in enumerate(entries):
-            for k, quantity in possible.items():
+            for k, quantity in possible.items():  # each vehicle type that is possible here
                 rows: Any = slice(None) if len(possible) == 1 else kind[:, i] == k
                 if isinstance(quantity, float):
                     drawn[rows, i] = quantity
                     continue
+                # All columns of a table take their number from one place, so a world takes them from the same row.
                 stream, column = ROW if isinstance(quantity, TableColumn) else RULES[key].place(i)
                 u = numbers(width_of(stream, scenario.vehicles), stream)[rows, column]
                 of = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)
@@ -122,7 +122,7 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
 
 
 def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools, index: Ints) -> State:
-    """Worlds at the alert from all their quantities, and the random numbers of their links."""
+    """State at the alert from all quantities of the worlds, and the random numbers of their V2X links."""
     n, N = whole["speeds_mps"].shape
     line, car = np.zeros((n, layout.LINE_ROWS, N + 1)), np.zeros((n, layout.CAR_ROWS, N + 1))
     know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))
@@ -150,7 +150,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
 
 
 def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn:
-    """The worlds ``index``; if the scenario rejects early impacts, such worlds are drawn again."""
+    """Worlds ``index``; worlds with an early impact are drawn again if the scenario rejects them."""
     drawn = draw_once(scenario, numbers_of(seed, channel, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn
@@ -174,14 +174,14 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
 
 
 def has_early_impact(scenario: Scenario, alert: State) -> Bools:
-    """Whether an impact happens no later than the first learner can act, [n]: nobody can prevent it."""
+    """Whether an impact happens before or when the first learner can act, [n]. Nobody can prevent it."""
     deciders = np.array(scenario.learners, np.int64)
     state = first_decision(alert, deciders, scenario.time_step_s, scenario.horizon_s)
     return np.asarray(state.line[:, COUNT].any(axis=1))
 
 
 def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
-    """The worlds of all parts in one, with row i of them in row ``place[i]``."""
+    """Worlds of all parts together: row i of the joined parts goes to row ``place[i]``."""
     order = np.argsort(place)
 
     def of_parts(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -163,7 +163,7 @@ class Scenario(Part):
 
     @classmethod
     def from_document(cls, document: Document) -> Self:
-        """Build a scenario from a parsed file, so that error messages show its name and lines."""
+        """Build a scenario from a parsed file; error messages then contain file and line."""
         scenario = cls.__new__(cls)
         scenario._build(document)
         return scenario
@@ -226,21 +226,21 @@ class Scenario(Part):
     def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> State:
         """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed, at the alert.
 
-        World k is always the same, bit for bit. A seed has two independent lists: ``channel="list"`` for evaluation,
+        World k always has the same bits. A seed has two independent lists: ``channel="list"`` for evaluation,
         ``"training"`` for training. Raises ``InvalidInput`` for bad arguments, and if ``early_impacts: reject`` leaves
         no world.
         """
         return self.draw(n, seed, first=first, channel=channel).worlds
 
     def draw(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Drawn:
-        """The worlds of ``sample`` with types, members, recordings and the number of rejected draws."""
+        """Worlds as in ``sample``, with their types, members and recordings, and the number of rejected draws."""
         return draw(self, n, seed, first, channel)
 
     # ---- who is in the line
 
     @property
     def members(self) -> tuple[Scenario, ...]:
-        """The scenarios of a mixture, with the keys beside ``mixture``; empty for a scenario that is none."""
+        """Scenarios of a mixture, with the keys beside ``mixture``; empty if this is not a mixture."""
         return tuple(entry.scenario for entry in self.mixture or ())
 
     @cached_property
@@ -250,19 +250,19 @@ class Scenario(Part):
 
     @cached_property
     def learners(self) -> tuple[int, ...]:
-        """The bodies that learn: 1 is Vehicle 1."""
+        """Bodies that learn (1: Vehicle 1)."""
         return tuple(i + 1 for i, name in enumerate(self.vehicle_names) if self.roles[name] == LEARNER)
 
     @property
     def has_obstacle(self) -> bool:
-        """Whether some of the worlds have an obstacle ahead of Vehicle 1."""
+        """Whether some worlds have an obstacle ahead of Vehicle 1."""
         own = not {"obstacle_gap_m", "obstacle_margin_m"}.isdisjoint(self.sources)
         return own or any(member.has_obstacle for member in self.members)
 
     def unheard(self, types: Ints | None = None) -> Bools:
-        """Whether i never gets a message of j, [n, N, N], by the equipment of vehicles of these types [n, N].
+        """Whether i cannot get messages of j because of the equipment of their vehicle types, [n, N, N].
 
-        Without types: [1, N, N], whether i may never get a message of j.
+        ``types`` [n, N] are the types. None: [1, N, N], whether this is possible.
         """
         if self.types_of_line is None:
             return np.zeros((1, self.vehicles, self.vehicles), np.bool_)
@@ -277,7 +277,7 @@ class Scenario(Part):
 
     @property
     def columns(self) -> dict[str, TableColumn]:
-        """Columns of the table by name, ``recording`` among them."""
+        """Columns of the table by name, including ``recording``."""
         return {} if self.table is None else self.table.by_name
 
     @cached_property
@@ -302,9 +302,9 @@ class Scenario(Part):
         return sources
 
     def bounds(self, key: str) -> tuple[tuple[float, float], ...]:
-        """Smallest and largest value of a quantity that every world has, for each vehicle, pair or world.
+        """Smallest and largest value of a quantity, for each vehicle, pair or world.
 
-        Capacities are those on the road. A rate that nobody declares is the largest that can be declared.
+        Capacities include the road's friction. An undeclared rate is the largest valid one.
         """
         at_once = np.full((2, self.vehicles), RULES[key].high)
         each = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
@@ -319,24 +319,24 @@ class Scenario(Part):
     # ---- its content, and scenarios like it
 
     def declared(self) -> dict[str, Any]:
-        """What is declared, as plain data: ``Scenario(**scenario.declared())`` equals the scenario."""
+        """The declared keys as plain data: ``Scenario(**scenario.declared())`` equals the scenario."""
         return self.model_dump(mode="json", exclude_unset=True, exclude_none=True)
 
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
-        """Every value, defaults too, as plain data, except the keys ``without``; of members without words."""
+        """All values as plain data, including defaults, except the keys ``without`` and the members' titles."""
         without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*WORDS}}}}
         return self.model_dump(mode="json", exclude=without_words | dict.fromkeys(without, True))
 
     def replace(self, **changes: Any) -> Scenario:
-        """The scenario with other values: ``replace(mass_t=2.0)``, in each member if it is a mixture.
+        """The scenario with changed values, such as ``replace(mass_t=2.0)``; a mixture changes in each member.
 
         A new way to declare gaps, speeds or an obstacle (``time_gaps_s``) replaces the old one (``gaps_m``). A key that
-        becomes None has its default again.
+        becomes None returns to its default.
         """
         return Scenario(**changed_content(self.declared(), changes))
 
     def with_learners(self, learners: Iterable[str]) -> Scenario:
-        """The scenario with exactly these learners, such as ``["vehicle_2"]``; a learner left out brakes fully.
+        """The scenario with exactly these learners, such as ``["vehicle_2"]``. Former learners brake fully.
 
         Raises ``InvalidInput`` for an unknown vehicle.
         """
@@ -347,7 +347,7 @@ class Scenario(Part):
 
 
 def plain(value: Any) -> Any:
-    """Plain dict, list and numbers of any mapping or sequence, array, model or View."""
+    """Plain dicts, lists and numbers from a mapping, sequence, array, model or View."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     if isinstance(value, View):

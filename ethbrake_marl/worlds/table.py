@@ -1,4 +1,4 @@
-"""Tables of measured values: every world takes one row, with the same row for all its columns."""
+"""Tables of measured values: every world takes one row, the same for all columns."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ Row = Annotated[tuple[Cell, ...], Field(strict=False)]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableColumn:
-    """A column of a table, which is drawn like a distribution."""
+    """A column of a table, used like a distribution: every row is equally likely."""
 
     rows: NDArray[Any]  # value of each row; texts in the column ``recording``
 
@@ -97,7 +97,7 @@ class Table(Part):
 
 
 class CsvFile(NamedTuple):
-    """A CSV file with a header and at least one row; its cells are unchecked texts."""
+    """A CSV file with a header and at least one row. Its cells are unchecked texts."""
 
     path: Path
     header: list[str]
@@ -120,7 +120,7 @@ class CsvFile(NamedTuple):
         return cls(path, [name.strip() for name in rows.pop(first)], rows)
 
     def cells(self, columns: Sequence[str]) -> list[list[float | str]]:
-        """The ``columns`` of each row: numbers, and texts in the column ``recording``."""
+        """Cells of each row in ``columns``: numbers, and texts in the column ``recording``."""
         cells: list[list[Any]] = []
         for line, row in self.rows.items():
             if len(row) != len(self.header):
@@ -136,7 +136,7 @@ class CsvFile(NamedTuple):
 
 
 def read_rows(path: Path, columns: object) -> list[list[float | str]]:
-    """Unchecked cells of the ``columns``, which are named as in the key ``table`` of a scenario."""
+    """Unchecked cells in ``columns``, the list from the key ``table`` of a scenario."""
     file = CsvFile.read(path)
     known = f"the columns of this file are {', '.join(file.header)}"
     if not isinstance(columns, list | tuple):

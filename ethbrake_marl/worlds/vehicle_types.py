@@ -1,7 +1,7 @@
 """Vehicle types: the quantities of a car, a van or a truck, and the types that are possible at each place of a line.
 
-The type of a vehicle is drawn first, then its quantities from what this type declares. All quantities
-``{with_load: [empty, full]}`` of a vehicle depend on the same load: a full truck is heavy *and* brakes weakly.
+A vehicle's type is drawn first, then its quantities. All quantities ``{with_load: [empty, full]}`` of a vehicle use the
+same load: a full truck is heavy *and* brakes weakly.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: i
 
 
 class TypesOfLine:
-    """The possible types at each place of a line. A type is named by its index in ``vehicle_types``."""
+    """The possible types at each place of a line. Types are numbered as in ``vehicle_types``."""
 
     def __init__(self, kinds: Mapping[str, VehicleType], types: Any, vehicles: int) -> None:
         self.names, self.kinds = tuple(kinds), tuple(kinds.values())
