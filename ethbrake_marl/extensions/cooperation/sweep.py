@@ -27,12 +27,12 @@ class Swept(NamedTuple):
 
     @property
     def setting(self) -> str:
-        """The value as a setting, such as ``objective=social:15``."""
+        """The setting of this value, such as ``objective=social:15``."""
         return f"{self.key}={self.word}{self.text}"
 
     @property
     def axis(self) -> str:
-        """The label of an axis: ``v2x.lost`` or ``objective = social:…``."""
+        """Label of a figure's axis: ``v2x.lost`` or ``objective = social:…``."""
         return f"{self.key} = {self.word}…" if self.word else self.key
 
     @property
@@ -44,9 +44,9 @@ class Swept(NamedTuple):
 def parse_sweep(text: str) -> list[Swept]:
     """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
 
-    A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. After ``KEY=``, single numbers
-    and ranges may stand together. Raises ``InvalidInput`` for any other text, a range that its step does not divide, a
-    repeated number, and fewer than 2 or more than ``MOST`` numbers.
+    A word may precede the numbers, as in ``objective=social:0..90:15``. Numbers and ranges may be mixed. Raises
+    ``InvalidInput`` for any other text, a range that its step does not divide, a repeated number, and fewer than 2 or
+    more than ``MOST`` numbers.
     """
     key, equals, values = (part.strip() for part in text.partition("="))
     match = WORD.match(values)

@@ -51,7 +51,7 @@ class RunReport:
     measures: tuple[str, ...] = (*Tables.measures, *MEASURES)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Write results in the other tests, pictures and page; return tables to print, and where the page is."""
+        """Write the results in the other tests, pictures and page. Return tables to print, and where the page is."""
         compared, folder = experiment.compared, experiment.trained.directory
         single = experiment.learned != TEAM
         tests, done = other_tests(compared.scenario) if single else [], count()
@@ -126,7 +126,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
 
 
 def telling_row(compared: Compared, learned: str) -> int:
-    """Return the row of a typical world: the median of the saved harm, among worlds in which full braking does harm."""
+    """Return the row of the world with the median saved harm, among worlds in which full braking does harm."""
     harm = COLUMN[compared.harm_count]
     before = compared.result[BASELINE][harm]
     rows = np.flatnonzero(before > 0.0)
