@@ -45,6 +45,7 @@ from ethbrake_marl.registry import Registry
 
 Declared = str | Sequence[str]  # one objective for all vehicles, or one for each
 
+PERSONAL = ("own", "social")  # objectives whose amount depends on the vehicle, beside registered ones
 FIRST_WEIGHT = 1000.0  # weight of A in ``first:A,then:B``; B keeps the scale for which recipes are tuned
 
 
@@ -101,6 +102,11 @@ class Objective(NamedTuple):
     @property
     def is_sum(self) -> bool:
         return self.kind.weights is not None and all(part.is_sum for part in self.parts)
+
+    @property
+    def differs(self) -> bool:
+        """Whether vehicles with this objective have amounts of their own."""
+        return self.kind.name in PERSONAL or self.kind.function is not None or any(part.differs for part in self.parts)
 
     def amount(self, harm: Harm, vehicle: int) -> Floats:
         """Amount that ``vehicle`` (from 0) should minimise, [n]."""

@@ -9,6 +9,7 @@ from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.evaluation.evaluate import Result
+from ethbrake_marl.evaluation.named_measures import split_names
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise
 from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.worlds.scenario import Scenario
@@ -32,7 +33,7 @@ class Compared(NamedTuple):
         **more: Any,
     ) -> Compared:
         """Let the teams drive; ``more``: as in ``evaluate``. The honest count also shows the push."""
-        names = measures.split(",") if isinstance(measures, str) and measures else [*measures]
+        names = split_names(measures) if isinstance(measures, str) and measures else [*measures]
         if harm_count == "honest":
             names.insert(0, "pushed_mps")
         result = evaluate(scenario, teams, harm_count=harm_count, measures=names, **more)

@@ -1,7 +1,7 @@
 """Measures by name: registered ones, summed terms of a reward, objectives, functions of a user's Python file.
 
 The sum of a term over all steps is what a learner with this reward would get (``episode.terms``). An objective
-(``social:45``) has a value for each vehicle, in both counts of harm.
+(``social:45``) has a value in each count of harm, for each vehicle if it differs between them.
 """
 
 from __future__ import annotations
@@ -15,10 +15,11 @@ from inspect import signature
 import numpy as np
 
 from ethbrake_marl.episode.conduct import drove, push
+from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, name_of, objectives_of
 from ethbrake_marl.episode.reward import RewardParams
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import PHYSICS, State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision, jerk, risk
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
@@ -102,6 +103,11 @@ _REWARDED: dict[str, TermFunction] = {
 }
 
 
+def split_names(names: str) -> list[str]:
+    """Split a list of names at its commas, but not within an objective such as ``weighted:1,4,1``."""
+    return re.split(r",(?!then:|[\d.][\d.e+-]*(?:,|$))", names)
+
+
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     """Return the measures, summed terms and objectives of these names, each once; ``FILE.py:NAME`` runs the file.
 
@@ -111,7 +117,7 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     if not isinstance(names, Iterable):
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'injury,pushed_m'")
     called: list[tuple[str, Measure]] = []
-    for name in dict.fromkeys(names.split(",") if isinstance(names, str) else names):
+    for name in dict.fromkeys(split_names(names) if isinstance(names, str) else names):
         called += [(name, each) for each in _called(name) if each not in [measure for _, measure in called]]
     count = Counter(measure.name for _, measure in called)
     return tuple(_in_full(name, measure) if count[measure.name] > 1 else measure for name, measure in called)
@@ -180,7 +186,9 @@ def _intervention(before: State, step: Step, after: State) -> Floats:
 
 def _objective(name: str, game: Game, alert: State, last: State) -> Given:
     objectives = objectives_of(name, last.vehicles)
-    return {count: amounts(objectives, None, last, count) for count in ("first", "total")}
+    counts = [count for count in COUNTS if count != "honest" or PHYSICS not in last.memories]
+    values = {count: amounts(objectives, None, last, count) for count in counts}
+    return values if objectives[0].differs else {count: value[:, 0] for count, value in values.items()}
 
 
 class SummedTerm:

@@ -50,12 +50,26 @@ def test_measures__of_one_impact_by_hand() -> None:
         "collided": 1.0, "impacts": 1.0, "first_impact_harm": 9.0, "total_harm": 9.0, "total_harm_1": 4.95,
         "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "pushed_m_1": 5.26575,
         "pushed_m_1_far": 1.0, "injury_lr4s_1": injuries[1], "injury_lr4s_2": injuries[2],
-        "injury_lr4s": sum(injuries.values()), "own_first_1": 4.95, "own_total_2": 4.05, "maximin_total_2": 4.95,
+        "injury_lr4s": sum(injuries.values()), "own_first_1": 4.95, "own_total_2": 4.05, "maximin_total": 4.95,
         "end_s": 3.7,
     }  # fmt: skip
     row = {name: float(result["full_brake"][name][1]) for name in expected}
     assert row == pytest.approx(expected, rel=1e-5)
     assert result["full_brake"]["ended"].tolist() == ["at_rest", "at_rest"]
+
+
+def test_objectives__are_measured_in_every_count_and_once_unless_vehicles_differ() -> None:
+    asked = "first:vehicle_2,then:total,weighted:1,3,vehicle_2,first:own,then:total,injury"
+    result = evaluated(PAIR, 1, [FULL_BRAKE, COAST], asked)
+    row = {name: column[0] for name, column in result["full_brake"].items()}
+    expected = {
+        "vehicle_2_first": 4.05, "vehicle_2_honest": 4.05, "weighted:1,3_total": (4.95 + 3.0 * 4.05) / 2.0,
+        "first:vehicle_2,then:total_total": 4059.0, "first:own,then:total_total_1": 4959.0,
+    }  # fmt: skip
+    assert {name: row[name] for name in expected} == pytest.approx(expected, rel=1e-9)
+    assert "vehicle_2_first_1" not in row and "injury_lr4s" in row
+    coasts = result["coast"]
+    assert coasts["vehicle_2_honest"] == coasts["honest_cost_2"] > coasts["vehicle_2_total"]
 
 
 def test_pushing__is_where_vehicle_1_ends_minus_where_it_would() -> None:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import COLUMN, HARM
+from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
 
@@ -42,3 +43,9 @@ class BestKnown(NamedTuple):
     def regret(self, result: Result, agent: str, count: str) -> Floats:
         """Return an agent's harm minus the best known harm, [n] m2/s2."""
         return np.asarray(result[agent][COLUMN[count]] - self.harm[count])
+
+
+def shown_counts(compared: Compared) -> dict[str, str]:
+    """Return both harms, and what the agents minimise if the best known is known of it: count -> column."""
+    known, minimised = BestKnown.of(compared.result), compared.harm_count
+    return HARM if known is not None and minimised not in known.harm else {**HARM, minimised: COLUMN[minimised]}

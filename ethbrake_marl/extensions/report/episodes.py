@@ -6,10 +6,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import HARM
+from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.compared import Compared
-from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.evaluation.summary import BASELINE
 from ethbrake_marl.extensions.report.best_known import BestKnown
@@ -24,32 +23,36 @@ EACH = 5  # worlds of every kind except the worst and the random ones
 TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
 
 
-def shown_worlds(result: Result, focus: str) -> dict[int, str]:
+def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
     """Return at most ``MOST_WORLDS`` rows to show, each once, in order of their kinds: row -> why it is shown."""
-    total, known, chosen = result[focus][HARM["total"]], BestKnown.of(result), dict[int, str]()
+    result, column = compared.result, COLUMN[compared.harm_count]
+    cost, known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
 
     def add(kind: str, rows: Iterable[int] | Ints, most: int = EACH) -> None:
         fresh = [int(row) for row in rows if int(row) not in chosen]
         chosen.update(dict.fromkeys(fresh[: min(most, MOST_WORLDS - len(chosen))], kind))
 
-    add(f"Where {focus} did worst", worst_rows(result, focus), WORST)
+    add(f"Where {focus} did worst", worst_rows(compared, focus), WORST)
     if known is not None and known.avoidable is not None:
         avoidable = result[focus]["collided"] & known.avoidable
-        add(f"Avoidable, and {focus} collided", largest(total, avoidable))
+        add(f"Avoidable, and {focus} collided", largest(cost, avoidable))
     if BASELINE in result.columns and focus != BASELINE:
-        saved = result[BASELINE][HARM["total"]] - total
+        saved = result[BASELINE][column] - cost
         add(f"Where {focus} saved most against {BASELINE}", largest(saved, saved > 0.0))
-        add(f"Where {focus} did more harm than {BASELINE}", largest(-saved, saved < 0.0))
-    order = np.argsort(total, kind="stable")
+        add(f"Where {focus} did worse than {BASELINE}", largest(-saved, saved < 0.0))
+    order = np.argsort(cost, kind="stable")
     add(f"Typical of {focus}", [order[int(q * (result.n - 1))] for q in TYPICAL])
     add("Drawn at random", np.random.default_rng(0).permutation(result.n), MOST_WORLDS)
     return chosen
 
 
-def worst_rows(result: Result, focus: str) -> Ints:
-    """Return at most ten rows in which an agent did worst, worst first: by total harm, minus the best known if any."""
-    known = BestKnown.of(result)
-    value = result[focus][HARM["total"]] if known is None else known.regret(result, focus, "total")
+def worst_rows(compared: Compared, focus: str) -> Ints:
+    """Return at most ten rows in which an agent did worst, worst first: by what agents minimise, minus the best known
+    if any.
+    """
+    result, count, known = compared.result, compared.harm_count, BestKnown.of(compared.result)
+    best = 0.0 if known is None else known.harm.get(count, 0.0)
+    value = result[focus][COLUMN[count]] - best
     return largest(value, value > 0.0)[:WORST]
 
 

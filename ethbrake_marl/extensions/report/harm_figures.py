@@ -14,7 +14,7 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.rendering.picture import COLOURS
-from ethbrake_marl.extensions.report.best_known import BestKnown
+from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.curves import curves_figure
 from ethbrake_marl.extensions.report.style import (
     TITLES,
@@ -62,11 +62,11 @@ def harm_by_agent(compared: Compared, others: Mapping[str, Compared]) -> Figure:
 
 
 @in_our_style
-def harm_above(result: Result) -> Figure:
+def harm_above(compared: Compared) -> Figure:
     """Draw, for every x, the share of worlds in which an agent's regret is above x; its harm if no best is known."""
-    known = BestKnown.of(result)
-    figure, panels = new_panels((10.0, 3.8), columns=2, sharey=True)
-    for axes, (count, harm) in zip(panels, HARM.items(), strict=True):
+    result, known, counts = compared.result, BestKnown.of(compared.result), shown_counts(compared)
+    figure, panels = new_panels((10.0, 3.8), columns=len(counts), sharey=True)
+    for axes, (count, harm) in zip(panels, counts.items(), strict=True):
         for number, agent in enumerate(result.columns):
             ordered = np.sort(result[agent][harm] if known is None else known.regret(result, agent, count))
             chosen = np.linspace(0, len(ordered) - 1, min(POINTS, len(ordered))).astype(np.int64)

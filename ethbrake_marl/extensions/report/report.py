@@ -16,7 +16,7 @@ from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.statistics import mean, rate
 from ethbrake_marl.evaluation.summary import IDENTITY, SummaryTable
-from ethbrake_marl.extensions.report.best_known import BestKnown
+from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.first_sentence import first_sentence
 from ethbrake_marl.extensions.report.harm_figures import harm_above, harm_by_agent
@@ -56,7 +56,7 @@ class Report:
     def html(self) -> str:
         compared, rows = self.compared, self.compared.table
         focus = self.focus or [row.agent for row in rows if row.policies or row is rows[-1]][-1]
-        kinds = shown_worlds(compared.result, focus)
+        kinds = shown_worlds(compared, focus)
         others = {title: test.compared for title, test in self.tests.items()}
         about = rows.parameters
         versions = {**about["versions"], **{key: about[key] for key in IDENTITY[:3]}}
@@ -100,21 +100,22 @@ def measured(agents: SummaryTable) -> list[Markup]:
 
 def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
     """Return the ten worlds in which an agent did worst; those that the player shows have a button."""
-    result, known = compared.result, BestKnown.of(compared.result)
-    columns = {"First-impact harm": result[focus][HARM["first"]], "Total harm": result[focus][HARM["total"]]}
+    result, known, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
+    counts = {**HARM, minimised: COLUMN[minimised]}
+    columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}
     if known is not None:
-        columns |= {"Best known, first": known.harm["first"], "Best known, total": known.harm["total"]}
+        columns |= {f"Best known, {count}": known.harm[count] for count in counts if count in known.harm}
         if known.avoidable is not None:
             columns["Contact"] = np.where(known.avoidable, "avoidable", "unavoidable")
-    if compared.harm_count not in HARM:
-        columns[IN_WORDS[compared.harm_count].capitalize()] = result[focus][COLUMN[compared.harm_count]]
     columns["Impacts"] = result[focus]["impacts"]
     rows = []
-    for k in worst_rows(result, focus).tolist():
+    for k in worst_rows(compared, focus).tolist():
         number = int(result.worlds["world"][k])
         name = Shown(part("watch", number)) if k in watched else number
         rows.append([name, *(each[k].item() for each in columns.values())])
-    by = "total harm" if known is None else "total harm minus best known total harm"
+    by = IN_WORDS[minimised]
+    if known is not None and minimised in known.harm:
+        by = f"{by} minus the best known {by}"
     sheet = Sheet(f"Worlds of {focus}", list(map(Column, ("World", *columns))), rows)
     return Section(
         "Worst ten worlds", [f"The worlds in which {focus} did worst, by {by}. Harm in m²/s².", table(sheet)]
@@ -122,10 +123,10 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
 
 
 def avoidable_section(compared: Compared) -> Section:
-    result, known = compared.result, BestKnown.of(compared.result)
+    result, known, figure = compared.result, BestKnown.of(compared.result), harm_above(compared)
     if known is None:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
-        return Section("World by world", [drawing(harm_above(result), "Harm", words)])
+        return Section("World by world", [drawing(figure, "Harm", words)])
     body: list[str] = []
     if known.avoidable is not None:
         share = rate(known.avoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
@@ -137,21 +138,26 @@ def avoidable_section(compared: Compared) -> Section:
             if among.any():
                 body.append(table(_harm_among(compared, known, where, among)))
     words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."
-    return Section("What was avoidable", [*body, drawing(harm_above(result), "Regret", words)])
+    return Section("What was avoidable", [*body, drawing(figure, "Regret", words)])
 
 
 def _harm_among(compared: Compared, known: BestKnown, where: str, among: Bools) -> Sheet:
-    result = compared.result
+    result, counts = compared.result, shown_counts(compared)
     some, rows = result.take(among), []
     for agent, own in some.columns.items():
-        regrets = (known.regret(result, agent, count)[among] for count in HARM)
-        harms = (own[harm] for harm in HARM.values())
+        regrets = (known.regret(result, agent, count)[among] for count in counts)
+        harms = (own[column] for column in counts.values())
         rows.append(
             (agent, rate(own["collided"], some.clusters), *(mean(x, some.clusters) for x in (*harms, *regrets)))
         )
-    collided = Column("Collided", digits=1, scale=100.0, unit=" %")
-    columns = map(Column, ("First-impact harm", "Total harm", "Regret, first-impact", "Regret, total"))
-    return Sheet(f"{where}: {count_of(some.n, 'world')}", ["Agent", collided, *columns], rows)
+    headings = [IN_WORDS[count] for count in counts]
+    columns = (
+        "Agent",
+        Column("Collided", digits=1, scale=100.0, unit=" %"),
+        *(Column(heading.capitalize()) for heading in headings),
+        *(Column(f"Regret, {heading}") for heading in headings),
+    )
+    return Sheet(f"{where}: {count_of(some.n, 'world')}", [*columns], rows)
 
 
 def _tested(test: Test) -> list[str]:

@@ -101,7 +101,7 @@ def test_harm_by_agent__bars_line_and_marks_are_the_means(searched: Compared) ->
 
 def test_harm_above__shares_are_those_of_the_worlds(compared: Compared, searched: Compared) -> None:
     for one, label in ((compared, "Harm"), (searched, "Regret")):
-        axes = harm_above(one.result).axes[0]
+        axes = harm_above(one).axes[0]
         drawn, values = axes.lines[0], one.result["full_brake"]["first_impact_harm"]
         if label == "Regret":
             values = values - one.result["full_brake"]["best_known_first"]

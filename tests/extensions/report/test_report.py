@@ -93,21 +93,32 @@ def test_first_sentence__flatters_nobody(compared: Compared) -> None:
 
 
 def test_shown__begin_with_the_worst(compared: Compared, searched: Compared) -> None:
-    total, braking = (compared.result[agent]["total_harm"] for agent in (FOCUS, "full_brake"))
-    chosen = shown_worlds(compared.result, FOCUS)
+    harm, braking = (compared.result[agent]["first_impact_harm"] for agent in (FOCUS, "full_brake"))
+    chosen = shown_worlds(compared, FOCUS)
     assert len(chosen) == 50 and len({*chosen.values()}) == 5
-    assert total[list(chosen)[:10]].tolist() == sorted(total, reverse=True)[:10]
+    assert harm[list(chosen)[:10]].tolist() == sorted(harm, reverse=True)[:10]
     for row, kind in chosen.items():
-        saved = braking[row] - total[row]
-        assert saved > 0.0 if "saved most" in kind else saved < 0.0 if "did more harm" in kind else True
-    known = searched.result[FOCUS]["best_known_total"]
-    assert (total - known)[worst_rows(searched.result, FOCUS)].tolist() == sorted(total - known, reverse=True)[:10]
-    avoidable = [row for row, kind in shown_worlds(searched.result, FOCUS).items() if "Avoidable" in kind]
-    assert avoidable and (searched.result[FOCUS]["avoidable"] & (total > 0.0))[avoidable].all()
+        saved = braking[row] - harm[row]
+        assert saved > 0.0 if "saved most" in kind else saved < 0.0 if "did worse" in kind else True
+    regret = harm - searched.result[FOCUS]["best_known_first"]
+    assert regret[worst_rows(searched, FOCUS)].tolist() == sorted(regret, reverse=True)[:10]
+    avoidable = [row for row, kind in shown_worlds(searched, FOCUS).items() if "Avoidable" in kind]
+    assert avoidable and (searched.result[FOCUS]["avoidable"] & (harm > 0.0))[avoidable].all()
+
+
+def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Compared, searched: Compared) -> None:
+    honest, cost = compared._replace(harm_count="honest"), compared.result["ppo"]["honest_cost"]
+    assert cost[worst_rows(honest, "ppo")].tolist() == sorted(cost, reverse=True)[:10]
+    section = " ".join(map(str, worst_section(honest, "ppo", ()).body))
+    assert "did worst, by honest cost." in section and section.count("Honest cost") == 1
+    unknown = searched._replace(harm_count="honest")  # no best known honest cost
+    assert worst_rows(unknown, "ppo").tolist() == worst_rows(honest, "ppo").tolist()
+    section = " ".join(map(str, worst_section(unknown, "ppo", ()).body))
+    assert "by honest cost." in section and section.count("Honest cost") == 1
 
 
 def test_worst_worlds__can_be_watched(searched: Compared) -> None:
-    shown = worst_rows(searched.result, FOCUS).tolist()[:3]
+    shown = worst_rows(searched, FOCUS).tolist()[:3]
     text = str(worst_section(searched, FOCUS, shown).body[1])
     assert text.count("data-watch") == 3 and text.count("avoidable") == 10
     assert f'data-watch="{shown[0]}"' in text and f"{searched.result[FOCUS]['total_harm'][shown[0]]:.2f}" in text
