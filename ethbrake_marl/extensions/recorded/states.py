@@ -128,7 +128,7 @@ def _along_road(raw: Any, cells: Cells, entry: Format) -> Any:
 
 
 def _turn_highd(states: Any, cells: Cells) -> None:
-    """Let positions increase in the direction of travel; x is the left edge of a vehicle and grows to the right."""
+    """Turn highD's positions (left edges, growing to the right) into fronts that grow in the direction of travel."""
     meta = read_cells(Path(f"{str(cells.file)[:-4]}Meta.csv"), HIGHD_META).frame
     direction = states["vehicle"].map(meta.drop_duplicates("vehicle").set_index("vehicle")["direction"])
     right = "must have the drivingDirection 1 or 2 in its tracksMeta.csv"
