@@ -116,7 +116,6 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 
 def _refuse(reason: str) -> int:
-    """Print the error message on stderr, and return the exit status 2."""
     Out().note(f"ethbrake: error: {reason}")
     return 2
 
@@ -189,7 +188,6 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
 
 def _names() -> list[str]:
-    """Return the names of all commands and command groups that do not come from extensions or packages."""
     return [
         *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
         *(str(group.name) for group in app.registered_groups),

@@ -100,14 +100,13 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout; after Ctrl-C, print a message and exit with status 130."""
         self._turned.__exit__(kind, error, trace)
         self.show_progress.end()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.remains}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
-        """Print the result: ``content`` as JSON after ``--json``, otherwise ``shown``."""
+        """Print the result: ``content`` as JSON if the user gave ``--json``, otherwise ``shown``."""
         if self.as_json:
             self.print_json(content)
         else:
@@ -130,7 +129,6 @@ class Out:
                 _PlainConsole(self._stdout, width=None if self._stdout.isatty() else 100).print(each)
 
     def note(self, text: str) -> None:
-        """Print one line on stderr, below the progress bars."""
         self.show_progress.end()
         say(text)
 
@@ -157,12 +155,10 @@ class Out:
             self.note(f"{what}: {path}")
 
     def interrupted(self, text: str) -> NoReturn:
-        """Print one line on stderr, and exit with status 130, as after Ctrl-C."""
         self.note(text)
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` units of the task ``name`` are done."""
         self.show_progress(Progress(name, done, total))
 
 

@@ -79,7 +79,6 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
 
 def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """Return the check ``name`` with the result (ok, detail) of ``look()``; an error in ``look`` is a failed check."""
     try:
         return Check(name, *look())
     except Exception as error:
@@ -87,7 +86,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Yield for each dependency whether the required version is installed. Optional packages may be missing."""
+    """Yield for each required package whether the right version is installed. Packages of extras may be missing."""
     from packaging.requirements import Requirement
 
     wanted = [Requirement(line) for line in requires("ethbrake-marl") or []]
@@ -177,7 +176,6 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    """Run Python with ``arguments`` in ``folder``; return the last line on stderr if it fails, else an empty text."""
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 

@@ -127,7 +127,6 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
 
 
 def _ranges(trial: Trial) -> dict[str, dict[str, float]]:
-    """Return the minimum, median and maximum of every quantity over the sampled worlds."""
     import numpy as np
 
     from ethbrake_marl.worlds.describe import quantities_of
@@ -146,7 +145,6 @@ def _kinds(trial: Trial) -> dict[str, Any]:
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
-    """Break a text into at most ``most`` lines of ``width`` characters; the rest is replaced by ``...``."""
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 

@@ -116,7 +116,6 @@ def train_command(
 
 
 def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Path:
-    """Return the default folder of a run, ``runs/SCENARIO-RECIPE[-SCHEME]-seedSEED``."""
     plan = recipe if scheme is None else f"{recipe}-{scheme}"
     return Path("runs") / f"{scenario}-{plan}-seed{seed}"
 

@@ -158,7 +158,9 @@ class EstimatedEV2XBM:
 
 
 def differ(one: State, other: State) -> Bools:
-    """Return where two lines differ in speeds, gaps or quantities of vehicles, [n]; past reaction times are ignored."""
+    """Return in which worlds two lines differ in speeds, gaps or other quantities, [n]; past reaction times are
+    ignored.
+    """
     parts = []
     for line in (one, other):
         car = line.car[:, :, 1:].copy()

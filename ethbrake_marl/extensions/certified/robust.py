@@ -130,7 +130,7 @@ def joined(states: State) -> State:
 
 
 def may_be_in(state: State, members: State) -> Bools:
-    """Return where all gaps and speeds lie in the range of the members, [n]; True once any vehicle has had an impact.
+    """Return in which worlds all gaps and speeds lie in the range of the members, [n]; True after any impact.
 
     Before any impact, gaps and speeds are monotone in each quantity, so every world in the box lies in this range.
     """

@@ -124,7 +124,6 @@ def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
 
 
 def measure(plan: Ablation, tell: OnProgress) -> list[Measured]:
-    """Evaluate every level with every algorithm, after all trainings have finished."""
     trained: dict[Any, list[Job]] = {}
     for level, name, job in plan.jobs():
         trained.setdefault((level.name, name), []).append(job)

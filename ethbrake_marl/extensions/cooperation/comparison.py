@@ -113,5 +113,4 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
 
 
 def _borne(one: Measured, column: str) -> list[Floats]:
-    """Return each vehicle's harm, front to rear, [seeds, n] each."""
     return [one.reached[f"{column}_{i}"] for i in range(1, one.level.scenario.vehicles + 1)]

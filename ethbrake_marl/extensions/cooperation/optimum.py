@@ -86,7 +86,7 @@ def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
 
 
 def can_imitate(own: Answer, other: Answer) -> Bools:
-    """Return where the learners of ``own`` can give the commands of the learners of ``other``, [m].
+    """Return in which worlds the learners of ``own`` can give the commands of the learners of ``other``, [m].
 
     They can if each learner of ``other`` learns in ``own``, the other vehicles of ``own`` have the same roles, lines
     and latencies are the same, and each decision time of ``other`` is also one of ``own``. Only ``own`` may have an

@@ -84,7 +84,6 @@ def _interval(
 
 
 def _resampled_means(sides: Sequence[Floats], cluster: Ints) -> Floats:
-    """Return the mean of each argument in each resample, [resamples, arguments]."""
     worlds, number, rng = len(cluster), int(cluster.max()) + 1, np.random.default_rng(0)
     means, chunk = np.empty((RESAMPLES, len(sides))), max(1, AT_ONCE // worlds)
     for begin in range(0, RESAMPLES, chunk):

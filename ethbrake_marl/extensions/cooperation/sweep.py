@@ -27,12 +27,10 @@ class Swept(NamedTuple):
 
     @property
     def setting(self) -> str:
-        """The setting of this value, such as ``objective=social:15``."""
         return f"{self.key}={self.word}{self.text}"
 
     @property
     def axis(self) -> str:
-        """Label of a figure's axis: ``v2x.lost`` or ``objective = social:…``."""
         return f"{self.key} = {self.word}…" if self.word else self.key
 
     @property

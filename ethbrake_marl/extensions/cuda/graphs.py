@@ -35,7 +35,6 @@ class Graphed:
         return self.result
 
     def _beside(self, *given: Tensor) -> Any:
-        """Call the function on another stream, as is required before a graph can be recorded."""
         main, beside = torch.cuda.current_stream(), new_stream()
         beside.wait_stream(main)
         with torch.cuda.stream(beside):
@@ -44,7 +43,6 @@ class Graphed:
         return result
 
     def _record(self, *given: Tensor) -> None:
-        """Record the graph without computing anything."""
         self.given = [tensor.clone() for tensor in given]
         self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self.graph, stream=new_stream()):

@@ -38,8 +38,6 @@ class Stored(NamedTuple):
 
 
 class Results(NamedTuple):
-    """Results of a step in n worlds."""
-
     out: Any  # [OUT_ROWS, n] rows as in `Step.out`
     reward: Any  # [n] of every learner
     observations: Any  # [n, L, F] float32
@@ -47,8 +45,6 @@ class Results(NamedTuple):
 
 
 class Ruling(NamedTuple):
-    """The numbers that a step needs, from ``Rules``."""
-
     learners: Any  # [L]
     time_step_s: Any
     horizon_s: Any
@@ -58,8 +54,6 @@ class Ruling(NamedTuple):
 
 
 class Looking(NamedTuple):
-    """The numbers that an observation needs, from ``observe.Plan``."""
-
     offsets: Any
     role: Any
     obstacle: Any
@@ -68,8 +62,6 @@ class Looking(NamedTuple):
 
 
 class Mine(NamedTuple):
-    """A thread's own memory: one world, and arrays to work with."""
-
     line: Any
     car: Any
     clock: Any
@@ -101,7 +93,6 @@ def shapes_of(bodies: int, learners: int, features: int, neighbours: int) -> Min
 
 @large
 def load(t, stored, mine):
-    """Copy world t into a thread's own memory."""
     for i in range(mine.wanted.shape[1]):
         for row in range(mine.line.shape[1]):
             mine.line[0, row, i] = stored.line[row, i, t]
@@ -116,7 +107,6 @@ def load(t, stored, mine):
 
 @large
 def save(t, stored, mine, is_new):
-    """Copy a thread's world back: what a step changes, and all of it if the world is new."""
     for i in range(mine.wanted.shape[1]):
         for row in range(mine.line.shape[1]):
             stored.line[row, i, t] = mine.line[0, row, i]
@@ -172,6 +162,5 @@ def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
 
 @large
 def play_each(mine, stored, pool, following, actions, results, rules, view, mode, n):
-    """Run ``play`` for n worlds on a processor."""
     for t in range(n):
         play(t, mine, stored, pool, following, actions, results, rules, view, mode)

@@ -64,8 +64,6 @@ class Plans(NamedTuple):
 
 
 class Own(NamedTuple):
-    """A thread's own memory."""
-
     car: Any  # this and the following: float64
     clock: Any
     wanted: Any
@@ -108,7 +106,6 @@ def shapes_of(bodies: int, controlled: int) -> Own:
 
 @large
 def load(k, searched, own):
-    """Copy world k into a thread's own memory."""
     for i in range(own.wanted.shape[0]):
         for row in range(own.lines.shape[1]):
             own.lines[0, row, i] = searched.line[row, i, k]
@@ -202,6 +199,5 @@ def search(t, own, searched, plans, drawing, drawn, budget):
 
 @large
 def search_each(own, searched, plans, drawing, drawn, budget, n):
-    """Run ``search`` for n threads on a processor."""
     for t in range(n):
         search(t, own, searched, plans, drawing, drawn, budget)

@@ -57,7 +57,6 @@ def place_of(recipe: VineRecipe) -> str:
 
 
 def sizes(recipe: VineRecipe) -> str:
-    """Return, for an error message, the settings that decide how much memory is needed."""
     return f"{place_of(recipe)}: n_envs = {recipe.n_envs}, n_steps = {recipe.n_steps}, tried = {recipe.tried}"
 
 
@@ -154,6 +153,5 @@ class CudaVineModel(VineModel):
         return result
 
     def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        """Make one gradient step; return the loss."""
         loss: Tensor = self.descended(seen, target, weight)
         return loss.clone()

@@ -181,7 +181,6 @@ class Worlds:
         return self.observations
 
     def arguments(self, actions: Tensor, mode: int) -> tuple[Any, ...]:
-        """Return the arguments of the kernel ``play``, except the thread's."""
         return self.now, self.pool, self.following, actions, self.results, self.rules, self.looking, mode
 
     def _launch(self, actions: Tensor, mode: int) -> None:

@@ -144,7 +144,6 @@ def _joined(parts: Sequence[Borne]) -> Borne:
 def _tried(
     pool: Pool, worlds: State, weights: Floats, preferring: Sequence[tuple[Game, Mapping[str, Team]]]
 ) -> dict[str, Borne]:
-    """Try constant commands, shipped profiles and agents; return the agents' harm, [W, n, N]."""
     problem = pool.problem
     constants = problem.constant(problem.even_grid(CONSTANTS))
     for q in range(CONSTANTS):
@@ -172,7 +171,6 @@ def observes_weights(team: Team) -> bool:
 
 
 def _search(pool: Pool, worlds: State, weights: Floats, effort: Mapping[str, int], tell: Callable[[int], None]) -> None:
-    """Search twice for each choice of weights, each time from the best profile tried so far."""
     problem = pool.problem
     starts = starting_profiles(problem, worlds)
     aims = [problem.minimising(row / row.sum()) for row in weights]

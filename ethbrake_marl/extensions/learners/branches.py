@@ -66,7 +66,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
 
 
 def stands_for_good(before: State, after: State, count: Floats) -> Bools:
-    """Return where all vehicles stand, and a policy without memory will never move one again, [n].
+    """Return in which worlds all vehicles stand and will never move again, if actions depend only on observations, [n].
 
     There nothing has changed in this step, and no vehicle waits for its latency or for news. ``count`` [6] are the
     weights of what counts as harm: a vehicle that presses against a standing one can still push it. Always False if
@@ -100,5 +100,5 @@ def find_standing(
 
 
 def moving(state: State) -> Bools:
-    """Return where a vehicle moves, [n]."""
+    """Return in which worlds a vehicle moves, [n]."""
     return np.asarray(state.line[:, SPEED].any(axis=1))

@@ -106,6 +106,5 @@ class BranchingModel(BaseAlgorithm):
         return amounts(self.objectives, None, state, count)[:, self.game.rules.learners - 1]
 
     def drawn_steps(self, count: int) -> Ints:
-        """Draw how many steps each of ``count`` tried actions lasts, [count]."""
         holds = np.array(self.recipe.holds, np.int64)
         return np.asarray(holds[torch.randint(len(holds), (count,)).numpy()])

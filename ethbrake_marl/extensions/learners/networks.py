@@ -59,7 +59,6 @@ class Averaged(nn.Module):
         self.optimizer = Adam(weights, lr=begin, eps=1e-5, capturable=on_gpu)
 
     def descend(self, loss: Tensor, keep: float) -> Tensor:
-        """Make one gradient step, update the average, and return the loss."""
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
@@ -102,7 +101,6 @@ class Memory(nn.Module):
         self.register_buffer("known", torch.zeros(1, dtype=torch.int64))
 
     def store(self, **arrays: NDArray[Any]) -> None:
-        """Store m decisions: name of a column -> [m, ...]."""
         m = len(next(iter(arrays.values())))
         places = torch.arange(int(self.known), int(self.known) + m) % self.size
         for name, array in arrays.items():

@@ -235,7 +235,6 @@ class RolloutClassificationRecipe(BranchingRecipe):
 
     @property
     def others(self) -> int:
-        """Number of choices that are tried at a decision, besides the policy's own."""
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     @model_validator(mode="after")

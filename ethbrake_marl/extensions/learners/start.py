@@ -22,7 +22,7 @@ class Member(NamedTuple):
 
 
 def members_of(policy: Policy) -> list[Member]:
-    """Return the policies among which a policy chooses, or its only actor."""
+    """Return the policies among which ``policy`` chooses; if it does not choose, only itself."""
     features, network = tuple(policy.observation.names), policy.manifest.network
     parts = {f"among_{m}.": member for m, member in enumerate(network.among, 1)} or {"": network}
     return [

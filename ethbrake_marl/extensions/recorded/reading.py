@@ -91,7 +91,6 @@ def read_cells(file: Path, entry: Format) -> Cells:
 
 
 def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str, Sequence[str], dict[str, int]]:
-    """Read up to the header; return its line number, the separator, all column names, and quantity -> column."""
     missing = list(entry.columns.values())
     for number in range(1, HEAD + 1):
         line = stream.readline(LONGEST_HEAD).decode("utf-8-sig")
@@ -124,7 +123,6 @@ def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, i
 
 
 def _numbers(cells: Cells, quantity: str, column: Any, may_be_empty: bool) -> Any:
-    """Return the numbers of a column. They may have commas between thousands."""
     try:
         values = column.cast(pyarrow.float64()).to_numpy()
     except pyarrow.ArrowException:

@@ -139,7 +139,6 @@ def _turn_highd(states: Any, cells: Cells) -> None:
 
 
 def _turn_exid(states: Any, raw: Any) -> None:
-    """Set the direction of travel, and move positions from the centre of a vehicle to its front."""
     heading = np.deg2rad(raw["heading"])
     states["dx"], states["dy"] = np.cos(heading), np.sin(heading)
     states["front"] += states["length"] / 2.0 * states["dx"]

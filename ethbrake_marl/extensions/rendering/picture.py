@@ -66,7 +66,6 @@ class Pen:
         return self.x(self.fronts_m[body - 1] - BODY_M), self.x(self.fronts_m[body - 1])
 
     def marks(self, every_m: float) -> list[float]:
-        """Return the multiples of a distance that are in view."""
         first, last = math.ceil(self.left_m / every_m), math.floor(self.right_m / every_m)
         return [k * every_m for k in range(first, last + 1)]
 

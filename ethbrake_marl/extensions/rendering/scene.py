@@ -36,7 +36,7 @@ COLUMNS = 100  # width of the road in characters
 
 
 class Impact(NamedTuple):
-    """The first impact of a pair in a step."""
+    """First impact of a pair of vehicles in a step."""
 
     pair: int  # 0: Vehicle 1 and the obstacle
     closing_mps: float

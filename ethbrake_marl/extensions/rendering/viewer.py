@@ -16,15 +16,12 @@ SMOOTH_FPS = 50  # frames per second in the window, and default of `step_frames`
 
 
 class Viewer:
-    """Viewer of an environment with one world, or with many (``num_envs``)."""
-
     def __init__(self, environment: Any) -> None:
         self.environment = environment
         self.many = hasattr(environment, "num_envs")
         self.motions: list[Motion] = []  # of each world, since its last decision
 
     def began(self, state: State) -> None:
-        """Start the pictures of new episodes; running episodes keep theirs."""
         if len(self.motions) != state.n:
             self.motions = [Motion(self.environment.game, state, row) for row in range(state.n)]
         self.stepped(state)
@@ -116,7 +113,6 @@ class Window(Viewer):
                 return
 
     def close(self) -> None:
-        """Close this environment's window."""
         if self.window is not None:
             self.window.destroy()
             self.window = None

@@ -46,8 +46,6 @@ PAGE = "report.html"
 
 
 class RunReport:
-    """Report of an experiment (``training.experiment.Report``)."""
-
     measures: tuple[str, ...] = (*Tables.measures, *MEASURES)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:

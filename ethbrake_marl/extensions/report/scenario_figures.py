@@ -50,7 +50,6 @@ def worlds_figure(scenario: Scenario, drawn: Drawn, *, seed: int) -> Figure:
 
 
 def _varying(drawn: Drawn) -> dict[Rule, dict[int, Floats]]:
-    """Return the quantities that differ between worlds: rule -> vehicle or pair (from 0) -> values [n]."""
     columns, varying = quantities_of(drawn.worlds, drawn.friction), dict[Rule, dict[int, Floats]]()
     for rule in (rule for rule in RULES.values() if rule.column):
         for i in range(rule.count(drawn.worlds.vehicles)):
@@ -82,7 +81,6 @@ def _distribution(axes: Axes, rule: Rule, entries: dict[int, Floats]) -> None:
 
 
 def _pictures(scenario: Scenario, drawn: Drawn) -> Frame:
-    """Return pictures of some worlds at the alert, one below the other, with the same scale."""
     worlds = drawn.worlds
     ranked = np.argsort(worlds.gaps_m.sum(axis=1), kind="stable")
     rows = {name: int(ranked[round(rank * (worlds.n - 1))]) for name, rank in SHOWN.items()}

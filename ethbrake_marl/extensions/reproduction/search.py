@@ -104,7 +104,7 @@ def differences(numbers: Floats, printed: Floats = PRINTED) -> Floats:
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> Any:
-    """Return the root mean square of the eight differences, [...]."""
+    """Return the root mean square of the eight differences between ours and the printed numbers, [...]."""
     return np.sqrt(np.square(differences(numbers, printed)).mean(axis=-1))
 
 

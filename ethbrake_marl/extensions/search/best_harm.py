@@ -82,7 +82,6 @@ def best_harm(
 def _searched(
     game: Game, alert: State, problem: Problem, given: Sequence[Profiles], objective: Declared, effort: dict[str, int]
 ) -> tuple[Profiles, dict[str, Floats]]:
-    """Search from all known starts; with several vehicles, also from the best profile of each one alone."""
     starts, bodies = starting_profiles(problem, alert, given), problem.bodies.tolist()
     for c, body in enumerate(bodies if len(bodies) > 1 else ()):
         own = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)

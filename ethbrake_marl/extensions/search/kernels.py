@@ -65,8 +65,6 @@ class Room(NamedTuple):
 
 
 class Field(NamedTuple):
-    """Memory for M profiles that are improved at the same time."""
-
     ends: Ints  # [M, K]
     commands: Floats  # [M, K, B]
     phases: Ints  # [M] number of phases in use; 0: an empty place

@@ -73,7 +73,6 @@ class BestHarmTable:
         return buffer.getvalue()
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Return the row of each world in the table, [m]; -1 if it is not there."""
         order = np.argsort(self.identity, kind="stable")
         rows = order[np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)]
         return np.where(self.identity[rows] == identity, rows, -1)
@@ -131,7 +130,6 @@ def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
 
 
 def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file. Raises ``ValueError`` for a damaged or too large one."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())

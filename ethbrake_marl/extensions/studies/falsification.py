@@ -69,7 +69,6 @@ def far_apart(points: Floats, scores: Floats, count: int) -> Ints:
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Return ``count`` new points [count, d], about equally many near each of ``parents`` [m, d]."""
     if count == 0:
         return parents[:0]
     parent = parents[np.arange(count) % len(parents)]

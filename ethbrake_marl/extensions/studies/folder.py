@@ -50,7 +50,6 @@ def work_in(
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return how two settings differ, in words such as ``seeds 2, now 5; recipes``."""
     differences = []
     for name in dict.fromkeys([*now, *before]):
         old, new = before.get(name), now.get(name)
