@@ -1,12 +1,12 @@
-"""What one vehicle can know of its line: *candidate lines*, made from its messages and the scenario's ranges.
+"""What one vehicle can know of its line: *estimated lines*, made from its messages and the scenario's ranges.
 
 A value of another vehicle that has not been received is its median in the *median line*, and an end of its range in
-every *corner*. Each candidate line is simulated beside the episode, from the alert on, with the vehicle's own actions;
+every *corner*. Each estimated line is simulated beside the episode, from the alert on, with the vehicle's own actions;
 the others follow their scripts. It is dropped when the vehicle receives or measures something that contradicts it. If
 all are contradicted, the truth lies between the corners: then received values replace assumed ones in all of them, and
 the rest goes on as before.
 
-Nothing else of the true state is read, so what was not received cannot change a candidate line.
+Nothing else of the true state is read, so what was not received cannot change an estimated line.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ OF_IMPACTS = [HIT, FIRST, TOTAL, COUNT]
 
 
 class Lines(NamedTuple):
-    """The M candidate lines of the vehicle ``body`` before it has received anything, the median line first."""
+    """The M estimated lines of the vehicle ``body`` before it has received anything, the median line first."""
 
     body: int
     alert: State  # [M] at the alert
@@ -143,7 +143,7 @@ class Lines(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the candidate lines at the alert, M rows for each world, given what ``state``, the first decision,
+        """Return the estimated lines at the alert, M rows for each world, given what ``state``, the first decision,
         shows.
 
         Vehicles of which everything is known by then start as in the true world ``alert``, and so does the gap between
@@ -165,10 +165,10 @@ class Lines(NamedTuple):
         return true._replace(line=line, car=car, wanted=self.commands(car, true.wanted))
 
     def received(self, state: State) -> tuple[Bools, Floats]:
-        """Return which quantities of each body the vehicle has received, [n, N + 1, PIECES], and their newest values.
+        """Return which quantities of each body the vehicle has received, [n, N + 1, PIECES], and the newest values.
 
-        The columns are those of ``messages.links``. The obstacle's place is known to all who know the place of Vehicle
-        1.
+        The values are [n, SAMPLE_ROWS, N + 1] (``messages.links``). The obstacle's place is known to all who know the
+        place of Vehicle 1.
         """
         if NAME in state.memories:
             pieces, news = known_pieces(state, self.body), newest(state, self.body)
@@ -181,7 +181,7 @@ class Lines(NamedTuple):
         return pieces, news
 
     def heard(self, state: State, lines: State) -> tuple[State, Bools, Bools]:
-        """Return the candidate lines after what was received by now; [n] whether any agreed with it; [n] whether any
+        """Return the estimated lines after what was received by now; [n] whether any agreed with it; [n] whether any
         did not.
 
         A contradicted line becomes a copy of one that agrees; if none agrees, ``overwritten`` corrects all of them.
@@ -199,7 +199,7 @@ class Lines(NamedTuple):
         return lines, some, changed
 
     def agrees(self, state: State, lines: State) -> Bools:
-        """Return in which candidate lines the vehicle would have received and measured the same, [n, M]."""
+        """Return in which estimated lines the vehicle would have received and measured the same, [n, M]."""
         pieces, news = self.received(state)
         mine, theirs = self.told(state, news), self.told(lines, self.received(lines)[1])
         far = np.abs(theirs.reshape(state.n, -1, *mine.shape[1:]) - mine[:, np.newaxis]) > SURPRISE
@@ -217,7 +217,7 @@ class Lines(NamedTuple):
         return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, lines: State) -> State:
-        """Return one candidate line for each world, in which received values replace assumed ones.
+        """Return one estimated line for each world, in which received values replace assumed ones.
 
         A received place and speed are moved on to the present by the sender's script, without contact; a sender that
         did not accelerate then reacts no earlier than then. A vehicle with an unknown place keeps its distance to this
@@ -257,9 +257,9 @@ class Lines(NamedTuple):
 
 
 def without_channel(game: Game, lines: State) -> tuple[Game, State]:
-    """Return the game and candidate lines in which every vehicle knows everything, for agents that drive there.
+    """Return the game and estimated lines in which every vehicle knows everything, for agents that drive there.
 
-    A candidate line does not say when the truth would be received, so each vehicle's own latency ends when it reacts.
+    An estimated line does not say when the truth would be received, so each vehicle's own latency ends when it reacts.
     """
     car = lines.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]

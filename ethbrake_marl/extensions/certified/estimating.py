@@ -1,15 +1,15 @@
-"""Shields and E-V2X-BM that use only what their vehicle has received: they decide in candidate lines (``estimated``).
+"""Shields and E-V2X-BM that use only what their vehicle has received: they decide in estimated lines (``estimated``).
 
 **Claim of the shield with corners**, ``robust:estimated``. Let B be its bound at the first decision. If the true world
-is one of the candidate lines that are possible then, the harm of the episode is at most B, to the last bit, whatever is
+is one of the estimated lines that are possible then, the harm of the episode is at most B, to the last bit, whatever is
 proposed and whatever messages are lost.
 
-**Proof.** Each candidate line is simulated by the episode's own step with the actions that are applied, so the one that
+**Proof.** Each estimated line is simulated by the episode's own step with the actions that are applied, so the one that
 is the true world is the true episode, and it never becomes impossible. The proof of the step shield holds in each line
 that remains; with fewer lines the price of the plan does not rise, and another plan is held only if it costs less. ∎
 
 Without corners, in the median line alone, nothing is promised. Between the corners the harm may be above the bound. The
-info ``trusted`` is false once every candidate line is contradicted.
+info ``trusted`` is false once every estimated line is contradicted.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 class EstimatedShield(MembersShield):
-    """Shield of one learner that certifies actions in its candidate lines (``estimated.Lines``).
+    """Shield of one learner that certifies actions in its estimated lines (``estimated.Lines``).
 
     Args:
         drivers: body -> agent, as for ``StepShield``.
@@ -158,8 +158,9 @@ class EstimatedEV2XBM:
 
 
 def differ(one: State, other: State) -> Bools:
-    """Return in which worlds two lines differ in speeds, gaps or other quantities, [n]; past reaction times are
-    ignored.
+    """Return in which worlds two lines differ in speeds, gaps or other quantities, [n].
+
+    Reaction times that are over are ignored.
     """
     parts = []
     for line in (one, other):

@@ -72,9 +72,10 @@ class MembersShield(StepShield):
 
 
 class RobustShield(MembersShield):
-    """Shield whose bound holds in the nominal world and in every corner of its box, not between them.
+    """Shield whose bound holds in the nominal world and in every corner of the intervals around it, but not between
+    them.
 
-    Its info ``trusted`` is false once a gap or speed was observed, before any impact, that no world in the box has.
+    Its info ``trusted`` is false once a gap or speed was observed, before any impact, that the intervals rule out.
 
     Args:
         drivers: body -> agent, as for ``StepShield``.
@@ -130,9 +131,10 @@ def joined(states: State) -> State:
 
 
 def may_be_in(state: State, members: State) -> Bools:
-    """Return in which worlds all gaps and speeds lie in the range of the members, [n]; True after any impact.
+    """Return in which worlds all gaps and speeds are in the range of the members, [n]; True after any impact.
 
-    Before any impact, gaps and speeds are monotone in each quantity, so every world in the box lies in this range.
+    Before any impact, gaps and speeds are monotone in each quantity, so every world within the intervals lies in this
+    range.
     """
     struck = state.line[:, COUNT].any(axis=1) | members.line[:, :, COUNT].any(axis=(1, 2))
     inside = np.ones(state.n, np.bool_)

@@ -40,7 +40,7 @@ class Interval(NamedTuple):
 
 
 class Side(NamedTuple):
-    """One uncertain number in n worlds."""
+    """One uncertain quantity of one vehicle or pair, with its interval in each of n worlds."""
 
     key: str
     body: int  # column in the arrays of a state
@@ -109,7 +109,7 @@ class Uncertainty(NamedTuple):
 
 
 def values_of(alert: State, key: str) -> Floats:
-    """Return a quantity's nominal values, one column per body; column 0, and of gaps the last, have no meaning."""
+    """Return a quantity's nominal values, one column per body. Column 0 and the last gap have no meaning."""
     return alert.line[:, OF_LINE[key]] if key in OF_LINE else alert.car[:, OF_CAR[key]]
 
 

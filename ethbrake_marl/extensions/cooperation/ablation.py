@@ -163,6 +163,6 @@ def driven(level: Level, drawn: Drawn, algorithm: str | None, jobs: Any) -> Meas
 
 
 def minimised(declared: Declared, count: str, game: Game, alert: State, last: State) -> Given:
-    """Return the mean over the learners of what the training minimises, [n]."""
+    """Return what the training minimises, as a mean over the learners, [n]."""
     each = amounts(objectives_of(declared, last.vehicles), None, last, count)
     return np.asarray(each[:, game.rules.learners - 1].mean(axis=1))

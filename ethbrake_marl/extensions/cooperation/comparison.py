@@ -95,7 +95,7 @@ def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Return how harm differs between two levels. Seeds are compared one to one, or all with an only seed."""
+    """Return how harm differs between two levels. Seed k is compared with seed k, or with an only seed."""
     entry: Json = {"algorithm": algorithm}
     for word, one in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}

@@ -35,7 +35,7 @@ class Swept(NamedTuple):
 
     @property
     def label(self) -> str:
-        """End of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
+        """Suffix of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
 

@@ -83,7 +83,7 @@ class Memory(NamedTuple):
 
 
 def samples_kept(delay_s: float, time_step_s: float) -> int:
-    """Return how many samples to keep so that every message finds its own: those of one delay, and three."""
+    """Return how many samples to store so that every message finds its own: those of one delay, and three more."""
     return math.ceil(delay_s / time_step_s - ON_GRID) + 3
 
 
@@ -102,7 +102,7 @@ def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, ke
 
 
 def present(state: State) -> Floats:
-    """Return a sample of all bodies now, [n, SAMPLE_ROWS, N + 1]; places are relative to Vehicle 1.
+    """Return the sample that each body would send now, [n, SAMPLE_ROWS, N + 1]; places are relative to Vehicle 1.
 
     The intent of a vehicle is its last command; 0 before it knows of the alert.
     """

@@ -41,7 +41,7 @@ def gentlest_between(kind, at, early, late):
 
 @kernel
 def decision_around(at, early, late):
-    """Return start and end (s) of the decision step that contains both ``early`` and ``late``.
+    """Return start and end (s) of the decision step that contains both times, ``early`` and ``late`` (s).
 
     If there is none, or if commands may change at any time, return ``late`` twice.
     """

@@ -24,7 +24,7 @@ TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
 
 
 def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
-    """Return at most ``MOST_WORLDS`` rows to show, row -> why it is shown."""
+    """Choose at most ``MOST_WORLDS`` worlds to show; return row -> why it is shown."""
     result, column = compared.result, COLUMN[compared.harm_count]
     cost, known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
 

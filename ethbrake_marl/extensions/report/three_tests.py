@@ -27,7 +27,7 @@ KEPT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the shor
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Return whether a scenario is the shipped one of its name, apart from title, description and source."""
+    """Return whether a scenario equals the shipped one of its name, except title, description and source."""
     return scenario.content(without=WORDS) == load_scenario(scenario.name).content(without=WORDS)
 
 

@@ -39,14 +39,15 @@ EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "PPO, not
 
 
 def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy under a reading of the paper, [n]."""
+    """Return the first-impact harm of each strategy under a reading of the paper's text, [n]."""
     found = strategies(reading, episodes, policies)
     lines = {name: each["first"] for name, each in found.items()} | {EXPECTED: found[E_V2X_BM][PREDICTED]}
     return lines | ({PROVEN: least_harm(reading, episodes)} if reading.step_s is None else {})
 
 
 def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[str, Floats]:
-    """Return the harm of each strategy in the paper's map, with policies trained by the paper's process, [seeds, n].
+    """Return the harm of each strategy in the paper's fixed-step map, with policies trained as in the paper, [seeds,
+    n].
 
     Empty without such trainings.
     """
@@ -56,7 +57,10 @@ def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[s
 
 
 def estimate(line: Floats, rows: Floats) -> Estimate:
-    """Return the mean harm in some worlds, with an interval over the worlds or, if there are several, over seeds."""
+    """Return the mean harm in some worlds, with a 95 % interval.
+
+    The interval is over the worlds or, if there are several seeds, over the seeds.
+    """
     return mean(line[rows]) if line.ndim == 1 else mean(line[:, rows].mean(axis=1))
 
 
@@ -74,7 +78,10 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 
 
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequence[str], x_label: str) -> Made:
-    """Return a figure of mean harm, with a panel for each reading, and a table for each. ``shown``: its lines."""
+    """Return a figure of mean harm, with a panel for each reading of the paper, and a table for each.
+
+    ``shown``: strategies that the figure shows.
+    """
     estimates = {
         reading: {
             name: {group: estimate(lines[name], rows) for group, (lines, rows) in groups.items()} for name in names
@@ -105,7 +112,7 @@ def over_distance(stem: str, readings: Mapping[str, Groups], shown: Sequence[str
 
 
 def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Groups]:
-    """Return the groups of worlds under the paper's stated parameters and in the nearest reading."""
+    """Group worlds by distance, under the paper's parameters as stated and in the reading nearest to its results."""
     episodes, found = min(DISTANCE_WORLDS, settings.episodes), {}
     for name, reading in (("as stated", STATED), ("nearest reading", NEAREST)):
         there = reading._replace(base=DISTANCE)

@@ -107,7 +107,7 @@ QUICK = "Figures 2 and 3, the paper's own process and the search over the readin
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the items with these names in the order of the paper; without names, all. Raises ``UnknownName``."""
+    """Return the paper's figures and tables with these names; without names, all. Raises ``UnknownName``."""
     known = {item.name: item for item in ITEMS}
     for name in names:
         if name not in known:
@@ -131,7 +131,7 @@ def cost(settings: Settings, items: Sequence[Item]) -> str:
 def reproduce(
     settings: Settings, items: Sequence[Item], machine: str, *, force: bool = False
 ) -> dict[Item, Made] | None:
-    """Train what is missing, make the items, and write page, figures and tables. None: Ctrl-C stopped a training.
+    """Train what is missing, and write figures, tables and a page. Return None if Ctrl-C stopped a training.
 
     Finished trainings in the folder are used. Raises ``AlreadyExists`` if the folder has results and ``force`` is
     false.

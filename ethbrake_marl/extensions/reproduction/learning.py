@@ -59,7 +59,10 @@ def is_finished(run: Path) -> bool:
 
 
 def trained(folder: Path, group: str) -> dict[str, list[Path]]:
-    """Return the runs of a group: recipe -> folder for each seed. Recipes with an unfinished run are left out."""
+    """Return the finished trainings of a group: recipe -> folder for each seed.
+
+    Recipes with an unfinished training are left out.
+    """
     every = {plan.recipe: runs_of(folder, group, plan) for plan in GROUPS[group]}
     return {recipe: runs for recipe, runs in every.items() if all(map(is_finished, runs))}
 
@@ -71,7 +74,7 @@ def seconds_left(folder: Path, groups: Iterable[str]) -> float:
 
 
 def train(settings: Settings, groups: Iterable[str]) -> bool:
-    """Start, or continue, the unfinished runs of some groups. Return False if Ctrl-C stopped one.
+    """Start, or continue, the unfinished trainings of some groups. Return False if Ctrl-C stopped one.
 
     Raises ``MissingExtra`` without torch, and the errors of ``eb.train`` and ``eb.resume``.
     """
@@ -104,7 +107,7 @@ def unconverged(folder: Path) -> str:
 
 
 def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
-    """Return the policies trained by the paper's process: name -> an agent name per seed; empty without ``full``."""
+    """Return the policies trained as in the paper: name -> one agent name per seed. Empty without ``settings.full``."""
     runs = trained(settings.folder, group) if settings.full else {}
     return {
         name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
@@ -119,7 +122,7 @@ Values = Sequence[Mapping[float, float]]  # for each seed: progress (%) -> value
 
 
 class Course(NamedTuple):
-    """Trainings by one recipe at one delay: two quantities over the progress (%), for each seed."""
+    """Learning curves of one recipe at one delay, for each seed, over the progress of the training (%)."""
 
     returns: Values  # mean return of training episodes
     harm: Values  # first-impact harm on the fixed list (m2/s2)
@@ -147,7 +150,7 @@ class Course(NamedTuple):
 
     @property
     def converged(self) -> Floats:
-        """Number of decisions until nine tenths of the rise, [seeds]; all decisions if there is no rise."""
+        """Number of decisions until the return has made nine tenths of its rise, [seeds]; all if it does not rise."""
         risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
         progress = np.where(self.rise > 0.0, np.array([*self.returns[0]])[risen.argmax(axis=1)], 100.0)
         return 0.01 * self.decisions * progress
@@ -164,7 +167,7 @@ class Course(NamedTuple):
 
 
 def column(run: Path, name: str) -> dict[float, float]:
-    """Return a column of a run's table: decisions -> value, without empty cells."""
+    """Return a column of the table of a training's progress: decisions -> value, without empty cells."""
     rows = csv.DictReader((run / "progress.csv").read_text("utf-8").splitlines())
     return {float(row["steps"]): float(row[name]) for row in rows if row.get(name)}
 

@@ -84,7 +84,7 @@ def exchange(line: Floats, car: Floats) -> None:
 
 
 def sample(state: State, step_s: float) -> State:
-    """Return the state one sample later: impacts, then a step with ``state.wanted`` [n, N + 1] m/s2."""
+    """Advance the state by one sampling period: impacts, then a step with ``state.wanted`` [n, N + 1] (m/s2)."""
     line, clock = state.line.copy(), state.clock.copy()
     exchange(line, state.car)
     now, speed, limit = clock[:, TIME, np.newaxis], line[:, SPEED], state.car[:, LIMIT]
@@ -119,7 +119,7 @@ class MappedGame(Game):
     __slots__ = ()
 
     def first_decision(self, alert: State) -> State:
-        """Return the episodes at the first sample.
+        """Return the episodes at the first decision.
 
         Raises ``InvalidInput`` for worlds with an impact before it, and for worlds of a scenario with exact impacts.
         """

@@ -52,7 +52,7 @@ def outcome_of(last: State) -> Outcome:
 
 
 def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED) -> Table:
-    """Return the table under a reading, in the first worlds of the random test, with 95 % intervals.
+    """Return the table of the paper's random test, with 95 % intervals, under a reading of its text.
 
     ``policies``: agent names of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the coupled H* in the paper's map.
     """
@@ -68,9 +68,9 @@ def estimate(row: str, reading: Reading, episodes: int, spec: str) -> tuple[Esti
 
 def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
     """Return whether each world has a collision, and its harm (m2/s2), [n] each, as a reading of the paper reports
-    them.
+    both.
 
-    ``spec``: name of the policy in a hybrid.
+    ``row``: strategy; ``spec``: agent name of the policy in a hybrid.
     """
     worlds, counted = reading.only(*WORLDS), reading.counted
     if row == NON_E:
@@ -97,7 +97,7 @@ def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str 
 
 
 def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
-    """Return collisions and harm as they happen, or as they were predicted at the alert."""
+    """Return collisions and harm, [n] each: as they happened, or as they were predicted at the alert."""
     if numbers == "predicted":
         return predicted > 0.0, predicted
     return collided, predicted if numbers == "predicted harm, realised collisions" else harm
@@ -111,7 +111,7 @@ def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
 
 @cache
 def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> Outcome:
-    """Let all vehicles brake fully, or Vehicle 2 with the deceleration of E-V2X-BM.
+    """Simulate full braking of all vehicles or, with ``plans``, Vehicle 2 with the deceleration of E-V2X-BM.
 
     After an impact vehicles brake on, or coast from the next decision on, or the episode ends.
     """
@@ -135,10 +135,9 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
 
 @cache
 def plan(plans: Reading, episodes: int) -> Choice:
-    """Return the deceleration that E-V2X-BM chooses by the paper's closed form, which ignores restitution and time
-    step.
+    """Return the deceleration that E-V2X-BM chooses by the paper's closed form, without restitution and time steps.
 
-    Of all decelerations with the same least harm it is the middle one, or the low or high end.
+    If several decelerations do the same least harm, the reading says which is taken: the smallest, middle or largest.
     """
     latencies = () if plans.plans_as_stated else ("acts_s", "rear_s")
     _, _, alert = opened(plans.only("base", "others", "seed", *latencies), episodes)
@@ -158,7 +157,7 @@ def plan(plans: Reading, episodes: int) -> Choice:
 
 @cache
 def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> Outcome:
-    """Let an agent drive Vehicle 2, even a policy that was trained elsewhere."""
+    """Simulate an agent as Vehicle 2, without warning if it is a policy trained for other worlds."""
     scenario, game, alert = opened(worlds, episodes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Unfamiliar)

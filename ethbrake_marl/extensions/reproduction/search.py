@@ -66,7 +66,7 @@ NEAREST = STATED._replace(
 
 
 def readings_of(grid: Grid) -> Iterator[Reading]:
-    """Yield all combinations of a grid, except the coupled H* in the paper's map."""
+    """Yield all readings of the paper in a grid, except those with the coupled H* in the paper's map."""
     for values in product(*grid.values()):
         reading = STATED._replace(**dict(zip(grid, values, strict=True)))
         if reading.step_s is None or reading.hybrid != "realised, by the coupled H*":
@@ -94,17 +94,17 @@ def search(
 
 
 def numbers_of(table: Table) -> Floats:
-    """Return collision rate and mean harm (m2/s2) of the four rows, [4, 2]."""
+    """Return collision rate and mean harm (m2/s2) of the four rows of the random test's table, [4, 2]."""
     return np.array([[each.value for each in row] for row in table.values()])
 
 
 def differences(numbers: Floats, printed: Floats = PRINTED) -> Floats:
-    """Return |ours / printed - 1| for numbers [..., 4, 2], as [..., 8]."""
+    """Return the relative differences |ours / printed - 1| of a table's numbers [..., 4, 2], as [..., 8]."""
     return np.abs(numbers / printed - 1.0).reshape(*numbers.shape[:-2], -1)
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> Any:
-    """Return the root mean square of the eight differences between ours and the printed numbers, [...]."""
+    """Return the root mean square of the relative differences of a table's eight numbers, [...]."""
     return np.sqrt(np.square(differences(numbers, printed)).mean(axis=-1))
 
 

@@ -31,9 +31,10 @@ MAP_STEP_S = 0.1
 
 
 def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Outcome]:
-    """Return the outcome of each strategy; if impacts are exact, also of E-V2X-BM (coupled) and its hybrids.
+    """Return the outcome of each strategy under a reading of the paper: name -> outcome.
 
-    ``policies``: name -> agent name. Hybrids decide by first-impact harm.
+    If impacts are exact, E-V2X-BM (coupled) and its hybrids are included. ``policies``: name -> agent name. Hybrids
+    decide by first-impact harm.
     """
     worlds, plans = reading.only(*WORLDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
@@ -52,7 +53,10 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
 
 
 def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[str, list[dict[str, Outcome]]]:
-    """Return the outcomes of the policies of the paper's process in its map, alone and in the hybrid: name -> seeds."""
+    """Return the outcomes of policies trained as in the paper, alone and in the hybrid, in the paper's fixed-step map.
+
+    Policy -> for each seed, outcomes of all strategies.
+    """
     mapped = reading._replace(step_s=MAP_STEP_S)
     return {
         name: [strategies(mapped, episodes, {name: spec}) for spec in specs]

@@ -72,10 +72,10 @@ def number_claims(
     *,
     not_ours: bool = False,
 ) -> list[Claim]:
-    """Return every number that the paper prints as a claim, compared with ours.
+    """Return every number that the paper prints in a table as a claim, compared with ours.
 
-    ``stated``, ``nearest``: our outcomes as stated and in the nearest reading. ``least`` [n] m2/s2: proven lower bound
-    as stated. ``not_ours``: the policies are the user's.
+    ``stated``, ``nearest``: our outcomes under the paper's parameters as stated, and in the reading nearest to its
+    results. ``least`` [n] m2/s2: proven lower bound, as stated. ``not_ours``: the policies are the user's.
     """
     claims, proven = [], {RATE: rate(least > 0.0), AVERAGE: mean(least)}
     for row in printed:
@@ -109,7 +109,7 @@ def number_claims(
 
 
 def outcomes_sheet(title: str, found: Mapping[str, Outcome], least: Floats) -> Sheet:
-    """Return a table of outcomes. ``least`` [n] m2/s2: proven lower bound for all strategies."""
+    """Return a table of the strategies' collision rates and harm. ``least`` [n] m2/s2: proven lower bound."""
     rows = [
         (
             *(name, rate(each["collided"]), mean(each["first"]), mean(each["total"])),
@@ -125,7 +125,10 @@ COLUMNS = PERCENT, *map(Column, ("First-impact harm", "Total harm", "Predicted h
 
 
 def process_sheet(settings: Settings, reading: Reading, episodes: int) -> list[Sheet]:
-    """Return a table of the paper's process in its map: means over seeds with t intervals; empty without trainings."""
+    """Return a table of policies trained as in the paper, in its fixed-step map: means over seeds with t intervals.
+
+    Empty without such trainings.
+    """
     found = of_the_process(reading, episodes, settings)
     if not found:
         return []
@@ -141,7 +144,7 @@ def process_sheet(settings: Settings, reading: Reading, episodes: int) -> list[S
 
 
 def compared(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less]:
-    """Compare both harms of the strategy ``smaller`` with those of others, in the same worlds."""
+    """Compare both harms of the strategy ``smaller`` with those of the strategies ``larger``, in the same worlds."""
     return [
         Less.of_worlds(f"{smaller} minus {other}, {harm}", found[smaller][count], found[other][count])
         for other in larger
@@ -150,7 +153,7 @@ def compared(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[L
 
 
 def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less]:
-    """Compare the collision rate (%) of the strategy ``smaller`` with those of others, in the same worlds."""
+    """Compare the collision rate (%) of the strategy ``smaller`` with those of ``larger``, in the same worlds."""
     percent = {name: 100.0 * each["collided"] for name, each in found.items()}
     return [
         Less.of_worlds(f"{smaller} minus {other}, % of worlds", percent[smaller], percent[other]) for other in larger
@@ -158,7 +161,10 @@ def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less
 
 
 def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: str, larger: str) -> list[Less]:
-    """Compare two strategies of the paper's process over its seeds; ``{}`` in their names stands for the policy's."""
+    """Compare two strategies over the seeds of policies trained as in the paper.
+
+    ``{}`` in the strategies' names stands for the policy's name.
+    """
     parts = []
     for name, seeds in process.items():
         one, other = smaller.format(name), larger.format(name)

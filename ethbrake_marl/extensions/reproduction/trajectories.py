@@ -75,7 +75,7 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 
 
 def all_records(settings: Settings) -> dict[str, Records]:
-    """Return the episodes as stated, in the nearest reading, and of the first seed of the paper's process."""
+    """Return recorded episodes as the paper states them, in the nearest reading, and of policies trained as in it."""
     policies = tuple(settings.policies.items())
     found = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
     trained = tuple((name, specs[0]) for name, specs in process(settings).items())
@@ -179,7 +179,10 @@ def apart(records: Records, number: int, what: str) -> float:
 
 
 def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
-    """Return claims about one world. ``readings``: for both, claim -> words, (smaller quantity) - (larger one)."""
+    """Return claims that one quantity is smaller than another in a world, as stated and in the nearest reading.
+
+    ``readings``: for both, claim -> words, (smaller quantity) - (larger one).
+    """
     claims = []
     for text in readings[0]:
         (words, stated), (_, nearest) = (each[text] for each in readings)

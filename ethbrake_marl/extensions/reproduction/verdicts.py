@@ -87,7 +87,10 @@ class Less(NamedTuple):
 
 
 def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, Outcome, str]:
-    """Return in how many comparisons a statement holds, the outcome, and the comparisons that fail or nearly fail."""
+    """Judge a statement of the paper: in how many comparisons it holds, the outcome, and the comparisons that fail.
+
+    If none fails, the closest comparison is returned instead.
+    """
     compared = [part for part in parts if not part.both_are_0]
     failing = [part for part in compared if not part.holds]
     ties = f", both are 0 in {len(parts) - len(compared)} more" if len(compared) < len(parts) else ""
@@ -105,7 +108,10 @@ def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, O
 def judge(
     where: str, paper: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, why: str = "", show: Column = APART
 ) -> Claim:
-    """Return the claim that a statement holds. ``why``: the reason if it does not."""
+    """Compare a statement of the paper with our results as stated and in the nearest reading.
+
+    ``why``: the reason to show if they differ.
+    """
     ours, outcome, numbers = judge_statement(stated, show)
     other = judge_statement(nearest, show)[0] if nearest else ""
     text = f"{why} ({numbers})" if why and outcome == "differs" else numbers

@@ -50,9 +50,7 @@ def _where_known(scenario: str) -> str:
 
 
 def best_known(game: Game, alert: State, last: State) -> Given:
-    """Least harm (honest: least honest cost) known in the same world, from a search that knew the whole world or an
-    agent.
-    """
+    """Least harm (honest: least honest cost) known in the same world, from a full-knowledge search or an agent."""
     return least(game, alert)
 
 

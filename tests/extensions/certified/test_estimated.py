@@ -25,7 +25,7 @@ DEAF = BASE.replace(
 
 
 def lines_at(scenario: eb.Scenario, n: int = 20, steps: int = 0, action: float = 0.0) -> tuple[Lines, State, State]:
-    """Return candidate lines before any message, the true state after some steps, and the candidate lines then."""
+    """Return estimated lines before any message, the true state after some steps, and the estimated lines then."""
     loaded, game = eb.open_game(scenario)
     lines, alert = Lines.of(loaded, 2, corners=False), loaded.sample(n, 7)
     state = game.reset(alert)
