@@ -143,8 +143,8 @@ class Lines(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the estimated lines at the alert, M rows for each world, given what ``state``, the first decision,
-        shows.
+        """Return the estimated lines at the alert, M rows for each world, if ``state`` is what is known at the first
+        decision.
 
         Vehicles of which everything is known by then start as in the true world ``alert``, and so does the gap between
         two of them.
@@ -219,9 +219,9 @@ class Lines(NamedTuple):
     def overwritten(self, state: State, lines: State) -> State:
         """Return one estimated line for each world, in which received values replace assumed ones.
 
-        A received place and speed are moved on to the present by the sender's script, without contact; a sender that
-        did not accelerate then reacts no earlier than then. A vehicle with an unknown place keeps its distance to this
-        vehicle, within the order of the line. This vehicle measures its own motion and its own impacts.
+        A received place and speed are moved on to the present by the sender's script, without contact. A sender that
+        was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to
+        this vehicle, within the order of the line. This vehicle measures its own motion and its own impacts.
         """
         body, (pieces, news), time = self.body, self.received(state), state.time_s[:, np.newaxis]
         line, car = lines.line.copy(), lines.car.copy()

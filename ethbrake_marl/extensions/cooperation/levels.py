@@ -48,8 +48,9 @@ class Level(NamedTuple):
 def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
     """Load the levels of an ablation, and choose for each the earlier level with which it is compared.
 
-    A level that differs from an earlier one only in ``v2x`` is compared with it; every other level with the previous
-    one of these others. Raises ``InvalidInput`` for fewer than two levels, or one given twice.
+    A level that differs from an earlier one only in ``v2x`` is compared with that one. The other levels form a ladder,
+    in which each is compared with the previous one. Raises ``InvalidInput`` for fewer than two levels, or one given
+    twice.
     """
     levels: list[Level] = []
     ladder: list[Level] = []

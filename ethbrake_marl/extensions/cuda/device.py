@@ -29,7 +29,7 @@ class Kernel(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name under which the compiled code is stored: all that decides the code, except the sources."""
+        """Name of the stored machine code: everything that decides it, except the sources."""
         return "-".join([self.work, *map(str, self.size)])
 
     def thread(self) -> Callable[..., None]:
@@ -61,7 +61,7 @@ def device_named(name: str) -> torch.device:
 
 
 class TooLittleMemory(InvalidInput):
-    """What was asked for needs more memory than the device has."""
+    """The device has less memory than the request needs."""
 
 
 @contextmanager
@@ -109,7 +109,7 @@ def as_arrays(given: Any) -> Any:
 
 
 def like(given: Any) -> Any:
-    """Return arguments of the same types on the processor, with empty arrays in place of tensors."""
+    """Return a kernel's arguments on the processor, with empty arrays in place of tensors, for compiling the kernel."""
     return _with(given, lambda tensor: torch.empty((0,) * tensor.dim(), dtype=tensor.dtype).numpy())
 
 

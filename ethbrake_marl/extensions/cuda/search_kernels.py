@@ -171,7 +171,7 @@ def begin_with(t, own, plans, world, room, drawing, drawn):
 
 @large
 def search(t, own, searched, plans, drawing, drawn, budget):
-    """Improve the profile of thread t by ``budget`` changes; if ``drawn`` is above 0, begin with the best of new ones.
+    """Improve the profile of thread t by ``budget`` changes; if ``drawn`` is above 0, first choose it among new ones.
 
     ``drawing``: how random profiles and changes are drawn.
     """

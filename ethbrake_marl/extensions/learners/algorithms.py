@@ -20,7 +20,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Vine(Algorithm):
-    """One actor drives all learners; or a mixture of experts drives the only one."""
+    """Algorithm vine: one actor drives all learners, or a mixture of experts drives the only one."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
         recipe = training.recipe

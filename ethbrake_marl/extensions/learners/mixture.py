@@ -40,7 +40,7 @@ LIKELY_ACTIONS, THEIR_SHARES = np.array([-1.0, 1.0, 0.0]), np.array([0.35, 0.5, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """No template has a higher return than the earlier experts, so a new expert has nothing to learn."""
+    """No template (random braking profile) has a higher return than the earlier experts: there is nothing to learn."""
 
 
 class Stage(NamedTuple):
@@ -100,7 +100,7 @@ class Explored(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """Decisions of templates that a new expert imitates."""
+    """Decisions of templates (random braking profiles) that a new expert imitates."""
 
     seen: Float32s  # [m, F] observations
     action: Float32s  # [m]
@@ -192,8 +192,8 @@ class MixtureModel(VineModel):
     def best_templates(self, explored: Explored) -> tuple[Ints, Floats]:
         """Draw random templates in each world; return the worlds [m] in which one does less harm than all experts.
 
-        Also return the best template's actions there, [m, T]. Templates are not improved by a search: a random one with
-        little harm tolerates small errors of its actions, so a policy can imitate it.
+        Also return the best template's actions there, [m, T]. A template is a random braking profile. No search
+        improves it: a random one with little harm tolerates small errors of its actions, so a policy can imitate it.
         """
         count, start = self.recipe.reward.harm_count, explored.start
         generator = np.random.default_rng(self.recipe.seed)
@@ -248,7 +248,7 @@ class MixtureModel(VineModel):
         """Let each of K experts drive on from some visited decisions at which they differ.
 
         Returns the observations, [B, F], and the experts' costs, [B, K]: minus the return, plus ``tie_break`` times the
-        harm by the other count.
+        harm by the count that the reward does not use.
         """
         policy, plan = self.policy, self.plan
         actions = np.stack([actor.act(seen) for actor in policy.actors])

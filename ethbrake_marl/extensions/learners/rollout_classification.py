@@ -206,7 +206,7 @@ class RolloutClassificationModel(BranchingModel):
     def usual_costs(self, numbers: Ints, least: Floats) -> Floats:
         """Update each scenario's running mean of the least cost; return it for each decision, [B].
 
-        ``numbers`` [B]: numbers of the worlds, which say the scenario of a mixture. ``least`` [B]: costs of the
+        ``numbers`` [B]: numbers of the worlds, which decide the scenario in a mixture. ``least`` [B]: costs of the
         cheapest choices.
         """
         known, back = np.unique(numbers, return_inverse=True)

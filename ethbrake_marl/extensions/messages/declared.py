@@ -35,7 +35,7 @@ _LISTED = {"type": "array", "items": {"enum": list(PIECES)}, "uniqueItems": True
 
 
 class Messages:
-    """The extension that these keys switch on."""
+    """Extension that the keys ``persistence`` and ``tells`` of ``v2x`` switch on."""
 
     name = "messages"
     schemas: Mapping[str, dict[str, Any]] = {
@@ -70,7 +70,7 @@ class Messages:
         return read if by_name else read[""]
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Return the keys that messages after the first use. Raises an error for keys that have no effect."""
+        """Return the keys of ``v2x`` that messages after the first use. Raises an error for keys without effect."""
         tells = _value(v2x, "tells")
         right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
         sent = v2x.hears != "none" and v2x.timing != "latency"

@@ -120,7 +120,7 @@ def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
 
 @large
 def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
-    """Return ``drive_before_braking`` for a follower with the speed limit ``limit`` (m/s)."""
+    """Return the same as ``drive_before_braking``, for a follower with the speed limit ``limit`` (m/s)."""
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         drive, touch, moving = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)

@@ -62,10 +62,10 @@ EXACT_ALONE = ("push", "drove", "still_moving")  # terms of a reward that the ma
 
 
 def exchange(line: Floats, car: Floats) -> None:
-    """Apply eq. (13) to all pairs that overlap and close, and count the harm, in place.
+    """Apply eq. (13) to all pairs that overlap and close, and count the harm, in place. w is the closing speed:
 
-    With the closing speed w: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and ``v_{i+1}+ = v_{i+1} - m_i (1 +
-    e) w / (m_i + m_{i+1})``.
+    v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})
+    v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})
     """
     speed, gap = line[:, SPEED], line[:, GAP]
     for p in range(speed.shape[1] - 2, 0, -1):

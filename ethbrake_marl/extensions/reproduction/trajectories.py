@@ -75,7 +75,11 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 
 
 def all_records(settings: Settings) -> dict[str, Records]:
-    """Return recorded episodes as the paper states them, in the nearest reading, and of policies trained as in it."""
+    """Return recorded episodes of each policy: as the paper states its parameters, and in the reading nearest to its
+    results.
+
+    After trainings by the paper's own recipes, also the episodes of their first seed.
+    """
     policies = tuple(settings.policies.items())
     found = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
     trained = tuple((name, specs[0]) for name, specs in process(settings).items())

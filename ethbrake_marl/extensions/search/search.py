@@ -129,7 +129,7 @@ def divide(field: Field, attention: int) -> None:
 
 
 def select(world: World, room: Room, given: Profiles, field: Field) -> None:
-    """Switch to step-by-step simulation, and put the best of the field and of the given profiles first in the field."""
+    """Simulate step by step from now on. Put the best profile of ``field`` and ``given`` first in ``field``."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
