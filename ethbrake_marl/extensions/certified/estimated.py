@@ -90,8 +90,8 @@ class Lines(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario, body: int, *, corners: bool) -> Lines:
-        """Return the median line of a scenario and, with ``corners``, lines with every unknown quantity at an end of
-        its range.
+        """Return the median line of a scenario and, with ``corners``, lines with unknown quantities at the ends of
+        their ranges.
 
         Unknown are the gaps and, of each other vehicle, speed, braking capacity, mass, latency, and when it receives
         the alert. Raises ``InvalidInput`` for a mixture of scenarios, for other vehicles with unknown commands, and for
@@ -143,7 +143,7 @@ class Lines(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the estimated lines at the alert, M rows for each world, if ``state`` is what is known at the first
+        """Return the estimated lines at the alert, M rows for each world, from what ``state`` shows at the first
         decision.
 
         Vehicles of which everything is known by then start as in the true world ``alert``, and so does the gap between
@@ -181,8 +181,8 @@ class Lines(NamedTuple):
         return pieces, news
 
     def heard(self, state: State, lines: State) -> tuple[State, Bools, Bools]:
-        """Return the estimated lines after what was received by now; [n] whether any agreed with it; [n] whether any
-        did not.
+        """Return the estimated lines after what was received, and in which worlds any, and not all, agreed with it, [n]
+        each.
 
         A contradicted line becomes a copy of one that agrees; if none agrees, ``overwritten`` corrects all of them.
         """

@@ -93,8 +93,7 @@ class EstimatedShield(MembersShield):
 
 
 class EstimatedEpisodeShield(EpisodeShield):
-    """Algorithm 1 (*hybrid*) in the median line: at the first decision, it chooses the policy or E-V2X-BM for the
-    episode.
+    """Algorithm 1 (*hybrid*) in the median line: the first decision chooses the policy or E-V2X-BM for the episode.
 
     ``harm_count`` is compared; ``bound`` is how H* is computed: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
     """

@@ -72,10 +72,10 @@ class MembersShield(StepShield):
 
 
 class RobustShield(MembersShield):
-    """Shield whose bound holds in the nominal world and in every corner of the intervals around it, but not between
-    them.
+    """Shield whose bound holds in the nominal world and in every corner of the intervals around it.
 
-    Its info ``trusted`` is false once a gap or speed was observed, before any impact, that the intervals rule out.
+    The bound does not hold between the corners. The info ``trusted`` is false once a gap or speed was observed, before
+    any impact, that the intervals rule out.
 
     Args:
         drivers: body -> agent, as for ``StepShield``.

@@ -55,8 +55,7 @@ class Uncertainty(NamedTuple):
         return ",".join(interval.text for interval in self.intervals)
 
     def members(self, alert: State) -> State:
-        """Return the members of worlds at the alert, M rows for each world: the world itself, then the corners of its
-        box.
+        """Return the members of worlds at the alert, M rows for each world: itself, then the corners of its box.
 
         Corner k takes the high end of number i where bit i of k is 1. Raises ``InvalidInput`` if an interval does not
         fit the worlds, and for more than ``MOST_CORNERS`` corners.

@@ -129,7 +129,7 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 
 
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
-    """Return two criteria of the fuzzy safety model of UN R157, proactive and critical, each [n]: 0 no danger, 1 full
+    """Return the proactive and the critical criterion of UN R157's fuzzy safety model, [n] each: 0 no danger, 1 full
     danger.
 
     ``p``: parameters of the law ``r157_fsm``.

@@ -95,8 +95,7 @@ class VineModel(BranchingModel):
         return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
 
     def play(self, states: State, branches: Branches, policy: Actor) -> tuple[Floats, Floats]:
-        """Simulate branches to the end; return what their learners gained, and how far their actions were moved, [2B]
-        each.
+        """Simulate branches to the end; return their learners' returns, and how far actions were moved, [2B] each.
 
         An action stays in [-1, 1], so it may move by less than ``size``. Moves are summed over the steps.
         """

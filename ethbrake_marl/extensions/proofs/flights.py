@@ -39,8 +39,7 @@ def flight_lead(pair, opening, flight):
 
 @kernel
 def best_flight(pair, opening):
-    """Return the duration (s) of the flight with the largest lead, if it begins with the opening speed ``opening``
-    (m/s).
+    """Return the duration (s) of the flight with the largest lead among those that begin with ``opening`` (m/s).
 
     Infinite if a longer flight always has a larger lead.
     """

@@ -43,8 +43,7 @@ LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)
 
 @kernel
 def value_of(line, time):
-    """Return the value at ``time`` of a piecewise linear function ``line``, a tuple (start, slope, turn, bend, turn,
-    bend).
+    """Return the value at ``time`` of a piecewise linear function, a tuple (start, slope, turn, bend, turn, bend).
 
     ``start + slope t + bend max(t - turn, 0) + bend max(t - turn, 0)``; each turn has its own bend.
     """
@@ -88,12 +87,11 @@ def rear_after(at, early):
 
 @large
 def pushed_by_leader(at, early, late, closing, end, lack):
-    """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with the leader; 0: none
-    proven.
+    """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with the leader.
 
-    It follows from the motion of the centre of mass of leader and controlled vehicle. If the leader is at rest at
-    ``early``, a later first contact leads to the same motion at a later time, so ``late``, ``end`` and ``lack`` do not
-    matter.
+    It follows from the motion of the centre of mass of leader and controlled vehicle; 0: none proven. If the leader is
+    at rest at ``early``, a later first contact leads to the same motion at a later time, so ``late``, ``end`` and
+    ``lack`` do not matter.
     """
     share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -119,8 +117,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 
 @large
 def held_by_leader(at, early, late, closing):
-    """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with a leader that brakes
-    harder.
+    """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with a harder braking leader.
 
     It holds because the controlled vehicle then stays near the leader. 0: none proven.
     """
@@ -191,11 +188,10 @@ def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
 
 @large
 def pushed_by_rear(at, early, late, closing, end, lack, gap):
-    """Return a lower bound (m/s) on the front pair's closing speed after the rear vehicle has hit the controlled
-    vehicle.
+    """Return a lower bound (m/s) on the front pair's closing speed after the rear vehicle's first contact.
 
-    It follows from the motion of the centre of mass of these two. The controlled vehicle must brake at least as hard as
-    the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m).
+    It follows from the motion of the centre of mass of rear and controlled vehicle. The controlled vehicle must brake
+    at least as hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m).
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]

@@ -108,8 +108,7 @@ def rear_bound(at):
 
 @large
 def last_first(kind, at, first, last):
-    """Return the latest time (s), at most ``last``, at which a contact with one neighbour can come before any with the
-    other.
+    """Return the latest time (s), at most ``last``, of a contact with one neighbour before any with the other.
 
     By bisection, from ``first`` (s), at which it is possible. The later the contact in front, the shorter the vehicle
     drives, so the rear vehicle comes nearer; the later the contact behind, the shorter it brakes, so it comes nearer to
@@ -169,8 +168,7 @@ def outer_contact(at):
 
 @large
 def front_first(at, floor, best, enough, cells):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front, or of all three at
-    once.
+    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all three.
 
     In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
     vehicle relative to the front vehicle, and the front pair's is at least the smallest possible one at this time. Such

@@ -86,8 +86,7 @@ def braking_to_rear(at, time):
 
 @large
 def gentlest(kind, at, time):
-    """Return the smallest closing speed (m/s) of a first contact at ``time``, and the ``drive`` or ``brake`` (s) that
-    leads to it.
+    """Return the smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake`` (s).
 
     To be at a place at a time with the largest speed, brake first and then drive. ``brake`` is infinite if the vehicle
     reaches its speed limit by then.

@@ -46,8 +46,7 @@ def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> di
 
 
 def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[str, Floats]:
-    """Return the harm of each strategy in the paper's fixed-step map, with policies trained as in the paper, [seeds,
-    n].
+    """Return the harm in the paper's fixed-step map, with policies trained as in the paper: strategy -> [seeds, n].
 
     Empty without such trainings.
     """

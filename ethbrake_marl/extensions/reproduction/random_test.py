@@ -67,8 +67,7 @@ def estimate(row: str, reading: Reading, episodes: int, spec: str) -> tuple[Esti
 
 
 def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
-    """Return whether each world has a collision, and its harm (m2/s2), [n] each, as a reading of the paper reports
-    both.
+    """Return collisions and harm (m2/s2) of each world, [n] each, as a reading of the paper reports them.
 
     ``row``: strategy; ``spec``: agent name of the policy in a hybrid.
     """

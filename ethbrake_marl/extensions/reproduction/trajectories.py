@@ -75,8 +75,7 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 
 
 def all_records(settings: Settings) -> dict[str, Records]:
-    """Return recorded episodes of each policy: as the paper states its parameters, and in the reading nearest to its
-    results.
+    """Return recorded episodes under the paper's parameters as stated, and in the reading nearest to its results.
 
     After trainings by the paper's own recipes, also the episodes of their first seed.
     """
@@ -200,8 +199,7 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
 
 
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return the first command of Vehicle 2 and the sum of its changes (m/s2), and the share of time in which it
-    brakes.
+    """Return the first command of Vehicle 2, the sum of its changes (m/s2), and the share of time in which it brakes.
 
     The share is of the time in which it moves after its latency.
     """

@@ -16,10 +16,10 @@ from ethbrake_marl.registry import Part
 
 
 def least(game: Game, alert: State) -> dict[str, Floats]:
-    """Return the least known value of each count, count -> [n] m2/s2; the honest cost only if it is known in all
-    worlds.
+    """Return the least known value of each count, count -> [n] m2/s2.
 
-    Raises ``InvalidInput`` if the least harm of a world is in no shipped table.
+    The honest cost is included only if it is known in all worlds. Raises ``InvalidInput`` if the least harm of a world
+    is in no shipped table.
     """
     problem = problem_of(game, alert)
     known = {count: stored(problem, count)[0] for count in COUNTS}

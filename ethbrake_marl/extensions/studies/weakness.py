@@ -43,11 +43,11 @@ class Measure(NamedTuple):
 
     @classmethod
     def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> Measure:
-        """Return the measure ``name`` of ``agent``. ``against``: the other agent; None: none, or the best known
-        commands.
+        """Return the measure ``name`` of ``agent``.
 
-        Agents are names or objects, as for ``eb.evaluate``. Raises ``InvalidInput`` if ``against`` is not used, or a
-        name means several agents, and the errors of ``teams_of``.
+        ``against``: the other agent; None: none, or the best known commands. Agents are names or objects, as for
+        ``eb.evaluate``. Raises ``InvalidInput`` if ``against`` is not used, or a name means several agents, and the
+        errors of ``teams_of``.
         """
         if name not in MEASURES:
             raise unknown_name("measure", name, MEASURES)
