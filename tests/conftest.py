@@ -49,7 +49,6 @@ settings.load_profile("deterministic")
 
 @pytest.fixture
 def empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder that the test runs in."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

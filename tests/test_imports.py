@@ -21,13 +21,11 @@ PACKAGE = "ethbrake_marl"
 
 
 def modules(package: Path) -> Iterator[tuple[str, Path]]:
-    """(room, file) of every module of the package."""
     for path in sorted(package.rglob("*.py")):
         yield path.relative_to(package).parts[0].removesuffix(".py"), path
 
 
 def imported_by_text(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """(line, module) of every `import_module("...")`."""
     for node in ast.walk(tree):
         match node:
             case ast.Call(

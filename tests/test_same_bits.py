@@ -41,7 +41,6 @@ def is_exact(base: ast.expr) -> bool:
 
 
 def imported(module: str, names: list[ast.alias]) -> set[str]:
-    """Of a ``from module import names``."""
     if module.startswith("scipy"):
         return {module}
     chosen = {f"{module}.{each.name}" for each in names if each.name in TRANSCENDENTAL | BY_MACHINE}

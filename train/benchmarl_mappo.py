@@ -30,11 +30,9 @@ from ethbrake_marl.training.training import Training
 def train(scenario: str, recipe: str, steps: int, seed: int, output: Path, harm_count: str | None = None) -> None:
     """Train MAPPO with the hyperparameters of a PPO recipe, and save the shared actor as `output`/policy.
 
-    `harm_count` is what the reward counts; None: as in the recipe.
-
-    The learning rate keeps its initial value, because BenchMARL has no schedule. There are no checkpoints and no
-    evaluations during the training. Raises `InvalidInput` if the recipe is not for PPO or nobody learns, `MissingExtra`
-    without BenchMARL, and `AlreadyExists` if `output` exists.
+    `harm_count` is what the reward counts; None: as in the recipe. The learning rate stays constant, because BenchMARL
+    has no schedule. Raises `InvalidInput` if the recipe is not for PPO or nobody learns, `MissingExtra` without
+    BenchMARL, and `AlreadyExists` if `output` exists.
     """
     plan = eb.load_recipe(recipe)
     if not isinstance(plan, PpoRecipe):
@@ -53,7 +51,7 @@ def train(scenario: str, recipe: str, steps: int, seed: int, output: Path, harm_
 def make_experiment(training: Training, scratch: str, algorithm: str = "mappo") -> Any:
     """Return a BenchMARL experiment with a recipe's hyperparameters. BenchMARL writes its files to `scratch`.
 
-    `algorithm` may also be "ippo", whose critic has the observation of the actor.
+    `algorithm`: "mappo", or "ippo", whose critic has the observation of the actor.
     """
     import torch
     from benchmarl.algorithms import algorithm_config_registry
@@ -89,7 +87,7 @@ def make_experiment(training: Training, scratch: str, algorithm: str = "mappo") 
 
 
 def policy_of(experiment: Any, training: Training) -> Policy:
-    """Return the shared actor of an experiment as a policy; the hyperbolic tangent limits its mean to [-1, 1]."""
+    """Return the shared actor as a policy. A hyperbolic tangent limits its mean to [-1, 1]."""
     from torchrl.modules import MultiAgentMLP
 
     recipe = training.recipe
@@ -116,7 +114,7 @@ def policy_of(experiment: Any, training: Training) -> Policy:
 
 
 def tensors_of(actor: Any, hidden: int) -> dict[str, NDArray[np.float32]]:
-    """Return the weights of the actor by the names of `NetworkSpec.tensors`. The last layer gives mean and noise."""
+    """Return the actor's weights by the names of `NetworkSpec.tensors`. The last layer gives mean and noise."""
     tensors: dict[str, NDArray[np.float32]] = {}
     for k in range(hidden + 1):
         for part in ("weight", "bias"):

@@ -31,8 +31,6 @@ from ethbrake_marl.training.own_team import save_team
 
 @dataclass(frozen=True)
 class Settings:
-    """What to train, and the hyperparameters of PPO."""
-
     scenario: str = "cooperation-3-pair"  # a shipped name, or the path of a YAML file
     steps: int = 1_500_000  # decisions of all learners together
     seed: int = 0
@@ -55,7 +53,7 @@ class Settings:
 
 
 def perceptron(inputs: int, hidden: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
-    """Return a network with two hidden layers, one output and the usual initial weights of PPO."""
+    """Return a network with two hidden layers, one output and PPO's usual initial weights."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, 1)]
     for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -74,7 +72,7 @@ class Learner(nn.Module):
         self.optimiser = torch.optim.Adam(self.parameters(), settings.learning_rate, eps=1e-5)
 
     def actions(self, seen: Tensor) -> Normal:
-        """Return the distribution of actions [..., 1] for observations [..., F]."""
+        """Return the distribution of the actions [..., 1] for observations [..., F]."""
         return Normal(self.mean(seen), self.log_std.exp())
 
 
@@ -94,7 +92,7 @@ class Rollout:
 
 
 class Copies:
-    """Parallel copies of the environment, each with its own worlds. Their only agents are the learners."""
+    """Parallel copies of the environment, each with its own worlds. Only the learners are agents."""
 
     def __init__(self, settings: Settings) -> None:
         reward = {"harm": 0.05, "harm_count": settings.harm_count, "terminal": 0.02}  # returns are of order 1
@@ -105,7 +103,7 @@ class Copies:
 
     @torch.no_grad()
     def collect(self, learners: dict[str, Learner], settings: Settings) -> tuple[dict[str, Rollout], list[float]]:
-        """Return a rollout per learner, and what the reward counted of each episode that ended."""
+        """Return a rollout per learner, and what the reward counts, summed over each episode that ended."""
         rollouts = {name: Rollout(self.seen[0][name].size, settings) for name in learners}
         harms: list[float] = []
         for t in range(settings.rollout):
@@ -144,7 +142,6 @@ def advantages(own: Rollout, values: Tensor, settings: Settings) -> Tensor:
 
 
 def update(learner: Learner, own: Rollout, settings: Settings) -> None:
-    """Improve the networks of one learner with one rollout."""
     seen, actions = own.seen[:-1].flatten(0, 1), own.actions.flatten(0, 1)
     with torch.no_grad():
         values = learner.critic(own.seen)[..., 0]

@@ -31,8 +31,6 @@ from ethbrake_marl.training.own_team import save_team
 
 @dataclass(frozen=True)
 class Settings:
-    """What to train, and the hyperparameters of PPO."""
-
     scenario: str = "cooperation-3-pair"  # a shipped name, or the path of a YAML file
     steps: int = 1_000_000  # decisions of all learners together
     seed: int = 0
@@ -55,7 +53,7 @@ class Settings:
 
 
 def perceptron(inputs: int, hidden: int, outputs: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
-    """Return a network with two hidden layers and the usual initial weights of PPO."""
+    """Return a network with two hidden layers and PPO's usual initial weights."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, outputs)]
     for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -64,7 +62,7 @@ def perceptron(inputs: int, hidden: int, outputs: int, last_gain: float, last_bi
 
 
 class Actor(nn.Module):
-    """Actor of one vehicle: returns the distribution of actions [..., 1] for observations [..., F]."""
+    """Actor of one vehicle: maps observations [..., F] to the distribution of actions [..., 1]."""
 
     def __init__(self, features: int, settings: Settings) -> None:
         super().__init__()
@@ -80,8 +78,6 @@ class Actor(nn.Module):
 
 @dataclass
 class Rollout:
-    """Observations, actions and rewards of all learners."""
-
     seen: dict[str, Tensor]  # learner -> observations [T, C, F]
     states: Tensor  # [T + 1, C, S]; the last row is the state after the last step
     actions: Tensor  # [T, C, L], before clipping
@@ -90,7 +86,7 @@ class Rollout:
 
 
 class Copies:
-    """Parallel copies of the environment, each with its own worlds. Their only agents are the learners."""
+    """Parallel copies of the environment, each with its own worlds. Only the learners are agents."""
 
     def __init__(self, settings: Settings) -> None:
         reward = {"harm": 0.05, "harm_count": settings.harm_count, "terminal": 0.02}  # returns are of order 1
@@ -101,7 +97,7 @@ class Copies:
 
     @torch.no_grad()
     def collect(self, actors: dict[str, Actor], steps: int) -> tuple[Rollout, list[float]]:
-        """Return a rollout, and what the reward counted of each episode that ended."""
+        """Return a rollout, and what the reward counts, summed over each episode that ended."""
         seen: dict[str, list[Tensor]] = {name: [] for name in actors}
         states, actions, rewards, ended, harms = [self.states()], [], [], [], []
         for _ in range(steps):
@@ -151,7 +147,6 @@ class Team:
         return torch.cat([self.actors[name](seen[name][rows]).log_prob(action) for name, action in own], dim=-1)
 
     def update(self, rollout: Rollout, settings: Settings) -> None:
-        """Improve the actors and the critic with one rollout."""
         seen = {name: rows.flatten(0, 1) for name, rows in rollout.seen.items()}
         states, actions = rollout.states[:-1].flatten(0, 1), rollout.actions.flatten(0, 1)
         with torch.no_grad():

@@ -33,8 +33,6 @@ from ethbrake_marl.training.own_team import save_team
 
 @dataclass(frozen=True)
 class Settings:
-    """What to train, where, and the hyperparameters of PPO."""
-
     scenario: str = "paper-random"  # a shipped name, or the path of a YAML file
     device: str = "cuda"  # or "cuda:1", or "cpu"
     steps: int = 5_000_000  # decisions of all learners together
@@ -61,7 +59,7 @@ class Settings:
 
 
 def perceptron(inputs: int, hidden: int, last_gain: float, last_bias: float = 0.0) -> nn.Sequential:
-    """Return a network with two hidden layers, one output and the usual initial weights of PPO."""
+    """Return a network with two hidden layers, one output and PPO's usual initial weights."""
     layers = [nn.Linear(inputs, hidden), nn.Linear(hidden, hidden), nn.Linear(hidden, 1)]
     for layer, gain, bias in zip(layers, (2**0.5, 2**0.5, last_gain), (0.0, 0.0, last_bias), strict=True):
         nn.init.orthogonal_(layer.weight, gain)
@@ -70,7 +68,7 @@ def perceptron(inputs: int, hidden: int, last_gain: float, last_bias: float = 0.
 
 
 class Actor(nn.Module):
-    """A policy: `mean` from observations [..., F] to the means of actions [..., 1], and one standard deviation."""
+    """A policy: `mean` maps observations [..., F] to the means of actions [..., 1]; all have one standard deviation."""
 
     def __init__(self, features: int, settings: Settings) -> None:
         super().__init__()
@@ -78,7 +76,7 @@ class Actor(nn.Module):
         self.log_std = nn.Parameter(torch.full((1,), settings.log_std))
 
     def log_prob(self, seen: Tensor, actions: Tensor) -> Tensor:
-        """Return the logarithm of the actions' density up to a constant, [...]. `Normal` would wait for the GPU."""
+        """Return the actions' log density up to a constant, [...]. torch's `Normal` would wait for the GPU."""
         noise = (actions - self.mean(seen)[..., 0]) / self.log_std.exp()
         return -0.5 * noise.square() - self.log_std
 
@@ -102,7 +100,7 @@ def advantages(rewards: Tensor, ended: Tensor, values: Tensor, gamma: float, gae
 
 
 class Ppo:
-    """Networks, optimiser, and a rollout of T time steps of n copies. An episode that ends is replaced at once."""
+    """Networks, optimiser, and a rollout: T time steps of n copies. An episode that ends is replaced at once."""
 
     def __init__(self, worlds: eb.cuda.Worlds, settings: Settings) -> None:
         self.worlds, self.settings = worlds, settings
@@ -122,7 +120,7 @@ class Ppo:
 
     @torch.no_grad()
     def collect(self) -> None:
-        """Collect a rollout, which begins where the last one ended, with its advantages."""
+        """Collect a rollout, which continues the last one, and compute its advantages."""
         self.seen[0].copy_(self.seen[-1])
         for t in range(self.settings.rollout):
             mean, std = self.actor.mean(self.seen[t])[..., 0], self.actor.log_std.exp()
@@ -138,7 +136,7 @@ class Ppo:
         self.gains.copy_((gains - gains.mean()) / (gains.std() + 1e-8))
 
     def update(self) -> None:
-        """Improve the networks with the minibatch `rows` by PPO's clipped loss (Schulman et al. 2017)."""
+        """Update the networks with the minibatch `rows` by PPO's clipped loss (Schulman et al. 2017)."""
         seen = self.seen[:-1].flatten(0, 2)[self.rows]
         actions, before, gains, targets = self.stored.flatten(1)[:, self.rows]
         ratio = (self.actor.log_prob(seen, actions) - before).exp()
@@ -170,7 +168,7 @@ class Ppo:
 
 @torch.no_grad()
 def evaluate(actor: Actor, worlds: eb.cuda.Worlds) -> dict[str, float]:
-    """Return the mean of each count (m2/s2) when the actor drives every world of a list once."""
+    """Let the actor drive every world of a list once; return the mean of each count of harm (m2/s2)."""
     seen = worlds.reset()
     for _ in range(worlds.longest):
         seen = worlds.step(actor.mean(seen)[..., 0], renew=False).observations

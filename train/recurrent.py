@@ -42,7 +42,7 @@ HIDDEN, NOISE, RATE = 64, 0.3, 3e-3
 
 
 class Recurrent(nn.Module):
-    """A GRU cell and a linear head. With `remembers=False` the memory is 0 at the beginning of each step."""
+    """A GRU cell and a linear head. With `remembers=False` the memory is set to 0 before each step."""
 
     def __init__(self, features: int, remembers: bool) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class Recurrent(nn.Module):
 
 
 def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespace) -> Recurrent:
-    """Return the trained network. Print what the reward counts every ten updates."""
+    """Return the trained network. Every ten updates, print the mean of what the reward counts."""
     torch.manual_seed(args.seed)
     _, game = eb.open_game(scenario, observation=observation, reward={"harm_count": args.harm_count})
     learners = game.rules.learners
@@ -117,7 +117,6 @@ def make_agent(folder: str, settings: eb.AgentSettings) -> eb.Agent:
 
 
 def main() -> None:
-    """Train, and save the network with the names of its features."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="cooperation-3-congested")
     parser.add_argument("--output", type=Path, required=True)

@@ -57,15 +57,13 @@ class LearnersOnly(BaseParallelWrapper):  # type: ignore[misc]  # PettingZoo is 
 
     @property
     def agents(self) -> list[str]:
-        """The learners while an episode runs; an empty list after it."""
+        """The learners while an episode runs; empty after it."""
         return self.possible_agents if self.env.agents else []
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Return the environment's reset, restricted to the learners."""
         return tuple(self._of_learners(part) for part in self.env.reset(seed=seed, options=options))
 
     def step(self, actions: dict[str, Any]) -> Any:
-        """Return the environment's step, restricted to the learners."""
         return tuple(self._of_learners(part) for part in self.env.step(actions))
 
     def _of_learners(self, part: dict[str, Any]) -> dict[str, Any]:
@@ -88,22 +86,19 @@ class SeededAndTruncated(VecEnvWrapper):
         self._next_seed: int | None = None
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Set the seed of the next reset."""
         self._next_seed = seed
         return [seed] * self.num_envs
 
     def reset(self) -> Any:
-        """Start an episode in every copy."""
         observations, self.reset_infos = self.venv.reset(seed=self._next_seed)
         self._next_seed = None
         return observations
 
     def step_async(self, actions: Any) -> None:
-        """Send the actions, one row per learner and copy."""
         self.venv.step_async(actions)
 
     def step_wait(self) -> Any:
-        """Finish one time step of every copy. A copy whose episode ended starts the next episode."""
+        """Finish one time step of every copy. Where an episode ended, the next one begins."""
         observations, rewards, terminated, truncated, infos = self.venv.step_wait()
         terminated, truncated = np.asarray(terminated, bool), np.asarray(truncated, bool)
         for row in np.flatnonzero(truncated & ~terminated):
@@ -111,16 +106,17 @@ class SeededAndTruncated(VecEnvWrapper):
         return observations, rewards, terminated | truncated, infos
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False for every row: the copies have no wrapper."""
         return [False] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return the attribute of SuperSuit's environment, once per row."""
         return [getattr(self.venv, attr_name)] * self.num_envs
 
 
 def make_worlds(scenario: eb.Scenario, reward: dict[str, Any] = REWARD) -> SeededAndTruncated:
-    """Return `COPIES` worlds of a scenario as rows for Stable-Baselines3: row k * L + l is learner l of L in copy k."""
+    """Return `COPIES` copies of a scenario's environment for Stable-Baselines3.
+
+    Row k * L + l is learner l of L in copy k.
+    """
     names = [scenario.vehicle_names[body - 1] for body in scenario.learners]
     learners = LearnersOnly(eb.parallel_env(scenario=scenario, reward=reward), names)
     rows = supersuit.pettingzoo_env_to_vec_env_v1(learners)
@@ -144,7 +140,6 @@ def train(scenario: eb.Scenario, steps: int, seed: int, output: Path, reward: di
 
 
 def learn(scenario: eb.Scenario, steps: int, seed: int, reward: dict[str, Any] = REWARD) -> Policy:
-    """Return the policy that PPO has learned after `steps` decisions."""
     torch.set_num_threads(1)
     worlds = VecMonitor(make_worlds(scenario, reward))
     model = PPO(

@@ -50,7 +50,7 @@ def read_jobs(args: argparse.Namespace) -> list[Job]:
 
 
 def sweep(args: argparse.Namespace) -> int:
-    """Do all training runs, write ``results.csv``, and return the number of runs that failed."""
+    """Do all training runs, write ``results.csv``, and return how many failed."""
     jobs = read_jobs(args)
     rows, failed = [], 0
     with folder_of_many(args.output, "results.csv"):
@@ -68,7 +68,7 @@ def sweep(args: argparse.Namespace) -> int:
 
 @contextmanager
 def on_ray(address):
-    """Context manager: joblib sends its work to a running Ray cluster, or to Ray on this machine (``local``)."""
+    """Context manager in which joblib sends its work to a Ray cluster, or to Ray on this machine (``local``)."""
     import ray
     from joblib import parallel_config
     from ray.util.joblib import register_ray

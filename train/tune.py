@@ -27,7 +27,7 @@ from ethbrake_marl.training.training import Training
 
 
 def read_search(text: str) -> tuple[str, BaseDistribution]:
-    """Read choices ``KEY=A/B/C`` or a range ``KEY=LOW..HIGH``, which is logarithmic with ``:log`` at its end."""
+    """Read choices ``KEY=A/B/C``, or a range ``KEY=LOW..HIGH`` (with ``:log`` at its end, a logarithmic one)."""
     key, _, values = text.partition("=")
     if "/" in values:
         return key, CategoricalDistribution(values.split("/"))

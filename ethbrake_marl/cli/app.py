@@ -56,7 +56,7 @@ def _about(
         bool, typer.Option("--version", is_eager=True, callback=_show_version, help="Show the version and exit.")
     ] = False,
 ) -> None:
-    """Options of ``ethbrake`` without a command: ``--version``."""
+    """Show the version."""
 
 
 def main() -> None:
@@ -66,11 +66,11 @@ def main() -> None:
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run a command line (the arguments after ``ethbrake``) and return its exit status.
+    """Run the command line ``ethbrake ARGUMENTS``, and return its exit status.
 
-    0: success. 2: invalid input, wrong usage or a file error, with the reason in one line on stderr. 1: the reader of
-    the output has closed the pipe. A command may set another one, such as 130 after Ctrl-C. Other errors are defects
-    of the program and are raised.
+    0: success. 1: the reader of the output has closed the pipe. 2: wrong usage, invalid input or a file error,
+    explained in one line on stderr. A command may choose another status, such as 130 after Ctrl-C. Every other
+    exception is a bug of this program and is raised.
     """
     asked = _shell_asks(os.environ)
     try:
@@ -105,9 +105,9 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Return whether a shell runs this command in order to complete a command line (see ``--show-completion``).
+    """Return whether a shell has started this program to complete a command line (see ``--show-completion``).
 
-    A stray variable that requests a completion is ignored if the completion script's other variables are missing.
+    False if only one of the shell's variables for completion is set: it may be left over from an earlier command.
     """
     if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
@@ -116,7 +116,6 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
 
 def _refuse(reason: str) -> int:
-    """Print the reason in one line on stderr; return the exit status, 2."""
     Out().note(f"ethbrake: error: {reason}")
     return 2
 
@@ -124,9 +123,9 @@ def _refuse(reason: str) -> int:
 def prepare_streams() -> None:
     """Set up stdout, stderr and warnings for the command line.
 
-    A character that the encoding of stdout does not have (m², lines of boxes) is printed as ``?``. Output that bypasses
-    Python's stdout, such as that of a library or child process, goes to stderr. Warnings of this package are printed in
-    one line. A message is printed before the first compilation of kernels.
+    Characters that stdout's encoding lacks, such as m², are printed as ``?``. Text that libraries and child processes
+    write to stdout without Python's ``sys.stdout`` goes to stderr. Warnings of this package are printed in one line. A
+    message announces the first compilation of numba kernels.
     """
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # closed by the caller: nobody reads it
@@ -150,7 +149,7 @@ def prepare_streams() -> None:
 
 
 def tell_compilation(folder: Path, empty: bool) -> None:
-    """Announce that kernels are being compiled. ``empty``: ``folder``, which stores them, had none to load."""
+    """Print that numba kernels are being compiled. ``empty``: ``folder``, which stores them, contains none yet."""
     if is_temporary(folder):
         what = (
             "the physics; no folder for compiled kernels is writable, so every command compiles it again (for help:"
@@ -163,7 +162,7 @@ def tell_compilation(folder: Path, empty: bool) -> None:
 
 
 def abandon_output() -> None:
-    """Discard buffered output that cannot be written (full disk); otherwise Python would raise an error at exit."""
+    """Discard output that cannot be written (full disk); otherwise Python would raise an error at exit."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -171,7 +170,7 @@ def abandon_output() -> None:
 
 
 def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog: str | None = None) -> None:
-    """Add the command ``ethbrake NAME``. Entry points: ``ethbrake_marl.commands``.
+    """Add the command ``ethbrake NAME``. Packages use the entry-point group ``ethbrake_marl.commands`` instead.
 
     Args:
         name: ``NAME``, or ``GROUP.NAME`` for a command inside an existing group of commands.
@@ -189,7 +188,6 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
 
 
 def _names() -> list[str]:
-    """Return the names of the core's commands and groups."""
     return [
         *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
         *(str(group.name) for group in app.registered_groups),
@@ -201,9 +199,9 @@ COMMANDS: Registry[Any] = Registry("command", "commands", add_command, dict.from
 
 
 class Installed(TyperCommand):
-    """A command of an extension or installed package, which is imported only when it is called.
+    """A command of an extension or another installed package. Its code is imported only when the command is called.
 
-    ``entry`` is the name of the entry point, ``NAME`` or ``GROUP.NAME``.
+    ``entry`` is the name of its entry point, ``NAME`` or ``GROUP.NAME``.
     """
 
     def __init__(self, entry: str) -> None:
@@ -221,12 +219,12 @@ class Installed(TyperCommand):
         return self.command().make_context(*arguments, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
-        """Return the short description; for another package's command its package, which need not be imported."""
+        """Return the command's line in ``ethbrake --help``. Another package is only named there, not imported."""
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
 
 def with_installed(group: Any, name: str) -> Any:
-    """Add the commands of the entry points ``NAME.COMMAND`` to the group ``name``; return the group."""
+    """Add the installed commands with entry points ``NAME.COMMAND`` to the command group ``name``; return the group."""
     for entry in points(COMMANDS.group):
         of, _, own = entry.rpartition(".")
         if of == name:
@@ -235,7 +233,7 @@ def with_installed(group: Any, name: str) -> Any:
 
 
 def whole_command() -> Any:
-    """Return all commands: of the core, of extensions and installed packages, and of ``add_command``.
+    """Return the program with all commands: the core's, those of installed packages, and those of ``add_command``.
 
     Raises ``AlreadyExists`` if two commands have the same name.
     """

@@ -56,7 +56,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on s
 def schema_option(module: str, function: str, kind: str) -> Any:
     """Return the type of an option ``--schema``, which prints the JSON Schema of a ``kind`` of file and exits.
 
-    The ``module`` of the ``function`` that returns the schema is imported only when the option is used.
+    ``function`` in ``module`` returns the schema. The module is imported only when the option is used.
     """
 
     def show_schema(asked: bool) -> None:
@@ -69,20 +69,20 @@ def schema_option(module: str, function: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Return the examples at the end of a help page, from command lines without ``ethbrake``."""
+    """Return the examples for the end of a help page. ``lines`` are commands without the word ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
 def say(text: str) -> None:
-    """Print a text as one line on stderr."""
     typer.echo(one_line(text), err=True)
 
 
 class Out:
     """Output of a command, used as ``with Out() as out``.
 
-    Inside the block only results go to stdout; all else, for instance of a user's agent, goes to stderr. Ctrl-C ends
-    the command with one line and exit status 130; the line ends with ``remains``, a text about the files that remain.
+    Inside the block only results go to stdout; everything else, such as what a user's agent prints, goes to stderr.
+    Ctrl-C ends the command with exit status 130 and a message, which ends with ``remains``: a text about files left
+    behind.
     """
 
     def __init__(self, *, as_json: bool = False, force: bool = False, remains: str = "nothing was written") -> None:
@@ -92,7 +92,7 @@ class Out:
         self._turned = redirect_stdout(sys.stderr)
 
     def __enter__(self) -> Self:
-        """Redirect stdout to stderr, and register the environments for the user's code."""
+        """Redirect stdout to stderr, and register the Gymnasium environments for the user's code."""
         self._turned.__enter__()
         register_environments()
         return self
@@ -100,26 +100,24 @@ class Out:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop redirecting stdout; after Ctrl-C, print a message and exit with status 130."""
         self._turned.__exit__(kind, error, trace)
         self.show_progress.end()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.remains}")
 
     def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
-        """Print the result: the plain data ``content`` as JSON, or else ``shown``."""
+        """Print the result: ``content`` as JSON if the user gave ``--json``, otherwise ``shown``."""
         if self.as_json:
             self.print_json(content)
         else:
             self.show(*shown, end=end)
 
     def print_json(self, content: Any) -> None:
-        """Print plain data as JSON, even without ``--json``."""
         self.show_progress.end()
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
     def show(self, *shown: RenderableType, end: str = "\n") -> None:
-        """Print texts, each followed by ``end``, and tables of rich.
+        """Print texts, each followed by ``end``, and tables of the library rich.
 
         Control characters in texts are escaped, except line ends and tabs.
         """
@@ -131,14 +129,14 @@ class Out:
                 _PlainConsole(self._stdout, width=None if self._stdout.isatty() else 100).print(each)
 
     def note(self, text: str) -> None:
-        """Print a text as one line on stderr, below the progress bars."""
         self.show_progress.end()
         say(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
-        """Raise ``InvalidInput`` or ``AlreadyExists``, before any work, if a file cannot be written. None is no file.
+        """Raise an error, before any work, if a file cannot be written. ``path=None`` means no file.
 
-        ``endings`` are the allowed endings of its name, such as ``.csv``; none: all. Messages call it ``what``.
+        ``endings`` are the allowed file extensions, such as ``.csv``; without them all are allowed. ``what`` is the
+        file's content in error messages. Raises ``InvalidInput``, or ``AlreadyExists`` without ``--force``.
         """
         if path is None:
             return
@@ -149,7 +147,7 @@ class Out:
         check_target(path, force=self.force)
 
     def write(self, path: Path, content: bytes | str, what: str | None = None) -> None:
-        """Write a file, whole or not at all; with ``what``, print ``WHAT: PATH`` on stderr."""
+        """Write a file completely or not at all. If ``what`` is set, print ``WHAT: PATH`` on stderr."""
         from ethbrake_marl.files.store import write_output
 
         write_output(path, content.encode() if isinstance(content, str) else content, force=self.force)
@@ -157,19 +155,17 @@ class Out:
             self.note(f"{what}: {path}")
 
     def interrupted(self, text: str) -> NoReturn:
-        """Print one line on stderr, and exit with status 130, as after Ctrl-C."""
         self.note(text)
         raise typer.Exit(130)  # 128 + SIGINT, as shells expect
 
     def progress(self, name: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` units of the task ``name`` are done."""
         self.show_progress(Progress(name, done, total))
 
 
 class _PlainConsole(Console):
-    """Console of rich that prints texts literally, without markup, and escapes control characters.
+    """Console of the library rich that prints texts literally, without markup, and escapes control characters.
 
-    ``width`` in characters; None: as wide as the terminal.
+    ``width`` is in characters; None: the terminal's width.
     """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:

@@ -62,7 +62,7 @@ class Check:
 def diagnose(*, compile_all: bool = False) -> list[Check]:
     """Return the results of all checks, in the order in which the user should solve problems.
 
-    With ``compile_all``, also compile the kernels (``compile_ahead``).
+    With ``compile_all``, also compile the numba kernels (``compile_ahead``).
     """
     has_torch = find_spec("torch") is not None
     return [
@@ -79,7 +79,6 @@ def diagnose(*, compile_all: bool = False) -> list[Check]:
 
 
 def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
-    """Return the check ``name`` with the result (ok, detail) of ``look()``; an error in ``look`` is a failed check."""
     try:
         return Check(name, *look())
     except Exception as error:
@@ -87,7 +86,7 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Yield a check per dependency: whether the required version is installed. Packages of extras may be missing."""
+    """Yield for each required package whether the right version is installed. Packages of extras may be missing."""
     from packaging.requirements import Requirement
 
     wanted = [Requirement(line) for line in requires("ethbrake-marl") or []]
@@ -124,7 +123,7 @@ def _scenarios() -> tuple[bool, str]:
 
 
 def _golden_impact() -> tuple[bool, str]:
-    """Check the physics: a car at 10 m/s brakes with 5 m/s2, 8 m behind a standing car.
+    """Check the physics: a car at 10 m/s, 8 m behind a standing car, brakes with 5 m/s2.
 
     The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2.
     """
@@ -161,10 +160,10 @@ def _golden_baseline() -> tuple[bool, str]:
 
 
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
-    """Compile and store the kernels that the usual commands use, by calling these commands on a few worlds.
+    """Compile and store the numba kernels of the usual commands, by running these commands on a few worlds.
 
-    With ``training``, also call ``ethbrake run``, which needs torch. With ``run_alone``, call only the one command that
-    compiles nearly all kernels of ``ethbrake run``. Returns whether all succeeded, and a message.
+    ``training``: also run ``ethbrake run``, which needs torch. ``run_alone``: run only the one command that compiles
+    nearly all kernels of ``ethbrake run``. Returns whether all commands succeeded, and a message for the user.
     """
     if is_temporary(cache_folder()):
         return False, "no folder for compiled kernels is writable; set NUMBA_CACHE_DIR to a writable folder"
@@ -177,7 +176,6 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    """Run Python in ``folder``; return the last line on stderr if it fails, else an empty text."""
     done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
 

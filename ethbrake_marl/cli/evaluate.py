@@ -107,7 +107,6 @@ def _compared(
 
 
 def _show(out: Out, every: dict[str, Compared], output: Path | None, per_world: Any, page: str) -> None:
-    """Write the files of an evaluation, and show its tables: one of a single scenario, or one of a group."""
     from ethbrake_marl.evaluation.results import write_results
     from ethbrake_marl.evaluation.summary import summarise_lists
 
@@ -131,7 +130,6 @@ def _show(out: Out, every: dict[str, Compared], output: Path | None, per_world: 
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:
-    """Raise an error, before any work, if the results cannot be written."""
     if output is None:
         for option, value in (("--per-world", per_world), ("--report", report)):
             if value:

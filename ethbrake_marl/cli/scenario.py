@@ -127,7 +127,6 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
 
 
 def _ranges(trial: Trial) -> dict[str, dict[str, float]]:
-    """Return least, median and largest value of every quantity in the worlds."""
     import numpy as np
 
     from ethbrake_marl.worlds.describe import quantities_of
@@ -146,7 +145,6 @@ def _kinds(trial: Trial) -> dict[str, Any]:
 
 
 def _folded(text: str, most: int, width: int = 80) -> list[str]:
-    """Return the text as at most ``most`` lines of ``width`` characters; the rest is replaced by ``...``."""
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 
@@ -158,7 +156,7 @@ def _share(part: int, whole: int, things: str = "worlds") -> str:
 def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> None:
     """Describe a scenario in plain sentences.
 
-    They tell the line, its roles, and what each key of the file says and means.
+    They describe the line of vehicles, who drives each vehicle, and what each key of the file means.
     """
     from ethbrake_marl.worlds.catalogue import load_scenario
     from ethbrake_marl.worlds.explain import sentences

@@ -38,10 +38,10 @@ class Settings(NamedTuple):
 def read_settings(
     texts: Sequence[str] | None, recipe_keys: Sequence[str] = (), of_command: Sequence[str] = ()
 ) -> Settings:
-    """Return the settings ``KEY=VALUE`` of a command, by their owner.
+    """Sort the settings ``KEY=VALUE`` of a command by what they change: scenario, recipe or the command itself.
 
-    A key that the scenario and the recipe share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName``
-    for an unknown key, and ``InvalidInput`` for an ambiguous one or a bad value.
+    A key that scenario and recipe share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an
+    unknown key, and ``InvalidInput`` for an ambiguous key or a bad value.
     """
     known = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
     known["command"] = {*of_command}
@@ -71,7 +71,7 @@ def read_settings(
 
 
 def _counted(rules: Override, given: Sequence[Override], owner: str) -> Override:
-    """Return the setting of a count for which ``rules=NAME`` is short: that of the reward in a recipe."""
+    """Return the setting that ``rules=NAME`` stands for: ``reward.harm_count`` of a recipe, else ``harm_count``."""
     name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
     if not isinstance(name, str) or name not in RULES:
         raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(RULES)}")

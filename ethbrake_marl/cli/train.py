@@ -116,13 +116,15 @@ def train_command(
 
 
 def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Path:
-    """Default folder of a run, ``runs/SCENARIO-RECIPE[-SCHEME]-seedSEED``."""
     plan = recipe if scheme is None else f"{recipe}-{scheme}"
     return Path("runs") / f"{scenario}-{plan}-seed{seed}"
 
 
 def changed(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
-    """Recipe with settings of the command line; say if only one of two keys that should agree is set."""
+    """Return the recipe with the command line's settings.
+
+    Print a note if they make the discount ``gamma`` and the discount of reward shaping differ.
+    """
     from ethbrake_marl.files.overrides import Override
 
     if not overrides:
@@ -140,9 +142,9 @@ def changed(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
 
 
 def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> None:
-    """Print the harm of the trained agent and of full braking, how the training ended, and what to do next.
+    """Print the harm of the trained agent and of full braking, how the training ended, and how to evaluate the agent.
 
-    ``scenario`` (name or path) stands in the command that evaluates the agent; None: the name in the run's folder.
+    ``scenario`` is the name or path to print in that command; None: the name in the run's folder.
     """
     from ethbrake_marl.agents.drive import Team, drive
     from ethbrake_marl.agents.scripts import Held
@@ -198,7 +200,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
 
 
 def tell_end(out: Out, status: str, steps: int, directory: Path) -> None:
-    """Print how the training ended, and the folder of the run; if it was interrupted, exit with status 130."""
+    """Print how the training ended, and the run's folder. Exit with status 130 if it was interrupted."""
     if status == "interrupted":
         left = f"the policy so far is saved; continue with: ethbrake train --resume {shlex.quote(str(directory))}"
         out.interrupted(f"interrupted after {steps:,} training steps; {left}")

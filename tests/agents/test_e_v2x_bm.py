@@ -27,7 +27,6 @@ PAPER = {
 
 
 def alert(gaps: Any, speeds: Any, **settings: Any) -> State:
-    """Worlds at the alert in which all vehicles hold full braking."""
     line, car = lines(gaps, speeds, **settings)
     n, bodies = len(line), line.shape[2]
     return at_alert(line, car, np.zeros((n, bodies, bodies)), -car[:, BRAKING], np.full(n, -1))

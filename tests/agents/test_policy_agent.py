@@ -46,12 +46,10 @@ TINY = {"net_arch": [4]}
 
 
 def harms(agent: Agent, game: Any = GAME, worlds: Any = WORLDS) -> list[float]:
-    """The harm in each world if the agent drives Vehicle 2."""
     return drive(game, worlds, Team("mine", {2: agent})).harm("first").tolist()
 
 
 def actions(agent: Agent) -> list[float]:
-    """The first commands of Vehicle 2, as shares of its capacities."""
     state = GAME.reset(WORLDS)
     command = agent.act(state, agent.begin(WORLDS, 2), 2)[0]
     return (command / np.where(command < 0.0, state.car[:, BRAKING, 2], state.car[:, DRIVING, 2])).tolist()

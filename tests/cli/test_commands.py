@@ -91,7 +91,6 @@ def test_defect_of_the_program__keeps_its_traceback_and_missing_memory_is_one_li
 
 
 def program(source: str, **environment: str) -> tuple[int, str, str]:
-    """Exit status, stdout and stderr of Python source in a process of its own."""
     process = subprocess.run(
         [sys.executable, "-c", source],
         env={**os.environ, **environment},

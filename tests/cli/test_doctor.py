@@ -13,7 +13,6 @@ from tests.fixtures.commands import Command, told_json
 
 
 def found(name: str) -> tuple[bool, str]:
-    """Whether a check is in order, and what it tells."""
     check = next(check for check in diagnose() if check.name == name)
     return check.ok, check.detail
 

@@ -24,7 +24,6 @@ PROGRESS = re.compile(r"^.*: [\d,]+ of [\d,]+(, about .* left)?\n", re.MULTILINE
 
 
 def printed(line: str) -> str:
-    """What a command line shows, in the folder where this runs."""
     words, out, err = shlex.split(line), io.StringIO(), io.StringIO()
     if words[0] in ("cat", "rm", "sed"):
         return subprocess.run(words, check=True, capture_output=True, encoding="utf-8").stdout
@@ -36,7 +35,6 @@ def printed(line: str) -> str:
 
 
 def told_again(story: Path) -> str:
-    """A story as it would be written today."""
     parts = re.split(r"^\$ (.*)\n", story.read_text("utf-8"), flags=re.MULTILINE)
     return parts[0] + "\n".join(f"$ {line}\n{printed(line)}" for line in parts[1::2]).replace(str(ROOT), "ROOT")
 

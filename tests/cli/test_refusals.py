@@ -98,7 +98,6 @@ def test_run_training_export_shield_or_film__is_refused(line: str, message: str,
 
 
 def write_scenario(old: str, new: str) -> None:
-    """The template of a scenario with one piece of text replaced; early impacts are kept."""
     text = new_scenario_text("mine").replace("early_impacts: reject", "early_impacts: keep")
     assert text.count(old) == 1
     Path("mine.yaml").write_text(text.replace(old, new))

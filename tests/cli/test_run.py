@@ -17,7 +17,6 @@ AGENTS = ["full_brake", "e_v2x_bm", "e_v2x_bm:pairwise", "trained policy", "hybr
 
 
 def status_of(folder: Path, *names: str) -> tuple[Any, ...]:
-    """These entries of run.json."""
     content = json.loads((folder / "run.json").read_text())
     return tuple(content[name] for name in names)
 

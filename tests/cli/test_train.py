@@ -14,7 +14,6 @@ from tests.fixtures.commands import Command, check_refused, told_json
 
 
 def status_of(folder: Path) -> dict[str, Any]:
-    """The content of run.json."""
     content: dict[str, Any] = json.loads((folder / "run.json").read_text())
     return content
 

@@ -91,7 +91,6 @@ class Turn:
         return self.terminated | self.truncated
 
     def arrays(self) -> list[Array]:
-        """Every array that the caller was given."""
         given = (self.observation, self.reward, self.terminated, self.truncated, *self.final.values())
         return [a for a in given if isinstance(a, np.ndarray)]
 
@@ -116,7 +115,6 @@ class Interface:
     n = 1
 
     def drawn(self) -> list[dict[str, Any]]:
-        """What each running world was drawn as."""
         columns = self.env.unwrapped.describe_worlds()
         worlds = ({name: column[k].item() for name, column in columns.items()} for k in range(self.n))
         return [{name: value for name, value in world.items() if value != ""} for world in worlds]  # of other worlds
@@ -229,7 +227,6 @@ BATCHED = [name for name in INTERFACES if name.endswith(("vector", "sb3"))]
 
 
 def rows_of(name: str) -> int:
-    """Worlds that the suite runs an interface with."""
     return 6 if name in BATCHED else 1
 
 
@@ -239,7 +236,6 @@ def actions(seed: int, steps: int, n: int) -> Array:
 
 
 def initial_state(worlds: eb.State, row: int) -> dict[str, Any]:
-    """The option ``initial_state`` that describes one world at t = 0 completely."""
     names = ("gaps_m", "speeds_mps", "braking_capacity_mps2", "driving_capacity_mps2", "latency_s", "mass_t")
     return {
         **{name: getattr(worlds, name)[row] for name in names},

@@ -184,8 +184,6 @@ def test_batch__row_k_is_the_world_alone(name: str, scenario: Scenario) -> None:
 
 
 def acts(value: Any, shape: tuple[int, ...] = (1,)) -> Callable[[Interface], Any]:
-    """A step in which the last world's learner does this."""
-
     def step(interface: Interface) -> None:
         given = np.zeros((interface.n, *shape), object if isinstance(value, str) else float)
         given[-1] = value
@@ -195,8 +193,6 @@ def acts(value: Any, shape: tuple[int, ...] = (1,)) -> Callable[[Interface], Any
 
 
 def starts(state: Any) -> Callable[[Interface], Any]:
-    """A reset to this state."""
-
     def reset(interface: Interface) -> None:  # Stable-Baselines3 keeps a seed until a reset succeeds
         interface.reset(3 if not hasattr(interface.env, "reset_infos") else None, {"initial_state": state})
 
@@ -289,7 +285,6 @@ DRAWN = load_scenario(
 
 
 def drawn(seed: int, world: int) -> dict[str, Any]:
-    """World ``world`` as its scenario describes it."""
     columns = columns_of(DRAWN.draw(1, seed, first=world, channel="training"))
     assert "scenario" in columns
     return {"world_seed": seed} | {name: column[0].item() for name, column in columns.items()}

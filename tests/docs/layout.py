@@ -64,7 +64,6 @@ are in a subfolder of its name. The wheel contains both folders.
 
 
 def first_sentence(path: Path) -> str:
-    """What a folder or a file says it is, in its first sentence."""
     text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
     return " ".join(text.partition("\n\n")[0].split()).rstrip(".").replace("``", "`")
 

@@ -10,7 +10,6 @@ sys.path.append(str(DOCS / "studies"))  # which import one another
 
 
 def load(name: str) -> ModuleType:
-    """The module ``docs/studies/NAME.py``."""
     spec = spec_from_file_location(f"study_{Path(name).name}", DOCS / "studies" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = module_from_spec(spec)

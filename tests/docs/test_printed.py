@@ -130,7 +130,6 @@ PAGES = [
 
 
 def anchors(page: Path) -> set[str]:
-    """The anchors that GitHub gives to the headings of a page."""
     headings = re.findall(r"(?m)^#+ (.*)$", BLOCK.sub("", page.read_text("utf-8")))
     texts = [re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).lower() for heading in headings]
     return {re.sub(r"[^\w\- ]", "", text).strip().replace(" ", "-") for text in texts}

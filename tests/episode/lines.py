@@ -22,7 +22,6 @@ def state_of(gaps_m: Any, speeds_mps: Any, **settings: Any) -> State:
 
 
 def later(state: State, commands_mps2: Any, until_s: float) -> State:
-    """Return the worlds at a later time, under constant commands [N]."""
     line, met, _ = driven(state.line, state.car, commands_mps2, state.time_s, until_s)
     assert (met != FAILED).all()
     clock, wanted = state.clock.copy(), state.wanted.copy()
@@ -31,7 +30,6 @@ def later(state: State, commands_mps2: Any, until_s: float) -> State:
 
 
 def step_between(before: State, after: State, *, safe: bool = False) -> Step:
-    """Return what a step between two states did, with a reward of 0."""
     out = np.zeros((OUT_ROWS, after.n))
     out[0], out[1] = after.harm("first") - before.harm("first"), after.harm("total") - before.harm("total")
     out[SAFE_END] = safe

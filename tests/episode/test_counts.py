@@ -83,7 +83,6 @@ def test_amounts__of_pairs_and_worlds_have_the_weights_of_the_count() -> None:
 
 
 def opened(name: str, count: str) -> tuple[Game, State]:
-    """Return a game whose reward counts this, and its worlds at the first decision."""
     _, game = open_game(name, reward={"harm": 1.0, "harm_count": count})
     return game, game.reset(game.draw(N, 5, 0))
 

@@ -21,7 +21,6 @@ TWO_AHEAD = View(["own", "front_1", "front_2", "rear_1"])
 
 
 def seen(state: State, body: int, view: View, *parts: str) -> dict[str, float]:
-    """Return what a vehicle observes in the first world, scaled, by name."""
     values = zip(view.features, view.observe(state, np.array([body]), 0.1)[0, 0].tolist(), strict=True)
     return {f.name: round(value, 5) for f, value in values if not parts or f.name.startswith(parts)}
 

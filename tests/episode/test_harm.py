@@ -22,7 +22,6 @@ EPS = np.finfo(float).eps
 
 
 def split(pairs: Any, mass: Any) -> np.ndarray:
-    """Return the harm of each vehicle, [n, N], of pairs [n, N - 1] without an obstacle."""
     pairs, mass = (np.concatenate([np.zeros((len(rows), 1)), rows], axis=1) for rows in (pairs, mass))
     out = np.empty((len(mass), mass.shape[1] - 1))
     split_harm(np.concatenate([pairs, np.zeros((len(pairs), 1))], axis=1), mass, out)
@@ -89,7 +88,6 @@ def met(pairs: tuple[float, float] = (12.0, 9.0), total: tuple[float, float] = (
 
 
 def of_objective(objective: Any, state: State, count: str = "first") -> list[float]:
-    """Return what each vehicle should minimise."""
     found: list[float] = amounts(objectives_of(objective, 3), None, state, count)[0].tolist()
     return found
 

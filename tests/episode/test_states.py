@@ -38,7 +38,6 @@ def actions(game: Game, seed: int, n: int = N) -> np.ndarray:
 
 
 def middle(game: Game) -> State:
-    """Return episodes in their middle; some may have ended."""
     state = game.reset(game.draw(N, 3, 0))
     for k in range(25):
         state, _ = game.step(state, actions(game, k))
@@ -51,7 +50,6 @@ def bits(state: State) -> bytes:
 
 
 def after(game: Game, state: State, rows: Any = slice(None), *, donate: bool = False) -> tuple[bytes, bytes]:
-    """Return the bits of the state three steps later, and of their rewards."""
     rewards = b""
     for k in range(3):
         state, step = game.step(state, np.ascontiguousarray(actions(game, 100 + k)[rows]), donate=donate)

@@ -28,13 +28,11 @@ LEARNERS = np.array([2])
 
 
 def moved(gaps: list[float], speeds: list[float], seconds: float, commands: Any = 0.0) -> tuple[State, State]:
-    """Return a line of equal masses before and after; e = 0.5."""
     before = state_of(gaps, speeds, restitution=0.5)
     return before, later(before, commands, seconds)
 
 
 def paid(reward: dict[str, Any], before: State, after: State, **settings: Any) -> Step:
-    """Return what the step between two states did, with its whole reward."""
     rewarding, rules = Rewarding.of(reward, "total", after.vehicles, LEARNERS, (0.5, 8.0), settings.pop("vector", None))
     step = step_between(before, after, **settings)
     step.out[COUNTED] = harm = after.harm(rules.counting) - before.harm(rules.counting)
@@ -198,7 +196,6 @@ def test_components__of_vehicles_add_up_to_the_reward() -> None:
 
 
 def rewards(reward: Any, scenario: Any = "paper-random", n: int = 40) -> tuple[np.ndarray, State]:
-    """Return the sum of rewards of each vehicle, and the last state."""
     loaded, game = open_game(scenario, reward=reward)
     state, total = game.reset(loaded.sample(n, 4)), np.zeros((n, 3))
     actions = np.random.default_rng(2).uniform(-1.0, 0.0, (n, 1))

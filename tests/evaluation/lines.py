@@ -70,14 +70,12 @@ class Careless:
 
 
 def teams(*agents: Any, body: int = 2) -> dict[str, Team]:
-    """Return one team for each agent of one vehicle."""
     return {agent.name: Team(agent.name, {body: agent}) for agent in agents}
 
 
 def evaluated(
     scenario: Any, n: int = 40, agents: Any = (FULL_BRAKE, GENTLE), measures: Any = (), **more: Any
 ) -> Result:
-    """Return the result of agents of the only learner in the first worlds of seed 7."""
     loaded, game = open_game(Scenario(**scenario) if isinstance(scenario, dict) else scenario)
     (body,) = game.rules.learners.tolist()
     drawn = loaded.draw(n, 7)

@@ -33,7 +33,6 @@ REWARDS: dict[str, Any] = {
 
 
 def played(name: str, reward: Any = "harm") -> tuple[str, dict[str, np.ndarray]]:
-    """Return the digest of ten episodes under random actions, and their last lines, rewards and observations."""
     _, game = open_game(name, reward=reward)
     state, rng, sha256 = game.reset(load_scenario(name).sample(N, 7)), np.random.default_rng(7), hashlib.sha256()
     sums = np.zeros((N, state.vehicles))

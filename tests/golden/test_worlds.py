@@ -21,7 +21,6 @@ RECORDED, RECORDED_TRAINING = (json.loads(file.read_text("utf-8")) for file in (
 
 
 def digest(worlds: State) -> str:
-    """SHA-256 of worlds: line, car, know, first commands, in this order."""
     sha256 = hashlib.sha256()
     for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
         sha256.update(np.ascontiguousarray(array, "<f8").tobytes())

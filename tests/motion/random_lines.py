@@ -24,7 +24,6 @@ class Runs(NamedTuple):
     commands: Floats  # [T, n, N] m/s2
 
     def take(self, rows: np.ndarray) -> Runs:
-        """Return some of the worlds."""
         return Runs(self.line[rows], self.car[rows], self.times, self.commands[:, rows])
 
 
@@ -61,7 +60,6 @@ def random_runs(rng: np.random.Generator, n: int, N: int, *, builds_up: bool, ob
 
 
 def played(runs: Runs) -> Floats:
-    """Return the lines at the end. Fails if a check of the physics failed."""
     line = runs.line
     for start, end, command in zip(runs.times[:-1], runs.times[1:], runs.commands, strict=True):
         line, met, _ = driven(line, runs.car, command, start, end)
@@ -93,12 +91,10 @@ def differences(one: Floats, other: Floats) -> Floats:
 
 
 def push_differences(one: Floats, other: Floats) -> Floats:
-    """Return the largest relative difference of each world in the pushes of its pairs, [n]."""
     return largest(one, other, [at.PUSHED])
 
 
 def passed_differences(one: Floats, other: Floats) -> Floats:
-    """Return the largest relative difference of each world in what its contacts pass on, [n]."""
     return largest(one, other, [at.PASSED])
 
 

@@ -14,7 +14,6 @@ CLOSE = lines([1.0, 90.0], [10.0, 10.0, 0.0], latency_s=[0.0, 0.5, 0.0])
 
 
 def drove(line: Floats, car: Floats, commands: list[float], start: float, until: float) -> tuple[Floats, list[float]]:
-    """Return the line later, and the row DROVE: of the pair ahead of each vehicle."""
     later = driven(line, car, commands, start, until)[0]
     return later, later[0, DROVE].tolist()
 

@@ -15,7 +15,6 @@ from tests.programmes import ROOT, Told, __main__ as runner, bugs, hostile, libr
 
 
 def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """A programme in a process of its own."""
     command = [sys.executable, "-m", "tests.programmes", *words]
     given = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
     return subprocess.run(command, cwd=ROOT, env=given, capture_output=True, text=True, check=False)

@@ -216,7 +216,6 @@ class Total(NamedTuple):
 
 
 def attack(play: str, name: str, count: str, way: str, worlds: int, seed: int = 1) -> Total:
-    """Attack a shield through an interface."""
     found = list(PLAYS[play](LINES[name](), count, WAYS[way], seed, worlds))
     first, last, harm = (np.concatenate([getattr(each, key) for each in found]) for key in ("first", "last", "harm"))
     rises, decisions = sum(each.rises for each in found), sum(each.decisions for each in found)

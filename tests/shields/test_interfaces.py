@@ -86,7 +86,6 @@ def begin(env: Any) -> None:
 
 
 def push(env: Any, u: float = 1.0) -> Any:
-    """Propose u for all learners, and return what the step returns."""
     if hasattr(env, "num_envs"):
         return env.step(np.full((env.num_envs, 1), u, np.float32))
     return env.step({"vehicle_2": [u]} if isinstance(env, EthBrakeParallelEnv) else np.array([u], np.float32))

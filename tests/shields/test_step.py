@@ -27,14 +27,12 @@ NAN = np.nan
 
 
 def opened(name: str, n: int = 20, seed: int = 7, **options: Any) -> tuple[Game, State]:
-    """Return a shielded game of a line of ``attack.py``, and its first state."""
     scenario, game = open_game(LINES[name]())
     game = game._replace(shield=StepShield(**options))
     return game, game.reset(scenario.sample(n, seed))
 
 
 def at(gaps_m: list[float], speeds_mps: list[float]) -> tuple[Game, State]:
-    """Return a shielded game of paper-random in one given world, and its first state."""
     scenario, game = open_game("paper-random")
     game = game._replace(shield=StepShield())
     return game, game.reset(worlds_from_state(scenario, {"gaps_m": gaps_m, "speeds_mps": speeds_mps}))

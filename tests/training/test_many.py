@@ -29,7 +29,6 @@ TUNE += ("n_epochs=1..3", "network.policy=[8]/[16, 8]", "--recipe")
 
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The file of a recipe with a checkpoint after each update."""
     often = {"total_steps": 512, "evaluation": {"every_updates": 1, "worlds": 5, "seed": 7}}
     file = tmp_path_factory.mktemp("recipe") / "tiny.yaml"
     tiny = TINY.replace(name="tiny", checkpoint_every_updates=1, **often)
@@ -39,8 +38,6 @@ def recipe(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Run a script in this process; its exit status."""
-
     def call(script: str, *words: object) -> int:
         monkeypatch.setattr(sys, "argv", [f"{script}.py", *map(str, words)])
         try:

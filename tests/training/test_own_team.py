@@ -30,7 +30,6 @@ class Actor:
 
 
 def actor(between: nn.Module) -> Actor:
-    """Return an actor with large weights, which clips many actions."""
     made = Actor(nn.Linear(FEATURES, 4), between, nn.Linear(4, 1))
     nn.init.normal_(made.mean[-1].weight, std=30.0)
     return made

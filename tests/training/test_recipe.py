@@ -51,7 +51,6 @@ checkpoint_every_updates: 3
 
 
 def with_line(old: str, new: str) -> Any:
-    """Return the recipe of a file that is GOOD with one text changed."""
     assert old in GOOD
     Path("mine.yaml").write_text(GOOD.replace(old, new, 1))
     return load_recipe("mine.yaml")

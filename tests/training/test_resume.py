@@ -53,7 +53,6 @@ def dead(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(dead: Path, tmp_path: Path) -> Path:
-    """Return a copy of it."""
     return Path(shutil.copytree(dead, tmp_path / "run"))
 
 
@@ -157,7 +156,6 @@ def test_resume__after_an_error_and_a_kill_while_policies_are_replaced(
 
 
 def spoil(path: Path) -> None:
-    """Change one byte of the largest part of a checkpoint."""
     with zipfile.ZipFile(path) as archive:
         part = max(archive.infolist(), key=lambda each: each.file_size)
     data = bytearray(path.read_bytes())
@@ -204,7 +202,6 @@ def test_resume__says_that_a_checkpoint_was_damaged_and_begins_again_without_any
 
 
 def forged(saved: dict[str, Any], place: str, value: Any) -> None:
-    """Put a value in its place in a checkpoint."""
     *parts, last = place.split("/")
     for part in parts:
         saved = saved[int(part) if isinstance(saved, list) else part]

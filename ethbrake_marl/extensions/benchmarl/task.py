@@ -1,7 +1,7 @@
 """A scenario as a TorchRL environment and as a BenchMARL task; needs ``pip install ethbrake-marl[marl]``.
 
-All learners of a world form one group in TorchRL, and its episode ends for all of them at the same time. ``state``, the
-input of a central critic, is the full state of the line (``episode.full_state``).
+All learners of a world form one group in TorchRL, and its episode ends for all of them at once. ``state``, the input of
+a central critic, is the full state of the line (``episode.full_state``).
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         self.done_spec = Composite(flag, shape=(n,))
 
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
-        """Start the next episode in all worlds, or where the mask ``_reset`` in ``tensordict`` is True."""
+        """Start new episodes in all worlds or, if ``tensordict`` has a mask ``_reset``, where it is True."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if mask is None:
             self.episode = self.stream.next_episodes(self.batch_size[0])
@@ -127,7 +127,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
 
 
 class LineTask(TaskClass):  # type: ignore[misc]
-    """BenchMARL task for one scenario. ``config``: the key ``scenario``, and perhaps other arguments of ``LineEnv``."""
+    """BenchMARL task of one scenario. ``config`` has the arguments of ``LineEnv``; only ``scenario`` is required."""
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
@@ -135,7 +135,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """Return a function that creates a ``LineEnv``. ``device`` is unused.
 
-        Raises ``InvalidInput`` if only one of task and BenchMARL has continuous actions.
+        Raises ``InvalidInput`` if task and BenchMARL do not agree on continuous or discrete actions.
         """
         actions = self.config.get("actions")
         if continuous_actions != (actions is None):

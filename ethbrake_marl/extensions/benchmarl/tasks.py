@@ -1,7 +1,7 @@
 """Register every shipped scenario that has a learner as a BenchMARL task (needs the extra ``marl``).
 
 ``python -m ethbrake_marl.extensions.benchmarl.tasks algorithm=mappo task=ethbrake/paper_random`` registers these tasks
-and then runs BenchMARL's own command line, with Hydra overrides. BenchMARL alone searches only its own folder.
+and then runs BenchMARL's own command line.
 """
 
 from __future__ import annotations
@@ -27,8 +27,6 @@ from ethbrake_marl.worlds.catalogue import list_scenarios, load_scenario
 
 
 class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra is not installed
-    """The tasks for BenchMARL: one for each shipped scenario with a learner."""
-
     @staticmethod
     def associated_class() -> type[LineTask]:
         return LineTask
@@ -53,7 +51,7 @@ EthBrakeTask = _Scenarios("EthBrakeTask", list(SCENARIOS))
 
 
 def register_tasks() -> None:
-    """Register the tasks in BenchMARL under names such as ``ethbrake/paper_random``; repeated calls are harmless."""
+    """Register the tasks in BenchMARL as ``ethbrake/paper_random`` and so on; repeated calls are harmless."""
     store = ConfigStore.instance()
     for task in EthBrakeTask:
         name = task.name.lower()

@@ -1,1 +1,1 @@
-"""Shields for incomplete knowledge: ``robust`` for uncertain quantities, ``estimated`` for unknown vehicles."""
+"""Shields for incomplete knowledge: ``robust`` for uncertain quantities, ``estimated`` for values not received yet."""

@@ -1,12 +1,12 @@
-"""The estimated line of one vehicle: what it has received, completed from the scenario's ranges.
+"""What one vehicle can know of its line: *estimated lines*, made from its messages and the scenario's ranges.
 
-A quantity of another vehicle that no message has told yet is the median of its distribution, or an end of its range:
-the *lines* are the median line, and perhaps every *corner* of the ranges. Each line is played from the alert on, beside
-the episode, with the vehicle's own actions; the others follow their scripts. A line in which the vehicle would have
-received or measured something else than it has is no longer possible. If none is possible, the truth lies between the
-corners: then received values replace assumed ones in all lines, and the rest goes on as before.
+A value of another vehicle that has not been received is its median in the *median line*, and an end of its range in
+every *corner*. Each estimated line is simulated beside the episode, from the alert on, with the vehicle's own actions;
+the others follow their scripts. It is dropped when the vehicle receives or measures something that contradicts it. If
+all are contradicted, the truth lies between the corners: then received values replace assumed ones in all of them, and
+the rest goes on as before.
 
-Nothing else of the true state is read, so what was not received cannot change a line.
+Nothing else of the true state is read, so what was not received cannot change an estimated line.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ OF_IMPACTS = [HIT, FIRST, TOTAL, COUNT]
 
 
 class Lines(NamedTuple):
-    """The M lines that vehicle ``body`` assumes as long as it has received nothing, the median one first."""
+    """The M estimated lines of the vehicle ``body`` before it has received anything, the median line first."""
 
     body: int
     alert: State  # [M] at the alert
@@ -90,10 +90,12 @@ class Lines(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario, body: int, *, corners: bool) -> Lines:
-        """Return the median line of a scenario, and its ``corners``: every unknown quantity at an end of its range.
+        """Return the median line of a scenario and, with ``corners``, lines with unknown quantities at the ends of
+        their ranges.
 
-        Unknown are the gaps, and of each other vehicle speed, braking capacity, mass, latency, and when it receives the
-        alert. Raises ``InvalidInput`` for a mixture, for others that agents drive, and for too many corners.
+        Unknown are the gaps and, of each other vehicle, speed, braking capacity, mass, latency, and when it receives
+        the alert. Raises ``InvalidInput`` for a mixture of scenarios, for other vehicles with unknown commands, and for
+        too many corners.
         """
         where = f"scenario {scenario.name!r}: estimated agents and shields need"
         if scenario.members:
@@ -130,7 +132,10 @@ class Lines(NamedTuple):
         return cls(body, alert, news, tuple(scenario.roles.values()))
 
     def commands(self, car: Floats, wanted: Floats) -> Floats:
-        """Return the commands of scripts, [n, N + 1] m/s2; other learners brake fully."""
+        """Return the commands of all vehicles, [n, N + 1] m/s2.
+
+        Scripts follow their rules, other learners brake fully, and the vehicle itself keeps ``wanted``.
+        """
         wanted = wanted.copy()
         for other, role in enumerate(self.roles, 1):
             if other != self.body:
@@ -138,9 +143,11 @@ class Lines(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the lines at the alert, M rows for each world, if ``state`` is what is known at the first decision.
+        """Return the estimated lines at the alert, M rows for each world, from what ``state`` shows at the first
+        decision.
 
-        Vehicles of which everything is known then are as they were, and so is the gap between two of them.
+        Vehicles of which everything is known by then start as in the true world ``alert``, and so does the gap between
+        two of them.
         """
         M, (pieces, news) = self.alert.n, self.received(state)
         lines, true = self.alert.take(np.tile(np.arange(M), alert.n)), alert.take(np.arange(alert.n).repeat(M))
@@ -158,9 +165,10 @@ class Lines(NamedTuple):
         return true._replace(line=line, car=car, wanted=self.commands(car, true.wanted))
 
     def received(self, state: State) -> tuple[Bools, Floats]:
-        """Return which pieces of each body are known, [n, N + 1, PIECES], and its newest sample (``messages.links``).
+        """Return which quantities of each body the vehicle has received, [n, N + 1, PIECES], and the newest values.
 
-        The place of the obstacle is known to Vehicle 1, and to all who know the place of Vehicle 1.
+        The values are [n, SAMPLE_ROWS, N + 1] (``messages.links``). The obstacle's place is known to all who know the
+        place of Vehicle 1.
         """
         if NAME in state.memories:
             pieces, news = known_pieces(state, self.body), newest(state, self.body)
@@ -173,9 +181,10 @@ class Lines(NamedTuple):
         return pieces, news
 
     def heard(self, state: State, lines: State) -> tuple[State, Bools, Bools]:
-        """Return the lines after what has been received by now, [n] whether one was possible, [n] whether one was not.
+        """Return the estimated lines after what was received, and in which worlds any, and not all, agreed with it, [n]
+        each.
 
-        A line that is not possible becomes a copy of one that is; if none is, ``overwritten`` mends all of them.
+        A contradicted line becomes a copy of one that agrees; if none agrees, ``overwritten`` corrects all of them.
         """
         n, M = state.n, lines.n // state.n
         possible = self.agrees(state, lines)
@@ -190,7 +199,7 @@ class Lines(NamedTuple):
         return lines, some, changed
 
     def agrees(self, state: State, lines: State) -> Bools:
-        """Would the vehicle have received and measured in each line what it has? [n, M]."""
+        """Return in which estimated lines the vehicle would have received and measured the same, [n, M]."""
         pieces, news = self.received(state)
         mine, theirs = self.told(state, news), self.told(lines, self.received(lines)[1])
         far = np.abs(theirs.reshape(state.n, -1, *mine.shape[1:]) - mine[:, np.newaxis]) > SURPRISE
@@ -200,7 +209,7 @@ class Lines(NamedTuple):
         return np.asarray(~wrong)
 
     def told(self, state: State, news: Floats) -> Floats:
-        """Return the pieces of all bodies but the intent, [n, N + 1, PIECES - 1], places relative to the vehicle."""
+        """Return the values in messages of all bodies, without intents, [n, N + 1, PIECES - 1]; places are relative."""
         car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
         car[:, :, 0] = 0.0
         own = news[:, PLACE, self.body, np.newaxis]
@@ -208,11 +217,11 @@ class Lines(NamedTuple):
         return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, lines: State) -> State:
-        """Return lines, one for each world, in which received values replace assumed ones.
+        """Return one estimated line for each world, in which received values replace assumed ones.
 
-        A vehicle last seen without a force reacts at the earliest then. A sample is moved on to the present by the
-        vehicle's script, without contact. A vehicle whose place is unknown keeps its distance to this vehicle, within
-        the order of the line. This vehicle measures its own motion and its own impacts.
+        A received place and speed are moved on to the present by the sender's script, without contact. A sender that
+        was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to
+        this vehicle, within the order of the line. This vehicle measures its own motion and its own impacts.
         """
         body, (pieces, news), time = self.body, self.received(state), state.time_s[:, np.newaxis]
         line, car = lines.line.copy(), lines.car.copy()
@@ -248,9 +257,9 @@ class Lines(NamedTuple):
 
 
 def without_channel(game: Game, lines: State) -> tuple[Game, State]:
-    """Return the game and its lines as if everybody knew everything: for agents that drive in an estimated line.
+    """Return the game and estimated lines in which every vehicle knows everything, for agents that drive there.
 
-    Each vehicle's own latency is then over when it reacts. A line does not say when the truth would be received.
+    An estimated line does not say when the truth would be received, so each vehicle's own latency ends when it reacts.
     """
     car = lines.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
@@ -259,9 +268,9 @@ def without_channel(game: Game, lines: State) -> tuple[Game, State]:
 
 
 def in_order(place: Floats, known: Bools) -> Floats:
-    """Return places (m) of the vehicles in one direction, moved so that each is at least as far as the one before.
+    """Return places (m), raised where they would decrease from one vehicle to the next.
 
-    An unknown place is at most as far away as the next ``known`` one beyond.
+    An unknown place is first lowered to the next ``known`` one, if it is beyond it.
     """
     limit = np.where(known, place, np.inf)[:, ::-1]
     within = np.minimum(place, np.minimum.accumulate(limit, axis=1)[:, ::-1])
@@ -270,9 +279,9 @@ def in_order(place: Floats, known: Bools) -> Floats:
 
 @large
 def move_on(speed, way, wanted, onset, limit, age):
-    """Move vehicles on by ``age`` (s) without contact; from ``onset`` (s) on they follow ``wanted`` (m/s2).
+    """Move vehicles on by ``age`` (s) without contact: from ``onset`` (s) on they accelerate with ``wanted`` (m/s2).
 
-    All arrays are [n, N + 1].
+    All arrays are [n, N + 1]; ``speed`` (m/s, at most ``limit``) and ``way`` (m) are overwritten.
     """
     for k in range(speed.shape[0]):
         for i in range(speed.shape[1]):

@@ -1,15 +1,15 @@
-"""Shields and E-V2X-BM in estimated lines (``estimated``): they use only what their vehicle has received.
+"""Shields and E-V2X-BM that use only what their vehicle has received: they decide in estimated lines (``estimated``).
 
 **Claim of the shield with corners**, ``robust:estimated``. Let B be its bound at the first decision. If the true world
-is one of the lines that are possible then, the harm of the episode is at most B, to the last bit, whatever is proposed
-and whatever messages are lost.
+is one of the estimated lines that are possible then, the harm of the episode is at most B, to the last bit, whatever is
+proposed and whatever messages are lost.
 
-**Proof.** Each line is played by the episode's own step with the actions that are applied, so the line that is the true
-world is the true episode, and it never becomes impossible. The proof of the step shield holds in each line that
-remains; with fewer lines the price of the plan does not rise, and another plan is held only if it costs less. ∎
+**Proof.** Each estimated line is simulated by the episode's own step with the actions that are applied, so the one that
+is the true world is the true episode, and it never becomes impossible. The proof of the step shield holds in each line
+that remains; with fewer lines the price of the plan does not rise, and another plan is held only if it costs less. ∎
 
 Without corners, in the median line alone, nothing is promised. Between the corners the harm may be above the bound. The
-info ``trusted`` is false once no line is possible.
+info ``trusted`` is false once every estimated line is contradicted.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 
 class EstimatedShield(MembersShield):
-    """Shield of one learner that certifies actions in its estimated lines.
+    """Shield of one learner that certifies actions in its estimated lines (``estimated.Lines``).
 
     Args:
         drivers: body -> agent, as for ``StepShield``.
-        scenario: of the worlds.
-        harm_count: what is bounded (``episode.counts``).
+        scenario: the scenario of the worlds.
+        harm_count: which count of harm is bounded (``episode.counts``).
         corners: certify also in the corners of the ranges, not only in the median line.
 
     """
@@ -79,11 +79,10 @@ class EstimatedShield(MembersShield):
         return super().decide(game, state, proposed, donate=donate)
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
-        """Roll out in the median line, where the shield's agents know everything."""
         return super().rolled_out(*without_channel(game, state), plans, most)
 
     def planned_again(self, game: Game, memory: Memory, lines: State, rows: Ints) -> Memory:
-        """In the worlds ``rows``, hold the cheapest of the old plan and new first plans."""
+        """In the worlds ``rows``, replace the plan by the cheapest of itself and newly made plans."""
         here = part(lines, rows, self.lines.alert.n)
         median = here.take(np.arange(0, here.n, self.lines.alert.n))
         plan, price = memory.plan.copy(), memory.price.copy()
@@ -94,9 +93,9 @@ class EstimatedShield(MembersShield):
 
 
 class EstimatedEpisodeShield(EpisodeShield):
-    """Algorithm 1 in the median line: at the first decision, the policy or E-V2X-BM gets the whole episode.
+    """Algorithm 1 (*hybrid*) in the median line: the first decision chooses the policy or E-V2X-BM for the episode.
 
-    ``harm_count`` is compared; ``bound`` is H*: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
+    ``harm_count`` is compared; ``bound`` is how H* is computed: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
     """
 
     knows = ESTIMATED
@@ -124,9 +123,9 @@ class Estimate(NamedTuple):
 
 
 class EstimatedEV2XBM:
-    """E-V2X-BM in the median line, which chooses again when what it receives differs from the line's prediction.
+    """E-V2X-BM in the median line; it chooses a new deceleration when received values differ from this line's.
 
-    ``is_pairwise``: by the paper's closed form, instead of the simulation of the line. ``count`` is minimised.
+    ``is_pairwise``: use the paper's closed form, not a simulation of the line. ``count`` is the harm that is minimised.
     """
 
     knows = ESTIMATED
@@ -158,7 +157,10 @@ class EstimatedEV2XBM:
 
 
 def differ(one: State, other: State) -> Bools:
-    """Do lines differ in speeds, gaps or vehicles? [n]. When a vehicle began to react does not matter."""
+    """Return in which worlds two lines differ in speeds, gaps or other quantities, [n].
+
+    Reaction times that are over are ignored.
+    """
     parts = []
     for line in (one, other):
         car = line.car[:, :, 1:].copy()

@@ -1,8 +1,8 @@
 """The robust shield: its bound holds in the nominal world and in every corner of its box of possible worlds.
 
-It is the step shield with one change: the price of a plan is the largest harm over all members of a world
-(``uncertainty``). The members are played beside the episode, with the applied actions, by the episode's own step; so
-the proof of the step shield holds in each of them. It does not hold between the corners
+It is the step shield with one change: the price of a plan is its largest harm over all *members* of a world: the
+nominal world and the corners (``uncertainty``). The members are simulated beside the episode, with the applied actions,
+by the episode's own step; so the proof of the step shield holds in each of them. It does not hold between the corners
 (docs/internals/proofs/shield.md).
 """
 
@@ -35,23 +35,23 @@ class Members(NamedTuple):
 
 
 class MembersShield(StepShield):
-    """A step shield for worlds that may be in one of M states."""
+    """Step shield for worlds whose true state may be any of M states, the *members*."""
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the members (the states in which a world may be), M rows for each world, with the agents' memories."""
+        """Return the members with the agents' memories, M rows for each world."""
         states = joined(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)
         own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
         return states._replace(memories={**states.memories, **own})
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2, or above ``most``."""
+        """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2; or more than ``most``."""
         M = states.n // len(plans)
         each = np.broadcast_to(most, len(plans)).repeat(M)
         return np.asarray(super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1))
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Return the plans of the step shield for the nominal state, and the best constant one in the worst state."""
+        """Return the step shield's plans, and the constant plan that is best in the worst member."""
         learners, n, plans = game.rules.learners, state.n, super().plans(game, alert, state, states)
         if states.n == n:
             return plans
@@ -62,7 +62,6 @@ class MembersShield(StepShield):
         return [*plans, held(game, actions[best])]
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        """Decide, and let the members make the step."""
         applied, memory = super().decide(game, state, proposed, donate=donate)
         states = joined(memory.members.states)
         after, _ = game.follow(states, applied.repeat(states.n // state.n, axis=0))
@@ -73,14 +72,15 @@ class MembersShield(StepShield):
 
 
 class RobustShield(MembersShield):
-    """Shield whose bound holds in the nominal world and in every corner of its box, not between them.
+    """Shield whose bound holds in the nominal world and in every corner of the intervals around it.
 
-    Its info ``trusted`` is false once a gap or speed was seen, before any impact, that no world in the box has.
+    The bound does not hold between the corners. The info ``trusted`` is false once a gap or speed was observed, before
+    any impact, that the intervals rule out.
 
     Args:
         drivers: body -> agent, as for ``StepShield``.
         uncertainty: intervals around the nominal quantities, required, such as ``gaps_m=0.5,mass_t=10%``.
-        harm_count: what is bounded (``episode.counts``).
+        harm_count: which count of harm is bounded (``episode.counts``).
         allowance: harm by which the bound is loosened, for fewer replaced actions (m2/s2).
 
     """
@@ -99,7 +99,7 @@ class RobustShield(MembersShield):
         self.uncertainty = parse_uncertainty(uncertainty)
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision. Raises ``InvalidInput`` if the intervals do not fit."""
+        """Return the memory at the first decision. Raises ``InvalidInput`` if the intervals do not fit the worlds."""
         states = opened(game, self.uncertainty.members(alert))
         if (states.time_s >= game.rules.horizon_s).any():
             raise InvalidInput(
@@ -121,19 +121,20 @@ def opened(game: Game, alerts: State) -> State:
 
 
 def apart(states: State, n: int) -> State:
-    """M rows for each of n worlds -> arrays [n, M, ...]."""
+    """Reshape arrays from M rows for each of n worlds to [n, M, ...]."""
     return mapped(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
 
 
 def joined(states: State) -> State:
-    """Arrays [n, M, ...] -> M rows for each world."""
+    """Reshape arrays from [n, M, ...] to M rows for each world."""
     return mapped(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
 
 
 def may_be_in(state: State, members: State) -> Bools:
-    """Do gaps and speeds lie in the range of the members? [n]; True once anybody has had an impact.
+    """Return in which worlds all gaps and speeds are in the range of the members, [n]; True after any impact.
 
-    Before any impact, gaps and speeds are monotone in each quantity, so every world in the box lies in this range.
+    Before any impact, gaps and speeds are monotone in each quantity, so every world within the intervals lies in this
+    range.
     """
     struck = state.line[:, COUNT].any(axis=1) | members.line[:, :, COUNT].any(axis=(1, 2))
     inside = np.ones(state.n, np.bool_)

@@ -1,9 +1,9 @@
 """Uncertainty: intervals around the quantities of a world, and the *members* that stand for all worlds in them.
 
 The true value of a quantity with the nominal value x lies in [x - h, x + h]. The half-width h is a number in the
-quantity's unit, or a share of x (such as 5 %). What is impossible is cut off: latencies, speeds and gaps below 0, and
-speeds above the vehicle's limit. The *box* of a world is the set of all combinations of values. Its *members* are the
-nominal world and every corner of the box: 2^d corners for d uncertain numbers.
+quantity's unit, or a share of x (such as 5 %). Intervals end at what is possible: latencies, speeds and gaps of 0, and
+the vehicle's speed limit. The *box* of a world is the set of all combinations of values. Its *members* are the nominal
+world and every corner of the box: 2^d corners for d uncertain numbers.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Interval(NamedTuple):
 
 
 class Side(NamedTuple):
-    """One uncertain number of n worlds."""
+    """One uncertain quantity of one vehicle or pair, with its interval in each of n worlds."""
 
     key: str
     body: int  # column in the arrays of a state
@@ -57,8 +57,8 @@ class Uncertainty(NamedTuple):
     def members(self, alert: State) -> State:
         """Return the members of worlds at the alert, M rows for each world: itself, then the corners of its box.
 
-        Corners are in the order of binary numbers, with the first interval as the lowest bit (0: smallest value).
-        Raises ``InvalidInput`` if an interval does not fit the worlds, and for more than ``MOST_CORNERS`` corners.
+        Corner k takes the high end of number i where bit i of k is 1. Raises ``InvalidInput`` if an interval does not
+        fit the worlds, and for more than ``MOST_CORNERS`` corners.
         """
         sides = self.sides(alert)
         if 2 ** len(sides) > MOST_CORNERS:
@@ -73,13 +73,13 @@ class Uncertainty(NamedTuple):
         return whole.take(np.arange(whole.n).reshape(-1, alert.n).T.ravel())
 
     def draw(self, alert: State, rng: np.random.Generator, *, corners: bool = False) -> State:
-        """Return one world from each box: uniform in the whole box, or one of its corners."""
+        """Return one random world from each box: uniform in the whole box, or one of its corners."""
         sides = self.sides(alert)
         shares = rng.random((alert.n, len(sides)))
         return placed(alert, sides, np.round(shares) if corners else shares)
 
     def sides(self, alert: State) -> list[Side]:
-        """Return the uncertain numbers of worlds; an interval of width 0 has none."""
+        """Return the numbers that are uncertain; an interval of width 0 makes none."""
         sides = []
         for interval in self.intervals:
             key, rule, bodies = interval.quantity, RULES[interval.quantity], alert.vehicles
@@ -108,7 +108,7 @@ class Uncertainty(NamedTuple):
 
 
 def values_of(alert: State, key: str) -> Floats:
-    """Return the nominal values of a quantity, one column per body; column 0 and the last pair have no meaning."""
+    """Return a quantity's nominal values, one column per body. Column 0 and the last gap have no meaning."""
     return alert.line[:, OF_LINE[key]] if key in OF_LINE else alert.car[:, OF_CAR[key]]
 
 
@@ -116,7 +116,7 @@ def placed(alert: State, sides: list[Side], shares: Floats) -> State:
     """Return worlds whose uncertain numbers are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
 
     A vehicle that brakes fully does so with the new capacity. Without a V2X channel, a vehicle that reacts later also
-    learns everything later. Raises ``InvalidInput`` if a script's command is beyond a capacity.
+    learns everything later. Raises ``InvalidInput`` if a script's command exceeds a capacity.
     """
     line, car, know, wanted = alert.line.copy(), alert.car.copy(), alert.know.copy(), alert.wanted.copy()
     for (key, body, low, high), at in zip(sides, shares.T, strict=True):
@@ -137,10 +137,10 @@ def placed(alert: State, sides: list[Side], shares: Floats) -> State:
 
 
 def parse_uncertainty(text: object) -> Uncertainty:
-    """Return the uncertainty of entries ``quantity=half-width``, separated by commas or colons, as in ``EXAMPLE``.
+    """Read intervals ``quantity=half-width``, separated by commas or colons, as in ``EXAMPLE``.
 
     A half-width is a number in the quantity's unit, or a percentage of the nominal value. ``.vehicle_2`` or ``.pair_1``
-    after the quantity limits the entry to one vehicle or pair. Raises ``InvalidInput`` for another text.
+    after the quantity limits the interval to one vehicle or pair. Raises ``InvalidInput`` for any other text.
     """
     form = f"must be quantity=half-width, for instance {EXAMPLE}"
     if not isinstance(text, str):

@@ -68,7 +68,6 @@ class Ablation:
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """Names of the compared algorithms, ``RECIPE-SCHEME``."""
         return tuple(f"{recipe.name}-{recipe.scheme}" for recipe in self.recipes)
 
     def jobs(self) -> Iterator[tuple[Level, str, Job]]:
@@ -112,9 +111,9 @@ class Measured(NamedTuple):
 
 
 def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
-    """Start or continue every training, ``jobs`` at a time; return False if Ctrl-C stopped one.
+    """Start or continue all trainings, ``jobs`` at a time. Return False if Ctrl-C stopped one.
 
-    Raises ``InvalidInput`` for a folder that holds anything but the right training.
+    Raises ``InvalidInput`` if a training's folder contains anything else.
     """
     every = [job for _, _, job in plan.jobs()]
     for done, finished in enumerate(run_each(((job.finish,) for job in every), jobs), 1):
@@ -125,7 +124,6 @@ def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
 
 
 def measure(plan: Ablation, tell: OnProgress) -> list[Measured]:
-    """Evaluate all levels, each with all algorithms, after all trainings have finished."""
     trained: dict[Any, list[Job]] = {}
     for level, name, job in plan.jobs():
         trained.setdefault((level.name, name), []).append(job)
@@ -165,6 +163,6 @@ def driven(level: Level, drawn: Drawn, algorithm: str | None, jobs: Any) -> Meas
 
 
 def minimised(declared: Declared, count: str, game: Game, alert: State, last: State) -> Given:
-    """What the training minimises, the mean over the learners."""
+    """Return what the training minimises, as a mean over the learners, [n]."""
     each = amounts(objectives_of(declared, last.vehicles), None, last, count)
     return np.asarray(each[:, game.rules.learners - 1].mean(axis=1))

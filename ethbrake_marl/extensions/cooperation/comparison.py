@@ -23,9 +23,9 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
 
     - ``levels``: results of each level and algorithm;
     - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
-    - ``undertrained``: one sentence that names the levels whose trained policies do worse than full braking, or none.
+    - ``undertrained``: a sentence that names the levels whose trained policies do worse than full braking, if any.
 
-    The joint optimum is known in the first ``searched`` worlds; comparisons with it use only these.
+    The joint optimum is known only in the first ``searched`` worlds; comparisons with it use only these.
     """
     steps = []
     for algorithm in dict.fromkeys(each.algorithm for each in measured if each.algorithm is not None):
@@ -95,7 +95,7 @@ def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Seed k of one level is compared with seed k of the other, or with its only seed."""
+    """Return how harm differs between two levels. Seed k is compared with seed k, or with an only seed."""
     entry: Json = {"algorithm": algorithm}
     for word, one in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}
@@ -113,5 +113,4 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
 
 
 def _borne(one: Measured, column: str) -> list[Floats]:
-    """Return each vehicle's harm, [seeds, n] each, front to rear."""
     return [one.reached[f"{column}_{i}"] for i in range(1, one.level.scenario.vehicles + 1)]

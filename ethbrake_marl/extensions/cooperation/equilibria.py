@@ -1,4 +1,4 @@
-"""Equilibria of several learners: one after the other improves its own plan, until nobody can.
+"""Equilibria of several learners: in turn, each improves its own plan, until none can.
 
 A plan holds the commands of every decision and is fixed at the alert (open loop), so no learner reacts to what the
 others do; the learners know the whole world. In its turn, a learner searches for the plan that is best for its own
@@ -44,7 +44,7 @@ class Equilibrium(NamedTuple):
 
 
 class Spread(NamedTuple):
-    """How much the equilibria from different starts differ in each world, among those that converged."""
+    """How much the equilibria from different starts differ in each world; starts that did not converge are left out."""
 
     found: Ints  # [n] number of starts that converged
     differs: Bools  # [n] whether the harm of a vehicle differs
@@ -63,8 +63,8 @@ def find_equilibria(
 ) -> dict[str, Equilibrium]:
     """Search equilibria of the scenario's learners by best responses in turn, once from each start in ``STARTS``.
 
-    If no learner changes its plan in a round, the result is an equilibrium of plans; it is approximate, because a turn
-    tries only ``budget`` plans. A world may have other equilibria. The result depends on no other world.
+    If no learner changes its plan in a round, the result is an equilibrium of plans. It is approximate, because a turn
+    tries only ``budget`` plans, and a world may have other equilibria. A world's result depends on no other world.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import compare_starts, find_equilibria
@@ -78,8 +78,8 @@ def find_equilibria(
         worlds: at the alert.
         objective: of each learner: one for all, such as ``own``, or one for each vehicle; None: the scenario's.
         count: what counts as harm (``episode.counts``).
-        budget: number of plans that a learner tries in its turn, in each world.
-        rounds: the most.
+        budget: number of plans that a learner tries in each turn, in each world.
+        rounds: largest number of rounds; in a round, every learner has one turn.
 
     Raises ``InvalidInput`` for a scenario without learners, a script that looks at the state, and an objective that is
     neither a weighted sum of the vehicles' harm nor ``maximin``.
@@ -111,7 +111,7 @@ def turn_of(game: Game, worlds: State, body: int, declared: Declared, count: str
 
 
 def _settle(turns: list[Problem], plans: Floats, budget: int, rounds: int, seed: int) -> tuple[Bools, Ints]:
-    """Let the learners improve ``plans`` [n, T, L] in place; return whether they converged, [n], and rounds, [n]."""
+    """Improve ``plans`` [n, T, L] in place; return whether the learners converged, [n], and the rounds used, [n]."""
     active, taken = np.arange(len(plans)), np.zeros(len(plans), np.int64)
     for turn in range(rounds):
         moved = np.zeros(len(active), np.bool_)
@@ -132,10 +132,10 @@ def _settle(turns: list[Problem], plans: Floats, budget: int, rounds: int, seed:
 
 
 def respond(problem: Problem, plans: Floats, budget: int, seed: int) -> Floats:
-    """Return plans [n, T, B] in which the first controlled vehicle has the best commands of a search.
+    """Return plans [n, T, B] in which only the first of B vehicles has new commands: the best that a search finds.
 
-    The best few of its own plan, of plans of two commands and of random ones are improved by changes of some decisions
-    at a time. Raises ``PhysicsError`` for a world in which no plan can be simulated.
+    The search improves the best of its present plan, of plans with two commands and of random ones, by changing a few
+    decisions at a time. Raises ``PhysicsError`` for a world in which no plan can be simulated.
     """
     random, found = seeded(problem.identity, seed), plans.copy()
     shape = T, _ = plans.shape[1:]
@@ -163,10 +163,10 @@ def respond(problem: Problem, plans: Floats, budget: int, seed: int) -> Floats:
 
 
 def other_plans(plan: Floats, bounds: Floats, number: int) -> Floats:
-    """Return the plan [T, B], and plans with other commands of its first vehicle, [Q, T, B].
+    """Return the plan [T, B], and copies with other commands of its first vehicle, [Q, T, B].
 
-    These have two commands of a grid, or up to four random ones; full braking and driving are likely, as are short
-    phases.
+    These commands are two values of a grid, or up to four random values; full braking, full driving and short phases
+    are likely.
     """
     low, high = bounds
     steps, rng = np.arange(len(plan)), np.random.default_rng(number)
@@ -199,8 +199,8 @@ def best_joint_harm(
 ) -> Floats:
     """Return the harm of each vehicle in the joint optimum, [n, N] m2/s2.
 
-    In each world this is the result with the least harm of the line, among ``ends`` (of any objectives) and
-    ``best_harm``, which searches the commands of all learners together.
+    In each world this is the result with the least harm of the line, among the equilibria ``ends`` (of any objectives)
+    and ``best_harm``, a search over the commands of all learners together.
     """
     game = open_game(scenario)[1]
     table = best_harm(game, worlds, counts=(count,), budget=budget, threads=1)
@@ -212,7 +212,7 @@ def best_joint_harm(
 
 
 def price_of_anarchy(borne: Floats, optimum: Floats) -> Estimate | None:
-    """Return (line's mean harm in equilibrium) / (line's mean harm in the joint optimum), with its interval.
+    """Return (line's mean harm in equilibrium) / (line's mean harm in the joint optimum), with a confidence interval.
 
     For the worst equilibria (``Spread.worst``) this is the price of anarchy, for the best ones the price of stability.
     Both arguments are [n, N] m2/s2; worlds with NaN (no equilibrium) are left out. None if the joint optimum does no

@@ -41,15 +41,16 @@ class Level(NamedTuple):
 
     @property
     def same_vehicles(self) -> bool:
-        """World k has the same vehicles at all levels."""
+        """Whether world k has the same vehicles at all levels."""
         return self.swept is None or self.swept.key.partition(".")[0] in SAME_VEHICLES
 
 
 def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
-    """Load the levels of an ablation.
+    """Load the levels of an ablation, and choose for each the earlier level with which it is compared.
 
-    A level that differs from an earlier one only in ``v2x`` is compared with it. The others form a ladder, in which
-    each level is compared with the previous one. Raises ``InvalidInput`` for fewer than two levels, or one given twice.
+    A level that differs from an earlier one only in ``v2x`` is compared with that one. The other levels form a ladder,
+    in which each is compared with the previous one. Raises ``InvalidInput`` for fewer than two levels, or one given
+    twice.
     """
     levels: list[Level] = []
     ladder: list[Level] = []
@@ -75,8 +76,8 @@ def _is_other_channel(one: Scenario, other: Scenario) -> bool:
 def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[TrainingRecipe]) -> list[Level]:
     """Return one level for each value of a sweep, in ascending order; each is compared with the previous one.
 
-    Raises ``InvalidInput`` if the key is not a scenario's, if a setting or a recipe sets it too, and if levels with
-    different values of it cannot be compared.
+    Raises ``InvalidInput`` if the key is not a scenario's, if a setting or a recipe sets it too, or if its values make
+    levels that cannot be compared.
     """
     values, levels = parse_sweep(sweep), list[Level]()
     key = values[0].key
@@ -110,9 +111,8 @@ def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[Tr
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Drawn]:
     """Draw the worlds of each level; world k has the same line of vehicles at all levels.
 
-    Levels may differ in obstacles and weights of harm and, with different ``v2x``, in latencies. Raises
-    ``InvalidInput``, which names level and quantity, if anything else differs. If a sweep varies a key of the vehicles,
-    world k only has the same random numbers.
+    Only obstacles, weights of harm and, with different ``v2x``, latencies may differ; ``InvalidInput`` names any other
+    difference. If a sweep varies a key of the vehicles, worlds k share only their random numbers.
     """
     drawn = [level.scenario.draw(episodes, seed) for level in levels]
     if not levels[0].same_vehicles:

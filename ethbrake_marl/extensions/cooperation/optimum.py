@@ -1,7 +1,7 @@
 """Joint optimum of a level: in each world, the least known harm or cost that its learners can cause together.
 
 It depends on worlds, learners and scripts, but not on what the learners know or minimise, so levels that differ only in
-that share one search. The best commands of one level count for every other level whose learners can give the same ones.
+this share one search. A level also uses the best commands of every other level whose commands its learners can give.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Answer(NamedTuple):
 
 
 def with_optima(plan: Ablation, measured: Sequence[Measured], threads: int, tell: OnProgress) -> list[Measured]:
-    """Add the joint optimum of each level with a learner; finished chunks of the search are read from the folder."""
+    """Add the joint optimum to the results of each level with a learner. Finished parts of the search are read back."""
     tables: dict[bytes, BestHarmTable] = {}
     answers: dict[str, Answer] = {}
     for one in measured:
@@ -67,7 +67,7 @@ def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
 
 
 def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
-    """Return the least known harm in each world of ``own``, [m] m2/s2. ``answers`` are those of all levels."""
+    """Return the least known harm in each world of ``own``, [m] m2/s2. ``answers`` are the results of all levels."""
     best = np.full(own.worlds.n, np.inf)
     for other in answers:
         can = can_imitate(own, other)
@@ -86,11 +86,11 @@ def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
 
 
 def can_imitate(own: Answer, other: Answer) -> Bools:
-    """Can the learners of ``own`` give the commands of the learners of ``other``? [m].
+    """Return in which worlds the learners of ``own`` can give the commands of the learners of ``other``, [m].
 
     They can if each learner of ``other`` learns in ``own``, the other vehicles of ``own`` have the same roles, lines
-    and latencies are the same, and each decision of ``other`` is also one of ``own``. Only ``own`` may have an
-    obstacle, because commands are simulated with it.
+    and latencies are the same, and each decision time of ``other`` is also one of ``own``. Only ``own`` may have an
+    obstacle, because the commands are simulated again in its worlds.
     """
     mine, theirs = own.scenario, other.scenario
     scripted = [name for name, role in mine.roles.items() if role != "learner"]

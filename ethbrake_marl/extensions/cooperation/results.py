@@ -61,7 +61,7 @@ def conditions(plan: Ablation, number: int) -> str:
 
 
 def levels_csv(measured: Sequence[Measured], searched: int) -> str:
-    """Return CSV text with one row per level, algorithm and seed: means over worlds of all columns of an evaluation.
+    """Return CSV text with one row per level, algorithm and seed: the mean over worlds of each column of an evaluation.
 
     The columns ``searched_*`` are means over the first ``searched`` worlds.
     """
@@ -116,7 +116,7 @@ def tables(results: Json) -> list[Sheet]:
 
 
 def sheet(title: str, rows: Sequence[Json], columns: Columns) -> Sheet:
-    """Return a table; each column has the path of its values: ``first harm`` means ``row["first"]["harm"]``."""
+    """Return a table. A column's path says where its values are: ``first harm`` means ``row["first"]["harm"]``."""
     cells: list[list[Any]] = []
     for row in rows:
         cells.append([])

@@ -1,8 +1,8 @@
-"""Means over training runs with different seeds; their intervals say what to expect of other seeds and other worlds.
+"""Means over training runs with different seeds, with confidence intervals for other seeds and other worlds.
 
-The bootstrap resamples the seeds of each side, and the worlds, or recordings, of all sides together. ``values``,
-``baseline``, ``worst`` and ``best`` are [seeds, worlds], for the same worlds; the numbers of seeds may differ.
-``clusters`` has the name of each world's recording, [worlds]; None: all are independent.
+The bootstrap resamples the seeds of each argument, and the worlds (or recordings) of all arguments together.
+``values``, ``baseline``, ``worst`` and ``best`` are [seeds, worlds], for the same worlds; the numbers of seeds may
+differ. ``clusters`` has the name of each world's recording, [worlds]; None: all worlds are independent.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ CONFIDENCE = 0.95
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
     """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``.
 
-    No interval for only one world or recording, or without a baseline if all values are 0. Truth values without a
-    baseline always have one, which contains Wilson's: bootstrap intervals of nearly constant values are too narrow.
+    There is no interval for only one world or recording, or if all values are 0 without a baseline. A share (truth
+    values without a baseline) always has one that contains Wilson's interval, because bootstrap intervals of nearly
+    constant values are too narrow.
     """
     array = np.atleast_2d(np.asarray(values))
     sides = [array, np.zeros((1, array.shape[1])) if baseline is None else np.atleast_2d(baseline)]
@@ -70,7 +71,10 @@ def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clus
 def _interval(
     sides: Sequence[Floats], of: Callable[[Floats], Floats], clusters: Clusters
 ) -> tuple[float, float] | None:
-    """Return percentiles of a statistic of the sides' means, [resamples, sides]; None for one world or recording."""
+    """Return the confidence interval of a statistic ``of`` the arguments' means, [resamples, arguments].
+
+    None for only one world or recording.
+    """
     cluster = np.arange(sides[0].shape[1]) if clusters is None else np.unique(clusters, return_inverse=True)[1]
     if cluster.max() == 0:
         return None
@@ -80,7 +84,6 @@ def _interval(
 
 
 def _resampled_means(sides: Sequence[Floats], cluster: Ints) -> Floats:
-    """Return the mean of each side in each resample, [resamples, sides]. A drawn cluster contributes all its worlds."""
     worlds, number, rng = len(cluster), int(cluster.max()) + 1, np.random.default_rng(0)
     means, chunk = np.empty((RESAMPLES, len(sides))), max(1, AT_ONCE // worlds)
     for begin in range(0, RESAMPLES, chunk):

@@ -27,26 +27,24 @@ class Swept(NamedTuple):
 
     @property
     def setting(self) -> str:
-        """The value as a setting, such as ``objective=social:15``."""
         return f"{self.key}={self.word}{self.text}"
 
     @property
     def axis(self) -> str:
-        """The label of an axis: ``v2x.lost`` or ``objective = social:…``."""
         return f"{self.key} = {self.word}…" if self.word else self.key
 
     @property
     def label(self) -> str:
-        """End of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
+        """Suffix of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
         return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
 
 def parse_sweep(text: str) -> list[Swept]:
     """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
 
-    A word may precede the numbers, such as ``social:`` in ``objective=social:0..90:15``. After ``KEY=``, single numbers
-    and ranges may stand together. Raises ``InvalidInput`` for any other text, a range that its step does not divide, a
-    repeated number, and fewer than 2 or more than ``MOST`` numbers.
+    A word may precede the numbers, as in ``objective=social:0..90:15``. Numbers and ranges may be mixed. Raises
+    ``InvalidInput`` for any other text, a range that its step does not divide, a repeated number, and fewer than 2 or
+    more than ``MOST`` numbers.
     """
     key, equals, values = (part.strip() for part in text.partition("="))
     match = WORD.match(values)

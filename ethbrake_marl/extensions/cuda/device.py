@@ -1,4 +1,4 @@
-"""Where kernels run: on a GPU, through NVIDIA's driver, or on a processor, one world after the other."""
+"""Run kernels on a GPU, through NVIDIA's driver, or on a processor, one world after the other."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BLOCK = 128  # threads that a GPU starts together
 
 
 class Kernel(NamedTuple):
-    """Something to do in n worlds, in two forms."""
+    """A computation for n worlds, one thread for each: its GPU form and its processor form."""
 
     work: str  # ``play`` or ``search``
     size: tuple[int, ...]  # which decides ``shapes``
@@ -29,18 +29,17 @@ class Kernel(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of all that decides the code beside the sources."""
+        """Name of the stored machine code: everything that decides it, except the sources."""
         return "-".join([self.work, *map(str, self.size)])
 
     def thread(self) -> Callable[..., None]:
-        """Return the kernel of a GPU."""
         from ethbrake_marl.extensions.cuda import threads  # numba.cuda is slow to import
 
         made: Callable[..., None] = getattr(threads, f"{self.work}_thread")(self.shapes)
         return made
 
     def launch(self, device: torch.device, n: int, *given: Any) -> None:
-        """Do the work of n threads. ``given`` are tensors on this device, numbers, and tuples of both."""
+        """Run n threads. ``given``: tensors on this device, numbers, and tuples of both."""
         if device.type == "cuda":
             _driver(device.index or 0).launch(self, n, given)
         else:
@@ -62,14 +61,14 @@ def device_named(name: str) -> torch.device:
 
 
 class TooLittleMemory(InvalidInput):
-    """What was asked for needs more memory than the device has."""
+    """The device has less memory than the request needs."""
 
 
 @contextmanager
 def enough_memory(what: str) -> Iterator[None]:
     """Context manager: too little memory raises ``TooLittleMemory``, whose message begins with ``what``.
 
-    Of several such managers the outermost decides, since its names are the caller's.
+    If such managers are nested, the outermost one's message is used.
     """
     try:
         yield
@@ -105,12 +104,12 @@ def _check_gpu(index: int) -> None:
 
 
 def as_arrays(given: Any) -> Any:
-    """Return arguments with arrays of numpy, in the same memory, in place of tensors."""
+    """Replace tensors in a kernel's arguments by NumPy arrays that share their memory."""
     return _with(given, Tensor.numpy)
 
 
 def like(given: Any) -> Any:
-    """Return arguments of the same types on the processor: with empty arrays in place of tensors."""
+    """Return a kernel's arguments on the processor, with empty arrays in place of tensors, for compiling the kernel."""
     return _with(given, lambda tensor: torch.empty((0,) * tensor.dim(), dtype=tensor.dtype).numpy())
 
 
@@ -124,10 +123,10 @@ def _with(given: Any, array_of: Callable[[Tensor], Any]) -> Any:
 
 
 def cells_of(given: Any) -> Iterator[Any]:
-    """Yield the parameters that a kernel compiled by numba takes for its arguments.
+    """Yield a kernel's arguments in the form that code compiled by numba expects.
 
-    An array becomes two pointers that are not used, its number of entries, the size of one in bytes, its address, its
-    shape and its strides in bytes; a tuple becomes those of its parts.
+    An array becomes two unused pointers, its number of entries, the size of an entry in bytes, its address, shape and
+    strides in bytes. A tuple becomes its parts.
     """
     if isinstance(given, tuple):
         for each in given:
@@ -176,7 +175,7 @@ class _Driver:
         return function
 
     def check(self, call: str, *given: Any) -> None:
-        """Call a function of the driver. Raises ``InvalidInput`` with its reason if it fails."""
+        """Call a function of the driver. Raises ``InvalidInput`` with the driver's reason if it fails."""
         code = getattr(self.cuda, call)(*given)
         if code:
             text = ctypes.c_char_p()

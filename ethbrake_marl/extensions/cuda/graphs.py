@@ -1,4 +1,4 @@
-"""``Graphed``: a function of tensors which a GPU repeats as one CUDA graph, not operation by operation."""
+"""``Graphed``: a function of tensors that a GPU repeats as one CUDA graph, instead of operation by operation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ class Graphed:
         self.function, self.device, self.calls = function, device, 0
 
     def __call__(self, *given: Tensor) -> Any:
-        """Return the function's result."""
         if self.device.type != "cuda":
             return self.function(*given)
         self.calls += 1
@@ -36,7 +35,6 @@ class Graphed:
         return self.result
 
     def _beside(self, *given: Tensor) -> Any:
-        """Call the function on a stream of its own, as a graph is recorded later."""
         main, beside = torch.cuda.current_stream(), new_stream()
         beside.wait_stream(main)
         with torch.cuda.stream(beside):
@@ -45,7 +43,6 @@ class Graphed:
         return result
 
     def _record(self, *given: Tensor) -> None:
-        """Record the graph, which computes nothing yet."""
         self.given = [tensor.clone() for tensor in given]
         self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self.graph, stream=new_stream()):
@@ -53,5 +50,4 @@ class Graphed:
 
 
 def new_stream() -> torch.cuda.Stream:
-    """Return a new stream of the current GPU."""
     return torch.cuda.Stream()  # type: ignore[no-untyped-call]

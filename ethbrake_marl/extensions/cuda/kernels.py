@@ -1,11 +1,10 @@
-"""What one thread does in one world: it copies the world into its own memory and calls the core's functions there.
+"""Kernels in which each thread simulates one world: it copies the world into its own memory and calls the core there.
 
-``step_worlds`` and ``observe_worlds`` are the core's, ``follow``, ``gather`` and ``improve`` those of the search; they
-are called as they are, with a batch of one world, so no rule is written a second time. The same text runs on a GPU
-(``device``), and on a processor, one world after the other.
+``step_worlds`` and ``observe_worlds`` are the core's functions; they are called with a batch of one world, so no rule
+is written a second time. The same text runs on a GPU (``device``), and on a processor, one world after the other.
 
-In arrays that all threads share the worlds come last, so that neighbouring threads read neighbouring numbers. n:
-worlds, B: bodies, L: learners, F: features.
+In arrays that all threads share, the index of the world is last, so that neighbouring threads read neighbouring
+numbers. n: worlds, B: bodies, L: learners, F: features.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ FINE, NO_ACTION, PHYSICS_FAILED = 0, 1, 2
 
 
 class Stored(NamedTuple):
-    """Episodes, as in ``State``, with the worlds last."""
+    """Episodes, as in ``State``, with the index of the world last."""
 
     line: Any  # [LINE_ROWS, B, n]
     car: Any  # [CAR_ROWS, B, n]
@@ -39,8 +38,6 @@ class Stored(NamedTuple):
 
 
 class Results(NamedTuple):
-    """What a step did."""
-
     out: Any  # [OUT_ROWS, n] rows as in `Step.out`
     reward: Any  # [n] of every learner
     observations: Any  # [n, L, F] float32
@@ -48,8 +45,6 @@ class Results(NamedTuple):
 
 
 class Ruling(NamedTuple):
-    """The numbers that a step needs: the fields of ``Rules``."""
-
     learners: Any  # [L]
     time_step_s: Any
     horizon_s: Any
@@ -59,8 +54,6 @@ class Ruling(NamedTuple):
 
 
 class Looking(NamedTuple):
-    """How a view is computed: the fields of ``Plan`` that need no function of Python."""
-
     offsets: Any
     role: Any
     obstacle: Any
@@ -69,8 +62,6 @@ class Looking(NamedTuple):
 
 
 class Mine(NamedTuple):
-    """A thread's own memory: one world, and what it works with."""
-
     line: Any
     car: Any
     clock: Any
@@ -85,7 +76,6 @@ class Mine(NamedTuple):
 
 
 def shapes_of(bodies: int, learners: int, features: int, neighbours: int) -> Mine:
-    """Return the shapes of a thread's own memory for ``play``."""
     return Mine(
         line=(1, LINE_ROWS, bodies),
         car=(1, CAR_ROWS, bodies),
@@ -103,7 +93,6 @@ def shapes_of(bodies: int, learners: int, features: int, neighbours: int) -> Min
 
 @large
 def load(t, stored, mine):
-    """Copy world t into a thread's own memory."""
     for i in range(mine.wanted.shape[1]):
         for row in range(mine.line.shape[1]):
             mine.line[0, row, i] = stored.line[row, i, t]
@@ -118,7 +107,6 @@ def load(t, stored, mine):
 
 @large
 def save(t, stored, mine, is_new):
-    """Copy a thread's world back: what a step changes, and all of it if the world is new."""
     for i in range(mine.wanted.shape[1]):
         for row in range(mine.line.shape[1]):
             stored.line[row, i, t] = mine.line[0, row, i]
@@ -134,10 +122,10 @@ def save(t, stored, mine, is_new):
 
 @large
 def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
-    """Let world t take a step, as ``mode`` says, and observe it.
+    """Advance world t by one step, or begin or only observe its episode, as ``mode`` says; then observe it.
 
-    ``actions`` [n, L] float32 are clipped to [-1, 1]. If one of them is no number, nothing moves and ``status`` says
-    so. ``following`` [n] is the world of the pool in which the next episode begins.
+    ``actions`` [n, L] float32 are clipped to [-1, 1]. If one of them is NaN, nothing moves and ``status`` says so.
+    ``following`` [n] is the world of the pool in which the next episode begins.
     """
     load(t, stored, mine)
     is_new = mode == BEGIN
@@ -174,6 +162,5 @@ def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
 
 @large
 def play_each(mine, stored, pool, following, actions, results, rules, view, mode, n):
-    """Do the work of n threads of ``play`` on a processor."""
     for t in range(n):
         play(t, mine, stored, pool, following, actions, results, rules, view, mode)

@@ -1,7 +1,7 @@
-"""PTX, the machine code that NVIDIA's driver takes, of a kernel: made without a GPU, and kept beside the kernels' own.
+"""PTX of a kernel, the code that NVIDIA's driver compiles for its GPU: made without a GPU, and stored in a file.
 
-Multiplications and additions stay apart (``fma=0``), so every operation rounds as on a processor, and a world has the
-same bits there and here. The driver compiles PTX for its GPU when it is loaded.
+Multiplications and additions are not fused (``fma=0``), so every operation rounds as on a processor, and a world has
+the same bits there and here.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ PTX_VERSION = "8.4"  # every driver from 550 on reads it, and nothing here needs
 def ptx_of(
     name: str, kernel: Callable[[], Callable[..., None]], given: tuple[Any, ...], capability: tuple[int, int]
 ) -> str:
-    """Return the PTX of a kernel, whose entry is called ``kernel``, for arguments of the types of ``given``.
+    """Return the PTX of a kernel, with the entry ``kernel``, for arguments of the types of ``given``.
 
-    ``name`` says all that decides the code beside the sources. ``capability`` is the GPU's. Raises ``MissingExtra``
-    if the code has not been made before, and numba-cuda is not installed.
+    ``name``: all that decides the code, except the sources. ``capability``: the GPU's compute capability. Raises
+    ``MissingExtra`` if the code must be compiled and numba-cuda is not installed.
     """
     capability = min(capability, NEWEST)
     file = folder_of(str(Path(__file__).with_name("threads.py"))) / f"{name}-{capability[0]}{capability[1]}.ptx"
@@ -37,7 +37,6 @@ def ptx_of(
 
 
 def made(kernel: Callable[..., None], given: tuple[Any, ...], capability: tuple[int, int]) -> str:
-    """Compile a kernel."""
     with naming_extras():
         import numba_cuda  # noqa: F401  # replaces numba.cuda
     import numba
@@ -54,7 +53,7 @@ def made(kernel: Callable[..., None], given: tuple[Any, ...], capability: tuple[
 
 @contextmanager
 def without_fma(capability: tuple[int, int]) -> Iterator[None]:
-    """Context manager: numba-cuda keeps * and + apart, which it has no option for, and asks no GPU what it can."""
+    """Context manager in which numba-cuda does not fuse * and +, and needs no GPU. It has no option for either."""
     from numba.cuda import dispatcher
     from numba.cuda.cudadrv import nvvm
 

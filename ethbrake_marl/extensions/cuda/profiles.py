@@ -1,4 +1,4 @@
-"""``search``: the best profiles of many worlds at once, on a GPU, by many threads in each world."""
+"""``search``: the best profiles of many worlds at once, on a GPU, with many threads for each world."""
 
 from __future__ import annotations
 
@@ -39,24 +39,25 @@ def search(
 ) -> tuple[Profiles, dict[str, Floats]]:
     """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
 
-    Of ``restarts`` threads in each world every one draws random profiles and improves the best. After each round the
-    threads meet in pairs, and both go on from the better profile. The last round goes decision by decision. Several
-    controlled vehicles are first searched one by one, while the others brake fully; the result is at least as good.
+    In each world, each of ``restarts`` threads draws random profiles and improves its best one. After each round,
+    threads meet in pairs, and both continue with the better profile. The last round is simulated decision by decision.
+    Several controlled vehicles are first searched one by one, while the others brake fully; the result is at least as
+    good.
 
     Args:
-        problem: n worlds, and what is minimised in them (``problem_of``). For a front repeat its worlds, each time with
-            other weights: ``problem.take(rows).minimising(weights)``.
+        problem: n worlds, and what is minimised in them (``problem_of``). For a front, repeat its worlds, each time
+            with other weights: ``problem.take(rows).minimising(weights)``.
         given: profiles with which threads begin, [n * Q]: first the Q profiles of world 0, and so on.
-        seconds: begin no further round later; the result then depends on the speed. None: ``rounds`` of them. Of
-            several controlled vehicles each one by itself has an equal part of this time.
-        rounds: of random changes.
+        seconds: time (s) after which no further round begins; the result then depends on the speed. None: do all
+            ``rounds``. Of several controlled vehicles, each one by itself has an equal part of this time.
+        rounds: number of rounds of random changes.
         restarts: threads in each world, a power of two.
         drawn: random profiles that each thread tries in the first round, beside some of full driving and braking.
         changes: random changes that each thread tries in a round.
-        seed: of the random numbers.
+        seed: seed of the random numbers.
         device: as for ``Worlds``.
 
-    Raises ``InvalidInput`` for a bad number or device, and for more worlds than it has memory for, and
+    Raises ``InvalidInput`` for a bad number or device, and for more worlds than the device has memory for, and
     ``PhysicsError`` for worlds in which no profile can be simulated.
 
     """
@@ -100,7 +101,7 @@ def search(
 
 
 def best_alone(problem: Problem, search: Callable[..., Any]) -> Profiles:
-    """Return the best profiles of one controlled vehicle, [n], while the other controlled ones brake fully."""
+    """Search the best profile of each controlled vehicle while the others brake fully; return the best one, [n]."""
     results, braking = [], -problem.state.car[:, BRAKING][:, problem.bodies]
     for c, body in enumerate(problem.bodies.tolist()):
         wanted = problem.state.wanted.copy()
@@ -115,7 +116,7 @@ def best_alone(problem: Problem, search: Callable[..., Any]) -> Profiles:
 
 
 def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kernel]:
-    """Return worlds as tensors, and the kernel that searches them."""
+    """Return worlds as tensors on the device ``on``, and the kernel that searches them."""
 
     def moved(array: Any) -> Tensor:
         return torch.from_numpy(np.moveaxis(array, 0, -1).copy()).to(on)
@@ -140,7 +141,7 @@ def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kerne
 
 
 def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, on: torch.device) -> Plans:
-    """Return the plans of all threads before the first round: the given profiles, one after the other, or none."""
+    """Return the profiles of all threads before the first round: those in ``given``, or none."""
     n, C = problem.n, len(problem.bodies)
     ends = np.repeat(problem.last_step[:, np.newaxis], MOST_PHASES, axis=1)[np.newaxis].repeat(restarts, axis=0)
     commands, phases = np.zeros((restarts, n, MOST_PHASES, C)), np.zeros((restarts, n), np.int64)
@@ -170,9 +171,9 @@ def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, 
 
 
 def met(plans: Plans, n: int, restarts: int, number: int) -> Plans:
-    """Return the plans after a round, in which the threads of a world met in pairs: both have the better profile.
+    """Return the profiles after threads of the same world have met in pairs: both have the better one.
 
-    From round to round a thread meets a nearer one, so that after log2 of ``restarts`` rounds it can have met all.
+    From round to round a thread meets a nearer one, so after log2(``restarts``) rounds the best can have reached all.
     """
     if restarts == 1:
         return plans

@@ -1,4 +1,4 @@
-"""What one thread of a search does: it improves one profile of one world, with the kernels of the extension ``search``.
+"""Kernels in which each thread improves one profile of one world, with the kernels of the extension ``search``.
 
 Many threads search one world, each with random numbers of its own. n: worlds, B: bodies, C: controlled vehicles, K:
 phases of a profile.
@@ -54,7 +54,7 @@ class Searched(NamedTuple):
 
 
 class Plans(NamedTuple):
-    """The best profile of each of m threads: thread t searches world t modulo n."""
+    """The best profile of each of m threads. Thread t searches world t modulo n."""
 
     ends: Any  # [K, m] int64
     commands: Any  # [K, C, m]
@@ -64,8 +64,6 @@ class Plans(NamedTuple):
 
 
 class Own(NamedTuple):
-    """A thread's own memory."""
-
     car: Any  # this and the following: float64
     clock: Any
     wanted: Any
@@ -85,7 +83,6 @@ class Own(NamedTuple):
 
 
 def shapes_of(bodies: int, controlled: int) -> Own:
-    """Return the shapes of a thread's own memory."""
     K = MOST_PHASES
     return Own(
         car=(CAR_ROWS, bodies),
@@ -109,7 +106,6 @@ def shapes_of(bodies: int, controlled: int) -> Own:
 
 @large
 def load(k, searched, own):
-    """Copy world k into a thread's own memory."""
     for i in range(own.wanted.shape[0]):
         for row in range(own.lines.shape[1]):
             own.lines[0, row, i] = searched.line[row, i, k]
@@ -128,9 +124,9 @@ def load(k, searched, own):
 
 @large
 def begin_with(t, own, plans, world, room, drawing, drawn):
-    """Take the best of a thread's first profiles into its memory ``best``; return its number of phases, 0: none.
+    """Put the best of a thread's first profiles into its memory; return its number of phases, 0: none.
 
-    These are its plan so far, extreme profiles of one kind and ``drawn`` random ones. Extreme ones are tried as in
+    These are its profile so far, extreme profiles of one kind and ``drawn`` random ones. Extreme ones are tried as in
     ``extreme_profiles``, but at random times, so that no two threads try the same.
     """
     n, best_used, least, low, high, kind = world.wanted.shape[0], 0, np.inf, 0.0, LATEST_S, own.kind[0]
@@ -175,9 +171,9 @@ def begin_with(t, own, plans, world, room, drawing, drawn):
 
 @large
 def search(t, own, searched, plans, drawing, drawn, budget):
-    """Improve the plan of thread t by ``budget`` changes; if ``drawn`` is above 0, begin with the best of others.
+    """Improve the profile of thread t by ``budget`` changes; if ``drawn`` is above 0, first choose it among new ones.
 
-    ``drawing`` is how random profiles and changes are drawn.
+    ``drawing``: how random profiles and changes are drawn.
     """
     n = searched.wanted.shape[1]
     load(t % n, searched, own)
@@ -203,6 +199,5 @@ def search(t, own, searched, plans, drawing, drawn, budget):
 
 @large
 def search_each(own, searched, plans, drawing, drawn, budget, n):
-    """Do the work of n threads of ``search`` on a processor."""
     for t in range(n):
         search(t, own, searched, plans, drawing, drawn, budget)

@@ -1,6 +1,6 @@
-"""Kernels for a GPU: a thread takes memory of its own, and does the work of one world (``kernels``).
+"""GPU kernels: each thread takes memory of its own, and calls a function of ``kernels`` or ``search_kernels``.
 
-numba's simulator runs them without a GPU. Only what is launched imports this module, because numba.cuda is slow to
+numba's simulator runs them without a GPU. This module is imported only when needed, because numba.cuda is slow to
 import.
 """
 
@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.cuda.search_kernels import Own, search
 
 
 def play_thread(shapes: Mine) -> Callable[..., None]:
-    """Return the kernel that does ``play`` in n worlds, with one thread for each; ``shapes`` are constants of it."""
+    """Return the GPU kernel that runs ``play`` in n threads. ``shapes`` are constants of its code."""
     line, car, clock, know, wanted, proposed, scratch, out, rewards, value, seen = shapes
 
     def play_worlds(
@@ -43,7 +43,7 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
 
 
 def search_thread(shapes: Own) -> Callable[..., None]:
-    """Return the kernel that does ``search`` in n threads; ``shapes`` are constants of it."""
+    """Return the GPU kernel that runs ``search`` in n threads. ``shapes`` are constants of its code."""
     car, clock, wanted, bounds, shares, at, scratch, lines, tried = shapes[:9]
     commands, best_commands, change, ends, best_ends, kind, random = shapes[9:]
 

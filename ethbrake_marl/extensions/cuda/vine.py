@@ -1,4 +1,7 @@
-"""Vine on a GPU: episodes, branches and the network's training stay there; the random numbers are the processor's."""
+"""The algorithm vine on a GPU: episodes, branches and the network's training run there.
+
+Random numbers are drawn on the processor, so they are the same as there.
+"""
 
 from __future__ import annotations
 
@@ -24,10 +27,10 @@ from ethbrake_marl.training.training import Training
 
 
 class CudaVine(Vine):
-    """Vine for the recipe's device. A mixture of experts trains on a processor only."""
+    """The algorithm vine on the recipe's device. A mixture of experts trains on a processor only."""
 
     def new_model(self, training: Training, environment: EthBrakeVecEnv) -> CudaVineModel:
-        """Return a new model with random weights, the same as on a processor.
+        """Return a new model, with the same random weights as on a processor.
 
         Raises ``InvalidInput`` for a mixture of experts, for minibatches of different sizes, for what ``Worlds``
         refuses, and for more worlds than the device has memory for.
@@ -46,7 +49,6 @@ class CudaVine(Vine):
             return CudaVineModel(training, environment, self.device_of(recipe))
 
     def device_of(self, recipe: VineRecipe) -> str:
-        """Return the name of the device that trains."""
         return recipe.device
 
 
@@ -55,15 +57,14 @@ def place_of(recipe: VineRecipe) -> str:
 
 
 def sizes(recipe: VineRecipe) -> str:
-    """Return the settings that decide how much memory is needed, for a message."""
     return f"{place_of(recipe)}: n_envs = {recipe.n_envs}, n_steps = {recipe.n_steps}, tried = {recipe.tried}"
 
 
 class CudaVineModel(VineModel):
-    """Visits decisions in ``worlds``, and plays their branches in other ones.
+    """Model of vine on a GPU. It visits decisions in ``worlds``, and tries other actions in ``branches``.
 
-    The environment that the training has built, for the interface of Stable-Baselines3, stays at its first episodes.
-    n: worlds; L: learners; B: tried decisions; D: visited decisions of one learner, n_steps n.
+    The environment that the training has built for Stable-Baselines3 is not stepped. n: worlds; L: learners; B: tried
+    decisions; D: visited decisions of one learner, n_steps n.
     """
 
     def __init__(self, training: Training, environment: EthBrakeVecEnv, device: str) -> None:
@@ -82,7 +83,6 @@ class CudaVineModel(VineModel):
         self.descended = Graphed(partial(super().descend, self.policy), place)
 
     def new_policy(self) -> nn.Module:
-        """Return the actor, on the device."""
         actor = super().new_policy().to(self.worlds.device)
         assert isinstance(actor, Actor)
         actor.new_optimizer(self.recipe.learning_rate.at(1.0))
@@ -93,7 +93,7 @@ class CudaVineModel(VineModel):
         return super()._get_torch_save_params()[0], [*episodes, "worlds.following", "worlds.results.observations"]
 
     def _update_learning_rate(self, optimizers: Any) -> None:
-        """Set the learning rate. A CUDA graph reads it where it has been from the beginning."""
+        """Set the learning rate in its old place in memory, where a CUDA graph reads it."""
         (group,) = optimizers.param_groups
         rate = group["lr"]
         super()._update_learning_rate(optimizers)
@@ -101,18 +101,17 @@ class CudaVineModel(VineModel):
             group["lr"] = rate.fill_(group["lr"])
 
     def learn(self, *given: Any, **more: Any) -> Self:
-        """Train as on a processor. Raises ``InvalidInput`` if the device has too little memory."""
         with enough_memory(sizes(self.recipe)):
             return super().learn(*given, **more)
 
     def act(self, seen: Tensor) -> Tensor:
-        """Return the learners' actions, [n, L], where they observe ``seen`` [n, L, F]."""
+        """Return the learners' actions, [n, L], for observations ``seen`` [n, L, F]."""
         outputs: Tensor = self.policy.learning(seen.flatten(0, 1))
         return outputs.clamp(-1.0, 1.0).view(seen.shape[:2])
 
     @torch.no_grad()
     def collect(self, callback: BaseCallback) -> tuple[Tensor, Stored]:
-        """Drive all worlds for ``n_steps`` decisions; return observations [D L, F], and the states there."""
+        """Drive all worlds for ``n_steps`` decisions; return observations [D L, F], and the states at the decisions."""
         worlds = self.worlds
         for step in range(self.recipe.n_steps):
             rows = slice(step * worlds.n, (step + 1) * worlds.n)
@@ -125,12 +124,12 @@ class CudaVineModel(VineModel):
         return self.seen.flatten(0, 1), self.visited
 
     def improve(self, seen: Any, states: Any) -> None:
-        """Measure gradients at some of the visited decisions, and follow them."""
+        """Measure gradients at some of the visited decisions, and update the actor with them."""
         self.train_actor(self.policy, self.measure(seen))
 
     @torch.no_grad()
     def measure(self, seen: Tensor) -> Tried:
-        """Draw visited decisions; play a branch with a higher and one with a lower action than the policy's."""
+        """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's."""
         place = self.worlds.device
         branches = self.draw_branches(np.arange(len(seen)))
         own = seen[torch.from_numpy(branches.decisions(self.learners)).to(place)]
@@ -139,7 +138,7 @@ class CudaVineModel(VineModel):
         return Tried(own, self.policy.learning(own)[:, 0], self.measured_gradient(gained, moved))
 
     def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
-        """Do the work of ``play`` on the device; return what learners gained and how far actions moved, [2, 2B]."""
+        """Simulate branches; return what learners gained and how far their actions were moved, [2, 2B]."""
         worlds, result = self.branches, torch.zeros(2, len(world), dtype=size.dtype, device=size.device)
         seen, its, discount = worlds.put(self.visited, world), learner[:, None] == self.each_learner, 1.0
         for number in range(self.worlds.longest):
@@ -154,6 +153,5 @@ class CudaVineModel(VineModel):
         return result
 
     def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        """Make one step of the optimiser with some decisions; return the loss."""
         loss: Tensor = self.descended(seen, target, weight)
         return loss.clone()

@@ -1,4 +1,4 @@
-"""``Worlds``: many episodes on a GPU, as torch tensors: step, observe, begin again, without a copy to the processor."""
+"""``Worlds``: many episodes on a GPU, as torch tensors, without copies to the processor."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WHOSE = {"harm": "harm of single vehicles"}  # otherwise the compiled step compu
 
 
 class Stepped(NamedTuple):
-    """What a step did in n worlds: tensors that the next step overwrites."""
+    """Results of a step in n worlds: tensors that the next step overwrites."""
 
     observations: Tensor  # [n, L, F] float32 of the learners, front to rear; of the new episode where one has begun
     reward: Tensor  # [n] float64 of every learner
@@ -74,17 +74,17 @@ class Worlds:
         reward: Any = "harm",
         observation: Any = None,
     ) -> None:
-        """Draw the pool, bring it to the device, and begin all episodes.
+        """Draw the pool of worlds, copy it to the device, and begin all episodes.
 
         Args:
-            scenario: as for ``open_game``, and so are
-            learners: which vehicles learn,
-            reward: of terms that the compiled step knows, and
-            observation: the features of the groups own, front_K, rear_K, role and obstacle.
+            scenario: as for ``open_game``.
             n: number of episodes.
             pool: number of training worlds that are drawn, or worlds at the alert (``Scenario.sample``).
             device: ``cuda``, ``cuda:1``, or ``cpu``, where the same code runs slowly.
-            seed: of the training worlds.
+            seed: seed of the training worlds.
+            learners: vehicles that learn, as for ``open_game``.
+            reward: as for ``open_game``, of terms that the compiled step knows.
+            observation: features of the groups own, front_K, rear_K, role and obstacle.
 
         Raises ``InvalidInput`` for what no kernel computes: scripts that look at the state, messages, another physics,
         features and terms of the reward with functions of Python, learners with different views; for a device that
@@ -129,18 +129,17 @@ class Worlds:
         return torch.zeros(*shape, dtype=kind, device=self.device)
 
     def stored(self, state: State) -> Stored:
-        """Return episodes as tensors on this device."""
         arrays = (state.line, state.car, state.clock, state.know, state.wanted)
         return Stored(*(torch.from_numpy(np.moveaxis(each, 0, -1).copy()).to(self.device) for each in arrays))
 
     @property
     def observations(self) -> Tensor:
-        """What the learners observe now, [n, L, F] float32; the next step overwrites it."""
+        """Present observations of the learners, [n, L, F] float32; the next step overwrites them."""
         seen: Tensor = self.results.observations
         return seen
 
     def reset(self) -> Tensor:
-        """Begin all episodes, in the first n worlds of the pool; return what the learners observe, [n, L, F]."""
+        """Begin all episodes, in the first n worlds of the pool; return the observations, [n, L, F]."""
         torch.arange(self.n, out=self.following)
         self.following.remainder_(self.pool.wanted.shape[1])
         self.results.status.zero_()
@@ -150,9 +149,9 @@ class Worlds:
     def step(self, actions: Tensor, *, renew: bool = True) -> Stepped:
         """Take one step in all episodes.
 
-        ``actions`` [n, L] float32 are clipped to [-1, 1]. With ``renew`` False an episode that has ended stays as it
-        is, and its reward and harm are 0. What goes wrong in a world is kept for ``check``, so that no step waits for
-        the device. Raises ``InvalidInput`` for a tensor of another shape, type or device.
+        ``actions`` [n, L] float32 are clipped to [-1, 1]. With ``renew=False``, an episode that has ended stays as it
+        is, and its reward and harm are 0. Errors in a world are stored for ``check``, so that no step waits for the
+        device. Raises ``InvalidInput`` for a tensor of another shape, type or device.
         """
         shape, right = self._no_actions.shape, (torch.float32, torch.strided)
         if not (isinstance(actions, Tensor) and actions.shape == shape and (actions.dtype, actions.layout) == right):
@@ -166,9 +165,9 @@ class Worlds:
         return Stepped(observations, reward, *ends, out[HARM], out[TOTAL_HARM])
 
     def put(self, stored: Stored, rows: Tensor) -> Tensor:
-        """Continue the episodes ``rows`` [n] of any ``Stored``; return what the learners observe, [n, L, F].
+        """Continue from the episodes ``rows`` [n] of ``stored``; return the observations, [n, L, F].
 
-        Raises ``InvalidInput`` for another number of rows, and for episodes of other lines of vehicles.
+        Raises ``InvalidInput`` for another number of rows, and for worlds with another number of vehicles.
         """
         if not (rows.shape == (self.n,) and rows.dtype == torch.int64):
             what = f"{rows.dtype} of shape {tuple(rows.shape)}"
@@ -182,21 +181,20 @@ class Worlds:
         return self.observations
 
     def arguments(self, actions: Tensor, mode: int) -> tuple[Any, ...]:
-        """Return the arguments of the kernel ``play``, but for the thread."""
         return self.now, self.pool, self.following, actions, self.results, self.rules, self.looking, mode
 
     def _launch(self, actions: Tensor, mode: int) -> None:
         self.kernel.launch(self.device, self.n, *self.arguments(actions, mode))
 
     def state(self) -> State:
-        """Return the episodes as the core's ``State``, copied to the processor."""
+        """Return the episodes as the core's ``State`` on the processor."""
         line, car, clock, know, wanted = (np.moveaxis(each.cpu().numpy(), -1, 0).copy() for each in self.now)
         return State(line, car, clock, know, wanted, {})
 
     def check(self) -> None:
-        """Raise an error for the first world in which something went wrong in a step since the last ``reset``.
+        """Raise an error for the first world in which a step has failed since the last ``reset``.
 
-        ``InvalidInput`` for an action that is no number, ``PhysicsError`` if a check of the physics failed.
+        ``InvalidInput`` for an action that is NaN, ``PhysicsError`` if a check of the physics failed.
         """
         if not bool(self.results.status.any()):
             return
@@ -210,7 +208,7 @@ class Worlds:
 
 
 def check_runs(game: Game) -> None:
-    """Raise ``InvalidInput`` for what kernels of a GPU do not compute; the message says what they do."""
+    """Raise ``InvalidInput`` for what GPU kernels do not compute."""
     what = f"scenario {game.name!r} in kernels for a GPU"
     for body, script in game.scripts.items():
         name = getattr(script, "name", type(script).__name__)
@@ -247,7 +245,7 @@ def check_runs(game: Game) -> None:
 
 
 def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Looking, Kernel]:
-    """Return what ``play`` needs beside the worlds, and its kernel."""
+    """Return the kernel ``play`` and its constant arguments."""
     on = partial(torch.tensor, device=device)
     rules, plan = game.rules, game.views[int(game.rules.learners[0])].plan
     ruling = Ruling(

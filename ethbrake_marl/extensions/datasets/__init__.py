@@ -41,8 +41,8 @@ def to_parquet(
 ) -> None:
     """Let agents drive, and write a Parquet file with one row for each agent, world and decision.
 
-    docs/extensions/datasets.md describes the columns and the metadata. Each of the ``agents`` drives all learners, in
-    the worlds 0 to ``episodes`` - 1 of ``seed``. ``reward``: a name such as ``harm``, or the weights of its terms.
+    Each of the ``agents`` drives all learners, in the worlds 0 to ``episodes`` - 1 of ``seed``. ``reward``: a name such
+    as ``harm``, or the weights of its terms. docs/extensions/datasets.md describes the file.
 
     Raises ``InvalidInput`` for an invalid argument, ``AlreadyExists`` if the file exists and ``force`` is false, and
     ``MissingExtra`` without pyarrow.
@@ -85,7 +85,7 @@ def to_parquet(
 
 
 def actions_of(team: Team, game: Game, alert: State) -> list[Observations]:
-    """Return the commands of a team in n worlds as actions of L learners: one array [n, L] for each decision."""
+    """Simulate a team in n worlds; return its L learners' commands as actions, one array [n, L] for each decision."""
     learners = game.rules.learners.tolist()
     return [
         np.stack([to_action(state, body, state.wanted[:, body]) for body in learners], axis=1, dtype=np.float32)
@@ -97,7 +97,7 @@ def actions_of(team: Team, game: Game, alert: State) -> list[Observations]:
 def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator[dict[str, Any]]:
     """Yield the columns of each decision, with one value for each world whose episode has not ended.
 
-    The learners take ``actions``; if an episode needs more of them, they repeat the last one.
+    The learners take ``actions``; after the last of these they repeat it.
     """
     state, learners = game.reset(alert), game.rules.learners.tolist()
     while not state.ended.all():

@@ -36,7 +36,7 @@ class Parameters:
 
 
 class Seen(NamedTuple):
-    """Motion of one vehicle in n worlds, and what it knows of the vehicle ahead; for Vehicle 1, of the obstacle.
+    """What one vehicle knows in n worlds: its own motion, and the motion of what is ahead: a vehicle or the obstacle.
 
     If nothing is ahead, or nothing is known of it, the gap is infinite.
     """
@@ -50,7 +50,7 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, state: State, body: int, step_s: float) -> Seen:
-        """Return what vehicle ``body`` knows, of a state as it believes it."""
+        """Return what vehicle ``body`` knows; ``state`` is the world as it believes it to be."""
         line, ahead = state.line, body - 1
         known = state.know[:, body, ahead] <= state.time_s if ahead else line[:, GAP, 0] < FAR_M
         front, force = np.where(known, line[:, [SPEED, FORCE], ahead].T, 0.0)
@@ -59,7 +59,7 @@ class Seen(NamedTuple):
 
     @property
     def closing_mps(self) -> Floats:
-        """Speed at which the gap to the vehicle ahead closes, [n] m/s; negative if the gap opens."""
+        """Speed at which the gap ahead closes, [n] m/s; negative if the gap opens."""
         return self.speed_mps - self.front_mps
 
     @property
@@ -70,11 +70,11 @@ class Seen(NamedTuple):
 
     @property
     def headway_s(self) -> Floats:
-        """Gap to the vehicle ahead / speed of this vehicle, [n] s; infinite if this vehicle's speed is not above 0."""
+        """Gap ahead / own speed, [n] s; infinite if the own speed is not above 0."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the command, [n] m/s2, with a limited growth of the deceleration. ``wanted_mps2`` [n] is the law's."""
+        """Return the command ``wanted_mps2``, with its deceleration growing by at most ``rate_mps3``, [n] m/s2."""
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
@@ -129,9 +129,10 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 
 
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
-    """Return the proactive and the critical criterion of the fuzzy safety model of UN R157, each [n].
+    """Return the proactive and the critical criterion of UN R157's fuzzy safety model, [n] each: 0 no danger, 1 full
+    danger.
 
-    0: no danger, 1: full danger. ``p`` are parameters of the law ``r157_fsm``.
+    ``p``: parameters of the law ``r157_fsm``.
     """
     speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
     ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
@@ -220,8 +221,8 @@ class Controller:
     """Agent that follows a ``Law``.
 
     Its memory is the time at which it noticed a danger, [n] s: infinite if it has noticed none, NaN before the first
-    decision. The reaction time begins then; if there is a danger at the first decision, it begins at the alert, so it
-    overlaps with the latency. It ends with the danger, and the next danger starts a new one, unless ``law.stays``.
+    decision. The reaction time begins then or, for a danger at the first decision, at the alert, so it overlaps with
+    the latency. The reaction ends with the danger, unless ``law.stays``; the next danger starts a new one.
     """
 
     knows = MESSAGES
@@ -258,8 +259,8 @@ class Controller:
 def make_controller(argument: str | None, settings: Any) -> Controller:
     """Return the controller with the name ``settings.spec``, such as ``idm:T=1.0``.
 
-    ``argument``: values of parameters, such as ``T=1.0`` or ``T=1.0:a=2``; None: default values. Raises ``UnknownName``
-    for a parameter that the law does not have, and ``InvalidInput`` for a bad value.
+    ``argument``: values of parameters, such as ``T=1.0:a=2``; None: default values. Raises ``UnknownName`` for a
+    parameter that the law does not have, and ``InvalidInput`` for a bad value.
     """
     law, where = LAWS[settings.spec.partition(":")[0]], f"agent {settings.spec!r}"
     parameters: dict[str, float] = {}

@@ -1,6 +1,7 @@
-"""The groups ``contact`` and ``contact_far``: a vehicle's next impacts if it brakes fully, coasts, or drives fully.
+"""The feature groups ``contact`` and ``contact_far``: a vehicle's next impacts if it brakes fully, coasts, or drives
+fully.
 
-A forecast covers the vehicles that the observer knows, from it on without a gap, for ``FORECAST_S``. Its own command
+A forecast simulates, for ``FORECAST_S``, the unbroken row of known vehicles around the observer. The observer's command
 takes effect after its latency. Every other vehicle keeps its force, with two exceptions: one without a force brakes
 fully after its latency, and one whose brakes build up is taken to brake fully, since its force does not show its
 command.
@@ -80,7 +81,7 @@ CONTACT_FAR = tuple(feature for command, held in COMMANDS.items() for feature in
 
 @kernel
 def known_line(line, car, know, time, i, known, parameters, commands):
-    """Copy a world as body i knows it, with what is assumed of the others; return the first and last known body.
+    """Copy a world as body i knows it, with assumed commands of the others; return the first and last known body.
 
     Unknown bodies are at rest and out of reach.
     """
@@ -110,7 +111,10 @@ def known_line(line, car, know, time, i, known, parameters, commands):
 
 @large
 def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out):
-    """Write ``contact`` and ``contact_far``, unscaled, to ``out`` [n, observers, F]; return a failed row or -1."""
+    """Write the unscaled features ``contact`` and ``contact_far`` to ``out`` [n, observers, F].
+
+    Returns the row of a world whose simulation failed, or -1.
+    """
     scratch, here, known, parameters, commands = memory
     near, failed = 3 * PER_COMMAND, -1
     for k in range(len(out)):
@@ -135,7 +139,7 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
 
 @kernel
 def write_features(scratch, met, i, first, last, time_step_s, value):
-    """Write the features of one forecast; 0 for a pair that is not known.
+    """Write the features of one forecast to ``value``; they are 0 for a pair that is not known.
 
     An impact exactly at the end of a time step belongs to this step, as in the episode.
     """

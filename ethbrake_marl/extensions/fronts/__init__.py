@@ -1,1 +1,1 @@
-"""The command ``study front``: the harm of each vehicle under commands that minimise a weighted sum of the harms."""
+"""The command ``study front``: the harm of each vehicle if commands minimise a weighted sum of these harms."""

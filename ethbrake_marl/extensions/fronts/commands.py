@@ -1,4 +1,4 @@
-"""The command ``study front``: minimise the weighted harm of the vehicles for many choices of the weights."""
+"""The command ``study front``."""
 
 from __future__ import annotations
 

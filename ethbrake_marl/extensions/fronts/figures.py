@@ -26,9 +26,9 @@ Json = dict[str, Any]
 
 @in_our_style
 def front_figure(results: Json) -> Figure:
-    """Draw the mean of what is weighted: the line (horizontal) against the vehicle that bears most (vertical).
+    """Draw one point for each choice of weights: the line's mean harm against that of the vehicle that bears most.
 
-    One point for each choice of weights. ``results`` is the content of ``front.json``.
+    ``results``: the content of ``front.json``.
     """
     beside = {name: [{"vehicles": vehicles}] for name, vehicles in results["beside"].items()}
     count, all_positive = results["harm_count"], True

@@ -1,7 +1,7 @@
 """The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
-A point of the front is the mean harm of each vehicle over the worlds, for one choice of weights. The points approximate
-the convex part of the Pareto front; a search finds them, and there is no proof that no better ones exist. N vehicles, W
+A point of the front is the mean harm of each vehicle over the worlds, for one choice of weights. A search finds these
+points; they approximate the convex part of the Pareto front, without a proof that no better ones exist. N vehicles, W
 choices of weights.
 """
 
@@ -76,9 +76,9 @@ def search_front(
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    In each world and for each choice the weighted harm is at most that of ``CONSTANTS`` constant commands, and of the
-    results for all other choices. With one learner it is also at most that of the shipped profile of this world, of
-    each of ``agents``, and of every shipped policy that can drive here. It depends on no other world.
+    This harm is at most that of ``CONSTANTS`` constant commands, and of the results for all other choices. With one
+    learner it is also at most that of the shipped profile of this world, of each of ``agents``, and of every shipped
+    policy that can drive here. A world's result depends on no other world.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.fronts.front import search_front
@@ -93,9 +93,9 @@ def search_front(
         weights: weights of the vehicles' harm, [W, N].
         count: what is weighted (``episode.counts``).
         budget: number of profiles that are tried for each world and choice of weights.
-        threads: of the search.
-        agents: drive every world for each choice of weights, with these weights as the scenario's ``harm_weight``, and
-            the objective ``preference``; only with one learner.
+        threads: number of threads.
+        agents: names of agents that also drive, with each choice of weights as the scenario's ``harm_weight`` and the
+            objective ``preference``; only with one learner.
         on_progress: called with the number of finished searches and of all, two for each world and choice.
 
     Raises ``InvalidInput`` for ``agents`` with several learners, and for weights that are no table of numbers with a
@@ -144,7 +144,6 @@ def _joined(parts: Sequence[Borne]) -> Borne:
 def _tried(
     pool: Pool, worlds: State, weights: Floats, preferring: Sequence[tuple[Game, Mapping[str, Team]]]
 ) -> dict[str, Borne]:
-    """Add constant commands, shipped profiles and what the agents drive; return the agents' harm, [W, n, N]."""
     problem = pool.problem
     constants = problem.constant(problem.even_grid(CONSTANTS))
     for q in range(CONSTANTS):
@@ -165,14 +164,13 @@ def _tried(
 
 
 def observes_weights(team: Team) -> bool:
-    """May a team's commands depend on the weights of harm? Not for policies that do not observe them."""
+    """Return whether a team's commands may depend on the weights of harm: not if its policies do not observe them."""
     policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
     seen = [() if policy is None else policy.observation.names for policy in policies]
     return team.shield is not None or any(not names or any("harm_weight" in name for name in names) for names in seen)
 
 
 def _search(pool: Pool, worlds: State, weights: Floats, effort: Mapping[str, int], tell: Callable[[int], None]) -> None:
-    """Search twice for each choice of weights; a search begins with the best profile of all that were tried before."""
     problem = pool.problem
     starts = starting_profiles(problem, worlds)
     aims = [problem.minimising(row / row.sum()) for row in weights]
@@ -185,7 +183,7 @@ def _search(pool: Pool, worlds: State, weights: Floats, effort: Mapping[str, int
 
 
 class Pool:
-    """Profiles that were tried in the same worlds; its methods choose each world's best one for given weights."""
+    """Profiles that were tried in the same worlds, from which each world's best one for given weights can be chosen."""
 
     def __init__(self, problem: Problem, count: str) -> None:
         self.problem, self.count = problem, count
@@ -200,7 +198,7 @@ class Pool:
         return {count: each[-1] for count, each in self.borne.items()}
 
     def choice(self, weights: Floats) -> Ints:
-        """Return the number of each world's profile of least weighted harm, [n]; of equal ones, of least harm."""
+        """Return the number of the profile with the least weighted harm in each world, [n]; ties: the least harm."""
         borne = np.stack(self.borne[self.count])
         amounts = weighted(borne, weights)
         least = amounts.min(axis=0)
@@ -214,7 +212,7 @@ class Pool:
         return Profiles(np.stack(ends)[place, rows], np.stack(commands)[place, rows])
 
     def least(self, weights: Floats) -> Borne:
-        """Return the harm of each vehicle with the best profiles, [W, n, N] m2/s2 by count."""
+        """Return the harm of each vehicle under the best profiles for each choice of weights, [W, n, N] by count."""
         chosen, rows = [self.choice(row) for row in weights], np.arange(self.problem.n)
         return {count: np.stack([np.stack(each)[k, rows] for k in chosen]) for count, each in self.borne.items()}
 
@@ -222,7 +220,7 @@ class Pool:
 def least_largest(scenario: Scenario, worlds: State, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
     """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm, [n, N] by count.
 
-    It is at most the largest harm under any profile of ``front``, which was searched in the same worlds.
+    The largest harm is at most that under any profile of ``front``, which was searched in the same worlds.
     """
     game, parts = open_game(scenario)[1], []
     for first in range(0, worlds.n, CHUNK):

@@ -10,7 +10,7 @@ MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of 
 
 
 def hypervolume(points: Floats, reference: Floats) -> float:
-    """Return the exact volume of the region that ``points`` [Q, N] dominate, up to the point ``reference`` [N].
+    """Return the exact volume of the region between ``points`` [Q, N], which dominate it, and ``reference`` [N].
 
     Smaller coordinates are better. A point is ignored unless all its coordinates are below the reference point's. The
     region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").

@@ -33,9 +33,9 @@ def front_results(
 ) -> Json:
     """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
 
-    All means have 95 % intervals over worlds or, if these come from recordings, over recordings. For each choice of
-    weights, ``ratio`` is the mean weighted harm divided by the front's (null if that is 0), ``above`` their difference.
-    ``beside``: results beside the front, name -> count -> harm of each vehicle, [n, N] m2/s2; ``full_brake`` is one.
+    Means have 95 % intervals over worlds, or over recordings. For each choice of weights, ``ratio`` is an agent's mean
+    weighted harm divided by the front's (null if that is 0), ``above`` the difference. ``beside``: results beside the
+    front, name -> count -> harm of each vehicle, [n, N] m2/s2; it contains ``full_brake``.
     """
     by = clusters_of(columns_of(drawn))
     return {
@@ -79,11 +79,10 @@ def _vehicles(borne: Borne, by: Clusters) -> dict[str, list[Json]]:
 def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
     """Return the hypervolumes of the front and of each agent, for two reference points.
 
-    A point is the mean harm of all vehicles for one choice of weights. The first reference point is each vehicle's mean
-    harm under full braking, so only points count that are better for every vehicle. The second is the larger of that
-    and of the vehicle's largest mean harm on the front. ``share`` is an agent's hypervolume divided by the front's,
-    None if that is 0. ``full_brake`` is the harm of each vehicle if the learners brake fully, [n, N] m2/s2. Nothing for
-    more than ``MOST_DIMENSIONS`` vehicles.
+    A point is the mean harm of all vehicles for one choice of weights. The first reference point is full braking
+    (``full_brake`` [n, N] m2/s2), so only points count that are better for every vehicle. The second has, for each
+    vehicle, the larger of this and of its largest mean harm on the front. ``share``: an agent's hypervolume divided by
+    the front's, None if that is 0. Empty for more than ``MOST_DIMENSIONS`` vehicles.
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
@@ -110,8 +109,7 @@ def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
 def front_sheet(results: Json) -> Sheet:
     """Return a table with one row for each choice of weights, and for each result beside the front.
 
-    A row has the mean of what is weighted for each vehicle, the mean of every count for the line and, for a choice of
-    weights, the ``ratio`` of each agent.
+    Its columns are each vehicle's mean of what is weighted, the line's mean of every count, and each agent's ``ratio``.
     """
     count, agents = results["harm_count"], results["agents"]
 

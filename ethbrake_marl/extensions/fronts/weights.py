@@ -1,4 +1,4 @@
-"""Weights of the vehicles' harm: a regular grid, and one vehicle first."""
+"""Choices of weights for the vehicles' harm: a regular grid, and weights that put one vehicle first."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides be
 
 
 def weight_grid(vehicles: int, steps: int) -> Floats:
-    """Return W evenly spaced choices of weights, [W, N]. In each choice the weights of the N vehicles sum to 1.
+    """Return W evenly spaced choices of weights, [W, N]. The weights of each choice sum to 1.
 
-    From each row to the next, one weight rises by 1 / ``steps``, and another falls by 1 / ``steps``. Raises
-    ``InvalidInput`` for more than ``MOST`` choices.
+    From each row to the next, one weight rises by 1 / ``steps``, and another falls by as much. Raises ``InvalidInput``
+    for more than ``MOST`` choices.
 
     >>> from ethbrake_marl.extensions.fronts.weights import weight_grid
     >>> weight_grid(3, 1).tolist()
@@ -36,7 +36,7 @@ def weight_grid(vehicles: int, steps: int) -> Floats:
 
 
 def _divisions(vehicles: int, steps: int) -> list[list[int]]:
-    """Return all ways to divide ``steps`` equal parts among the vehicles; neighbours differ by one moved part."""
+    """Return all ways to divide ``steps`` parts among the vehicles; from one way to the next, one part moves."""
     if vehicles == 1:
         return [[steps]]
     divisions: list[list[int]] = []
@@ -55,7 +55,7 @@ def corners(vehicles: int) -> Floats:
 
 
 def weight_table(rows: Sequence[Sequence[Any]]) -> Floats:
-    """Return choices of weights as an array, [W, N]. Raises ``InvalidInput`` unless all are as many numbers."""
+    """Return choices of weights as an array, [W, N]. Raises ``InvalidInput`` for unequal rows and what is no number."""
     numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for row in rows for each in row)
     if not numbers or len({len(row) for row in rows}) != 1:
         shown = "; ".join(",".join(map(str, row)) for row in rows)

@@ -1,1 +1,1 @@
-"""Learning algorithms without exploration, critic or shaping: vine, mixtures of experts, and rollout classification."""
+"""Learning algorithms that try several actions in the same state: vine, mixtures of experts, rollout classification."""

@@ -1,4 +1,4 @@
-"""How a training builds the models of this extension, and takes policies from them."""
+"""How a training builds the models of this extension, and turns them into policies."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ethbrake_marl.training.training import Training
 
 
 class Vine(Algorithm):
-    """One actor drives all learners; or a mixture of experts drives the only one."""
+    """Algorithm vine: one actor drives all learners, or a mixture of experts drives the only one."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
         recipe = training.recipe
@@ -46,7 +46,7 @@ class Vine(Algorithm):
 
 class RolloutClassification(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """At first the model acts like the first of the recipe's ``policies``, or brakes fully."""
+        """Return a new model, which acts like the first of the recipe's ``policies``, or brakes fully."""
         return RolloutClassificationModel(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:

@@ -1,4 +1,4 @@
-"""Branches: copies of running episodes that are played to their end with other actions.
+"""Branches: copies of running episodes that are simulated to their end with other actions.
 
 Branches of one state have the same random numbers, so they differ only in the actions. n: branches, or worlds; m:
 branches that still run; L: learners, front to rear; F: features.
@@ -26,7 +26,7 @@ Act = Callable[[Observations], Float32s]  # observations [rows, F] -> actions [r
 
 
 class Moment(NamedTuple):
-    """A decision in all branches that still run."""
+    """One decision in all branches that still run."""
 
     state: State
     seen: Observations  # [m, L, F]
@@ -34,7 +34,7 @@ class Moment(NamedTuple):
     number: int  # steps so far
 
     def ask(self, act: Act) -> Floats:
-        """Return the actions of all learners by one policy, [m, L] float64."""
+        """Return the actions of one policy for all learners, [m, L] float64."""
         return act(self.seen.reshape(-1, self.seen.shape[2])).astype(np.float64).reshape(self.seen.shape[:2])
 
 
@@ -42,10 +42,10 @@ Decide = Callable[[Moment], Floats]  # returns the learners' actions, [m, L]
 
 
 def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least: int = 0) -> tuple[Floats, State]:
-    """Play episodes to the end; return each learner's discounted return, [n, L], and the last states.
+    """Simulate episodes to the end; return each learner's discounted return, [n, L], and the last states.
 
-    If harm is the only term of the reward, an episode also ends once everything stands for good, but not in its first
-    ``at_least`` steps.
+    If harm is the reward's only term, an episode also ends, after ``at_least`` steps, when no vehicle will ever move
+    again.
     """
     learners, only_harm = game.rules.learners, set(game.rewarding.counted) <= {"harm"}
     gained, over = np.zeros((state.n, len(learners))), state.ended
@@ -66,10 +66,10 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
 
 
 def stands_for_good(before: State, after: State, count: Floats) -> Bools:
-    """Return where all vehicles stand, and a policy that only looks at its observation never moves one again, [n].
+    """Return in which worlds all vehicles stand and will never move again, if actions depend only on observations, [n].
 
-    There nothing has changed in this step, and nobody waits for a latency or for news. ``count`` are the weights of
-    what counts (``episode.counts``): a vehicle that presses against a standing one can still push. Always False if
+    There nothing has changed in this step, and no vehicle waits for its latency or for news. ``count`` [6] are the
+    weights of what counts as harm: a vehicle that presses against a standing one can still push it. Always False if
     scripts, messages or a shield have a memory.
     """
     out = np.zeros(after.n, np.bool_)
@@ -100,5 +100,5 @@ def find_standing(
 
 
 def moving(state: State) -> Bools:
-    """Return where a vehicle moves, [n]; elsewhere no action has an effect."""
+    """Return in which worlds a vehicle moves, [n]."""
     return np.asarray(state.line[:, SPEED].any(axis=1))

@@ -40,7 +40,7 @@ LIKELY_ACTIONS, THEIR_SHARES = np.array([-1.0, 1.0, 0.0]), np.array([0.35, 0.5, 
 
 
 class NoBetterTemplate(EthBrakeError, ValueError):
-    """No template has a higher return than the earlier experts, so a new expert has nothing to learn."""
+    """No template (random braking profile) has a higher return than the earlier experts: there is nothing to learn."""
 
 
 class Stage(NamedTuple):
@@ -50,7 +50,7 @@ class Stage(NamedTuple):
 
 
 def stages_of(plan: ExpertsPlan, updates: int) -> tuple[Stage, ...]:
-    """Return the stages of a training of so many updates; a small share may get none."""
+    """Return the stages of a training with this number of updates. A stage with a small share may have no update."""
     shares, others = plan.shares, plan.networks - 1
     parts: list[tuple[int | None, float]] = [(0, shares.pretraining_first)]
     parts += [(k + 1, shares.pretraining_others / others) for k in range(others)]
@@ -74,7 +74,7 @@ class Mixture(nn.Module):
         self.memory = Memory(plan.gating_memory, seen=torch.zeros(inputs), more=torch.zeros(plan.networks))
 
     def means(self, observations: Float32s) -> Float32s:
-        """Return the outputs of the chosen actors, not clipped, [rows], for observations [rows, F]."""
+        """Return the actors' unclipped outputs, [rows], each of the actor chosen for the observation [rows, F]."""
         chosen, means = self.gate.best(observations), np.empty(len(observations), np.float32)
         for number, actor in enumerate(self.actors):
             rows = np.flatnonzero(chosen == number)
@@ -92,7 +92,7 @@ class Mixture(nn.Module):
 
 
 class Explored(NamedTuple):
-    """The first n worlds of the training, and the best that earlier experts have done in them."""
+    """The first n worlds of the training, and the best results of earlier experts in them."""
 
     start: State  # at the first decision
     gained: Floats  # [n] highest return
@@ -100,7 +100,7 @@ class Explored(NamedTuple):
 
 
 class Shown(NamedTuple):
-    """Decisions of templates, which a new expert imitates."""
+    """Decisions of templates (random braking profiles) that a new expert imitates."""
 
     seen: Float32s  # [m, F] observations
     action: Float32s  # [m]
@@ -122,7 +122,7 @@ class MixtureModel(VineModel):
         return ["policy", *actors, "policy.gate.optimizer"], []
 
     def collect(self, callback: BaseCallback) -> tuple[Float32s, State]:
-        """Return decisions in all worlds or, for a second or later expert, of whole episodes in its own worlds."""
+        """Return visited decisions: in all worlds or, for a second or later expert, of episodes in its own worlds."""
         each = self.n_envs * self.recipe.n_steps
         self.number, updates = self.num_timesteps // each, -(-self._total_timesteps // each)
         stage = next(one for one in stages_of(self.plan, updates) if one.first <= self.number < one.end)
@@ -156,7 +156,7 @@ class MixtureModel(VineModel):
 
         A second or later expert first imitates templates; then the worlds of its training are selected. This depends
         only on the earlier experts, so a resumed training repeats it exactly. Raises ``NoBetterTemplate`` if there is
-        no better template, or no world to select.
+        nothing to imitate, or no world to select.
         """
         self.stage, self.own = stage, None
         if not stage.expert:
@@ -185,16 +185,15 @@ class MixtureModel(VineModel):
         return Explored(start, gained, harm)
 
     def drive_from(self, state: State, act: Act, count: str) -> tuple[Floats, Floats]:
-        """Let one policy drive to the end; return its return and its harm, [n]."""
+        """Let one policy drive to the end; return the return and the harm, [n] each."""
         gained, last = play_on(self.game, state, lambda now: now.ask(act), self.recipe.gamma)
         return gained[:, 0], self.harm(last, count)[:, 0]
 
     def best_templates(self, explored: Explored) -> tuple[Ints, Floats]:
-        """Draw templates in each world; return the worlds in which the best one does less harm than all experts, and
-        the actions of these, [m, T].
+        """Draw random templates in each world; return the worlds [m] in which one does less harm than all experts.
 
-        No search improves a template: a random one with little harm tolerates small errors of its actions, so a policy
-        can imitate it.
+        Also return the best template's actions there, [m, T]. A template is a random braking profile. No search
+        improves it: a random one with little harm tolerates small errors of its actions, so a policy can imitate it.
         """
         count, start = self.recipe.reward.harm_count, explored.start
         generator = np.random.default_rng(self.recipe.seed)
@@ -210,7 +209,7 @@ class MixtureModel(VineModel):
         return rows, best[rows]
 
     def show(self, explored: Explored, rows: Ints, actions: Floats) -> Shown:
-        """Play templates ``actions`` [m, T] in the worlds ``rows``; return the decisions of those that gain enough."""
+        """Simulate templates ``actions`` [m, T] in the worlds ``rows``; return the decisions of the good ones."""
         seen, wanted, whose = [np.zeros((0, len(self.features)), np.float32)], [np.zeros(0)], [np.zeros(0, np.int64)]
 
         def decide(now: Moment) -> Floats:
@@ -235,10 +234,10 @@ class MixtureModel(VineModel):
         pupil.follow(0.0)
 
     def worlds_of(self, act: Act, explored: Explored) -> State:
-        """Return the worlds in which a new expert, which drives by ``act``, is to be trained further.
+        """Return the worlds in which a new expert is trained further; ``act`` is its policy after imitation.
 
-        It is better there than the best earlier expert, or not much worse. Left out are worlds in which both are equal,
-        or in which the earlier expert does no harm.
+        These are worlds in which it is better than the best earlier expert, or not much worse. Left out are worlds in
+        which both are equal, or in which the earlier expert does no harm.
         """
         gained, _ = self.drive_from(explored.start, act, self.recipe.reward.harm_count)
         more = gained - explored.gained
@@ -246,10 +245,10 @@ class MixtureModel(VineModel):
         return explored.start.take(np.flatnonzero(own))
 
     def compare(self, seen: Float32s, states: State) -> tuple[Float32s, Floats]:
-        """Let every expert drive on from some decisions at which they differ.
+        """Let each of K experts drive on from some visited decisions at which they differ.
 
-        Returns the observations there, [B, F], and the cost of each of K experts, [B, K]: minus the return, plus
-        ``tie_break`` times the harm by the other count.
+        Returns the observations, [B, F], and the experts' costs, [B, K]: minus the return, plus ``tie_break`` times the
+        harm by the count that the reward does not use.
         """
         policy, plan = self.policy, self.plan
         actions = np.stack([actor.act(seen) for actor in policy.actors])
@@ -263,7 +262,7 @@ class MixtureModel(VineModel):
         return seen[rows], costs
 
     def train_gate(self, seen: Float32s, costs: Floats) -> None:
-        """Teach the gating network the cheapest expert; a wrong choice weighs as much as it costs more."""
+        """Train the gating network to choose the cheapest expert. A wrong choice is weighted by its extra cost."""
         gate, memory, plan = self.policy.gate, self.policy.memory, self.plan
         self._update_learning_rate(gate.optimizer)
         more = (costs - costs.min(axis=1, keepdims=True)).astype(np.float32)
@@ -285,7 +284,7 @@ class MixtureModel(VineModel):
 
 
 def random_templates(generator: np.random.Generator, n: int, attention: int, longest: int) -> Floats:
-    """Return the actions of n random templates, [n, attention + longest]; the last one, full braking, repeats."""
+    """Return the actions of n random templates, [n, attention + longest]. They end with full braking."""
     first, length = generator.integers(0, attention, n), generator.integers(1, longest + 1, n)
     between, before = random_actions(generator, n), random_actions(generator, n)
     before[generator.random(n) < FULL_BRAKE_SHARE] = -1.0
@@ -294,7 +293,7 @@ def random_templates(generator: np.random.Generator, n: int, attention: int, lon
 
 
 def random_actions(generator: np.random.Generator, n: int) -> Floats:
-    """Return n random actions; often full braking, full driving or coasting."""
+    """Return n random actions; full braking, full driving and coasting are likely."""
     kind = np.searchsorted(THEIR_SHARES, generator.random(n), side="right")
     uniform = generator.uniform(-1.0, 1.0, n)
     return np.where(kind < len(LIKELY_ACTIONS), np.append(LIKELY_ACTIONS, 0.0)[kind], uniform)

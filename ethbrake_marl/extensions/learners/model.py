@@ -1,4 +1,4 @@
-"""The loop of both algorithms: drive without exploration, try other actions at some visited decisions, learn."""
+"""The training loop of both algorithms: drive without exploration, try other actions at visited decisions, learn."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from ethbrake_marl.training.training import Training
 
 
 class BranchingModel(BaseAlgorithm):
-    """A model that drives all rows of ``environment`` with one deterministic policy. F: features, L: learners."""
+    """Model of an algorithm that drives all worlds with one deterministic policy. F: features, L: learners."""
 
     policy: Any  # a torch module
 
@@ -51,11 +51,11 @@ class BranchingModel(BaseAlgorithm):
 
     @abstractmethod
     def new_policy(self) -> nn.Module:
-        """Return the networks, whose weights depend on torch's generator."""
+        """Return new networks with random weights."""
 
     @abstractmethod
     def improve(self, seen: Any, states: Any) -> None:
-        """Learn from what ``collect`` returns."""
+        """Learn from the result of ``collect``."""
 
     def learn(
         self,
@@ -79,11 +79,11 @@ class BranchingModel(BaseAlgorithm):
         return self
 
     def collect(self, callback: BaseCallback) -> tuple[Any, Any]:
-        """Return the visited decisions of this update: observations [decisions L, F], and the states there."""
+        """Return the observations of the decisions visited in this update, [decisions L, F], and the states there."""
         return self.visit(callback, self.policy.act)
 
     def visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions; return as ``collect``."""
+        """Drive all worlds for ``n_steps`` decisions; return the same as ``collect``."""
         seen, states, every = [], [], np.arange(self.rows.n)
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
@@ -102,10 +102,9 @@ class BranchingModel(BaseAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
     def harm(self, state: State, count: str) -> Floats:
-        """Return the harm so far that each learner should make small, [n, L]."""
+        """Return the harm so far that each learner minimises, [n, L]."""
         return amounts(self.objectives, None, state, count)[:, self.game.rules.learners - 1]
 
     def drawn_steps(self, count: int) -> Ints:
-        """Draw for how many steps each of ``count`` tried actions lasts, [count]."""
         holds = np.array(self.recipe.holds, np.int64)
         return np.asarray(holds[torch.randint(len(holds), (count,)).numpy()])

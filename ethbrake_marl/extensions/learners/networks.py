@@ -1,4 +1,4 @@
-"""Networks whose trained policy uses a running average of their weights, and what they learn with. F: features."""
+"""Networks with a running average of their weights, which the trained policy uses, and their optimiser. F: features."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PARTS = ("weight", "bias")
 
 
 class Adam(torch.optim.Adam):
-    """Torch's Adam without the decorators of its methods, which import torch's compiler (1 to 3 CPU-s). Same bits."""
+    """Torch's Adam, with the same bits, without its decorators, which import torch's compiler (1 to 3 CPU-s)."""
 
 
 for _name in ("step", "add_param_group", "zero_grad", "state_dict", "load_state_dict"):
@@ -43,7 +43,7 @@ def linear_layers(network: nn.Sequential) -> list[nn.Linear]:
 
 
 class Averaged(nn.Module):
-    """A network ``learning``, and ``average``, the running average of its weights."""
+    """A network in training, ``learning``, and ``average``, a copy whose weights are its running average."""
 
     def __init__(self, average: nn.Sequential, learning: nn.Sequential, rate: float) -> None:
         super().__init__()
@@ -52,14 +52,13 @@ class Averaged(nn.Module):
         self.new_optimizer(rate)
 
     def new_optimizer(self, rate: float) -> None:
-        """Begin with a new optimiser. On a GPU its rate and counters are there, so that a CUDA graph can contain it."""
+        """Create the optimiser. On a GPU its rate and counters are tensors, so that a CUDA graph can contain it."""
         weights = [*self.learning.parameters()]
         on_gpu, device = weights[0].is_cuda, weights[0].device
         begin = torch.tensor(rate, device=device) if on_gpu else rate
         self.optimizer = Adam(weights, lr=begin, eps=1e-5, capturable=on_gpu)
 
     def descend(self, loss: Tensor, keep: float) -> Tensor:
-        """Make one step of the optimiser, let the average follow, and return the loss."""
         self.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self.optimizer.step()
@@ -74,12 +73,12 @@ class Averaged(nn.Module):
 
     @torch.no_grad()
     def best(self, observations: Float32s) -> Ints:
-        """Return the output of ``average`` with the highest score, [rows], for observations [rows, F]."""
+        """Return which output of ``average`` is largest, [rows], for observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observations)).argmax(dim=1).numpy()
         return chosen
 
     def weights(self, name: str) -> dict[str, Tensor]:
-        """Return the averaged weights: names as in a policy file, which begin with ``name``."""
+        """Return the averaged weights under their names in a policy file, which begin with ``name``."""
         linear = linear_layers(self.average)
         places = [f"{name}.{k}" for k in range(len(linear) - 1)] + [f"{name}.output"]
         layers = zip(places, linear, strict=True)
@@ -90,7 +89,7 @@ class Averaged(nn.Module):
 
 
 class Memory(nn.Module):
-    """The latest decisions, in buffers, which checkpoints save. ``columns``: name -> zeros like one entry."""
+    """The latest decisions, in buffers, which checkpoints store. ``columns``: name -> zeros shaped like one entry."""
 
     known: Tensor  # number of decisions stored so far; a new one replaces the oldest
 
@@ -102,7 +101,6 @@ class Memory(nn.Module):
         self.register_buffer("known", torch.zeros(1, dtype=torch.int64))
 
     def store(self, **arrays: NDArray[Any]) -> None:
-        """Store m decisions: name of a column -> [m, ...]."""
         m = len(next(iter(arrays.values())))
         places = torch.arange(int(self.known), int(self.known) + m) % self.size
         for name, array in arrays.items():

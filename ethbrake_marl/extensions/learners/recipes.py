@@ -50,7 +50,7 @@ class Range(FileModel):
 
 
 class BranchingRecipe(TrainingRecipe):
-    """Keys of both algorithms: they try actions at visited decisions, and play each branch to the end."""
+    """Keys of both algorithms, which try actions at visited decisions and simulate each branch to its end."""
 
     n_steps: int = Field(ge=1, description="number of decisions in each world between two updates")
     tried: int = Field(ge=1, description="number of decisions per update at which other actions are tried")
@@ -138,7 +138,7 @@ class ExpertsPlan(FileModel):
 
 
 class VineRecipe(BranchingRecipe):
-    """Recipe of vine: a higher and a lower action are tried, and the difference in return gives the gradient."""
+    """Recipe of vine: the difference in return between a higher and a lower action gives the gradient."""
 
     algorithm: Literal["vine"]
     start: Text | None = Field(
@@ -235,7 +235,6 @@ class RolloutClassificationRecipe(BranchingRecipe):
 
     @property
     def others(self) -> int:
-        """Number of choices, beside the policy's own, that are tried at a decision."""
         return 2 * len(self.near) + len(self.fixed) + self.drawn
 
     @model_validator(mode="after")
@@ -248,9 +247,9 @@ class RolloutClassificationRecipe(BranchingRecipe):
 
     @cached_property
     def members(self) -> tuple[Member, ...]:
-        """The policies that the key ``policies`` names; one that chooses among others stands for these.
+        """The policies in the key ``policies``. A policy that chooses among others is replaced by these.
 
-        Raises ``InvalidInput`` if one cannot be used, or if more choices are drawn than there are policies.
+        Raises ``InvalidInput`` if one cannot be used, or if ``drawn`` exceeds their number.
         """
         named = (named_policy(name, self.name, "policies") for name in self.policies)
         members = tuple(member for policy in named for member in members_of(policy))

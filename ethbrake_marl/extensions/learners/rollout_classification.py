@@ -32,7 +32,7 @@ LEAST_USUAL = 0.1  # m2/s2; least divisor of relative costs, for scenarios with 
 
 
 class TorchActor(Actor):
-    """The actor of a policy file with torch's matrices: three times as fast, equal but for rounding."""
+    """Actor of a policy file, computed with torch: three times as fast, equal except for rounding."""
 
     @torch.no_grad()
     def forward(self, layers: Layers, x: Float32s) -> Float32s:
@@ -46,7 +46,7 @@ class TorchActor(Actor):
 
 
 class Chooser(Averaged):
-    """Takes the choice with the highest score: first come trained policies, then actions from -1 to 1.
+    """Network that scores choices and takes the best: first come trained policies, then actions from -1 to 1.
 
     ``first`` is the number of the first action, full braking. The *extra cost* of a choice is its cost minus the cost
     of the cheapest choice tried at the same decision.
@@ -73,14 +73,13 @@ class Chooser(Averaged):
         return actions
 
     def act(self, observations: Float32s) -> Float32s:
-        """Return the actions for observations [rows, F], [rows]."""
         return self.take(self.best(observations), observations)
 
     def draw(self, batches: int, count: int, focus: float) -> Iterator[tuple[Tensor, Tensor]]:
-        """Draw ``count`` remembered decisions for each step of the optimiser: numbers and importances, [count] each.
+        """Draw ``count`` stored decisions for each gradient step: yield their numbers and importances, [count] each.
 
         The share ``focus`` is drawn in proportion to the largest extra cost, the others uniformly. The importance of a
-        decision, ``1 / (n p)`` with the probability p of drawing it from n, keeps the mean of the loss.
+        decision is ``1 / (n p)``, with the probability p of drawing it from n, so the mean of the loss stays the same.
         """
         known = len(self.memory)
         if focus == 0.0:
@@ -94,10 +93,10 @@ class Chooser(Averaged):
         yield from zip(rows.view(batches, count), importance.view(batches, count), strict=True)
 
     def loss(self, some: Tensor, importance: Tensor, guide: float) -> Tensor:
-        """Return the loss at remembered decisions: expected extra cost of a choice, plus ``guide`` times a convex term.
+        """Return the loss at stored decisions: the expected extra cost of a choice, plus ``guide`` times a convex term.
 
-        A choice has the probability softmax of the scores. Where one is close to 0 or 1, the gradient of the expected
-        cost nearly vanishes, but the convex term's does not: it lowers the score of every tried choice but the
+        A choice has the probability softmax of the scores. Where a probability is close to 0 or 1, the gradient of the
+        expected cost nearly vanishes, but the convex term's does not: it lowers the score of every tried choice but the
         cheapest, in proportion to its extra cost.
         """
         seen, tried, more = (self.memory.get_buffer(name)[some] for name in ("seen", "tried", "more"))
@@ -116,7 +115,7 @@ class RolloutClassificationModel(BranchingModel):
     recipe: RolloutClassificationRecipe
 
     def new_policy(self) -> nn.Module:
-        """Return the network. At first it takes choice 0: the first policy or, without policies, full braking."""
+        """Return a network that takes choice 0 at first: the first policy or, without policies, full braking."""
         return Chooser(self.features, self.recipe, len(self.scenario.members) or 1)
 
     @property
@@ -145,7 +144,7 @@ class RolloutClassificationModel(BranchingModel):
         self.logger.record("train/loss", float(np.mean(losses)))
 
     def choices_at(self, seen: Float32s) -> Ints:
-        """Return the choices to try at decisions with the observations ``seen`` [B, F], [B, C]; its own one first."""
+        """Return the choices to try for observations ``seen`` [B, F], [B, C]; the network's own one first."""
         recipe, chooser = self.recipe, self.policy
         first, last, count = chooser.first, recipe.network.choices - 1, len(seen)
         own = chooser.best(seen)
@@ -163,10 +162,10 @@ class RolloutClassificationModel(BranchingModel):
         return np.stack(tried, axis=1)
 
     def try_choices(self, seen: Float32s, states: State) -> tuple[Ints, Ints, Floats]:
-        """Try C choices at B visited decisions: play a branch to the end after each.
+        """Try C choices at B visited decisions, each in a branch that is simulated to the end.
 
-        Returns the numbers of the decisions, [B], the choices, [B, C], and their costs, [B, C]. The cost is minus the
-        return from there on; the recipe's keys ``tie_break``, ``caution`` and ``relative`` change it.
+        Returns the numbers of the decisions, [B], the choices, [B, C], and their costs, [B, C]: minus the return,
+        changed by the recipe's keys ``tie_break``, ``caution`` and ``relative``.
         """
         recipe, chooser, learners = self.recipe, self.policy, self.learners
         alive = np.flatnonzero(moving(states).repeat(learners))
@@ -205,9 +204,10 @@ class RolloutClassificationModel(BranchingModel):
         return rows, tried, costs
 
     def usual_costs(self, numbers: Ints, least: Floats) -> Floats:
-        """Update the running mean of the least cost in each scenario of a mixture; return it for each decision, [B].
+        """Update each scenario's running mean of the least cost; return it for each decision, [B].
 
-        ``numbers`` [B]: worlds of the decisions. ``least`` [B]: costs of the cheapest choices.
+        ``numbers`` [B]: numbers of the worlds, which decide the scenario in a mixture. ``least`` [B]: costs of the
+        cheapest choices.
         """
         known, back = np.unique(numbers, return_inverse=True)
         member = member_numbers(self.scenario, known, self.recipe.seed, "training")[back]

@@ -1,4 +1,4 @@
-"""Trained policies in a new training, which may observe more features: to start from, or to choose among."""
+"""Trained policies in a new training, which may observe more features: as its start, or as choices."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Member(NamedTuple):
 
 
 def members_of(policy: Policy) -> list[Member]:
-    """Return the policies among which a policy chooses, or its own actor."""
+    """Return the policies among which ``policy`` chooses; if it does not choose, only itself."""
     features, network = tuple(policy.observation.names), policy.manifest.network
     parts = {f"among_{m}.": member for m, member in enumerate(network.among, 1)} or {"": network}
     return [
@@ -40,10 +40,10 @@ def members_of(policy: Policy) -> list[Member]:
 
 
 def named_policy(name: str, recipe: str, key: str) -> Policy:
-    """Return the policy that a name for ``--agents`` stands for: ``ppo``, ``policy@runs/mine``.
+    """Return the policy of an agent's name such as ``ppo`` or ``policy@runs/mine``.
 
-    ``recipe`` and its ``key`` are for messages. Raises the errors of ``make_agent``, and ``InvalidInput`` for an agent
-    that is no policy.
+    ``recipe`` and its ``key`` are for error messages. Raises the errors of ``make_agent``, and ``InvalidInput`` for an
+    agent that is no policy.
     """
     driver = make_agent(name)
     if not isinstance(driver, LearnedAgent):
@@ -52,7 +52,7 @@ def named_policy(name: str, recipe: str, key: str) -> Policy:
 
 
 def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
-    """Return the weights of ``policy`` for the networks ``wanted``, which observe ``features``.
+    """Return the weights of ``policy`` for a network ``wanted`` that observes ``features``.
 
     Raises ``InvalidInput`` for a mixture of experts, for other layers, and for a feature that is not observed.
     """
@@ -72,9 +72,9 @@ def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], 
 
 
 def widened(member: Member, features: Sequence[str], recipe: str, key: str) -> dict[str, Float32s]:
-    """Return the weights of a policy that observes ``features``, and does not use those that it did not know.
+    """Return a policy's weights for observations ``features``, with weight 0 for those that it did not know.
 
-    Raises ``InvalidInput`` if the training does not observe a feature that the policy needs.
+    Raises ``InvalidInput`` if ``features`` lack one that the policy needs.
     """
     missing = [name for name in member.features if name not in features]
     if missing:

@@ -59,7 +59,7 @@ class Branches(NamedTuple):
 
 
 class Tried(NamedTuple):
-    """B decisions at which a higher and a lower action were tried."""
+    """Results at B decisions at which a higher and a lower action were tried."""
 
     seen: Tensor  # [B, F] observations
     mean: Tensor  # [B] output of the actor, not clipped
@@ -80,7 +80,7 @@ class VineModel(BranchingModel):
         self.train_actor(self.policy, self.try_out(seen, states, self.policy))
 
     def try_out(self, seen: Float32s, states: State, policy: Actor) -> Tried:
-        """Draw visited decisions; play a branch with a higher and one with a lower action than the policy's."""
+        """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's."""
         branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
         gained, moved = self.play(states, branches, policy)
         own = seen[branches.decisions(self.learners)]
@@ -95,9 +95,9 @@ class VineModel(BranchingModel):
         return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
 
     def play(self, states: State, branches: Branches, policy: Actor) -> tuple[Floats, Floats]:
-        """Play branches to the end; return what their learners gained, and by how much their actions were moved, [2B].
+        """Simulate branches to the end; return their learners' returns, and how far actions were moved, [2B] each.
 
-        An action stays in [-1, 1], so it may move by less than ``size``. The steps are summed.
+        An action stays in [-1, 1], so it may move by less than ``size``. Moves are summed over the steps.
         """
         world, learner, size, steps = branches
         moved, longest = np.zeros(len(size)), int(steps.max(initial=0))
@@ -116,7 +116,7 @@ class VineModel(BranchingModel):
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
-        """Return the gradient at each decision, [B] float32, from the returns and moves of two branches each, [2B]."""
+        """Return the gradient at each decision, [B] float32, from the returns and moves of its two branches, [2B]."""
         (up, down), (higher, lower) = gained.chunk(2), moved.chunk(2)
         measured = (up - down) / (higher - lower)
         gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)

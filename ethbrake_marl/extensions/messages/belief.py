@@ -1,4 +1,4 @@
-"""What one vehicle believes: the state as its messages and sensors tell it."""
+"""What one vehicle believes: the state of the line according to its messages and sensors."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ LOOK_AHEAD = ("place", "speed", "braking_capacity", "latency", "mass")  # pieces
 
 
 def known_pieces(state: State, observer: int) -> Bools:
-    """Return whether the body ``observer`` knows each of ``PIECES`` of each body, [n, N + 1, PIECES].
+    """Return whether the body ``observer`` knows each quantity in ``PIECES`` of each body, [n, N + 1, PIECES].
 
-    It knows what the other's messages contain, the intent only once a message has come; and place, speed and
+    It knows what the messages of a vehicle contain, its intent only after the first message; and place, speed and
     acceleration of a neighbour in sight. Of itself and of the obstacle it knows everything.
     """
     memory: Memory = state.memories[NAME]
@@ -72,10 +72,10 @@ def known_pieces(state: State, observer: int) -> Bools:
 
 
 def believed(state: State, observer: int) -> State:
-    """Return the state as the body ``observer`` believes it. What it does not know is NaN, but for gaps.
+    """Return the state as the body ``observer`` believes it. What it does not know is NaN, except gaps.
 
-    Old news is moved on to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which it knows
-    nothing. ``wanted`` holds the newest intents. Gaps add up to the distances of bodies with a known place.
+    Old samples are moved on to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which it
+    knows nothing. ``wanted`` has the newest intents. Gaps add up to the distances of bodies with a known place.
     """
     known = known_pieces(state, observer)
     news = newest(state, observer)
@@ -91,9 +91,9 @@ def believed(state: State, observer: int) -> State:
 
 
 def believed_whole(state: State, observer: int) -> State:
-    """Return what the body ``observer`` believes of bodies that it can predict, as if it did not know the others.
+    """Return the state as the body ``observer`` believes it, without the vehicles that it cannot predict.
 
-    It can predict a body of which it knows all pieces but the intent.
+    It can predict a vehicle of which it knows all quantities but the intent.
     """
     known = known_pieces(state, observer)
     line, whole = estimated(state, observer, known, newest(state, observer)), known[:, :, :P_INTENT].all(axis=2)
@@ -107,9 +107,9 @@ def _known_if(state: State, observer: int, holds: Bools) -> Floats:
 
 
 def ages_s(state: State) -> Floats:
-    """Return the age of the newest sample that i has of j, [n, N + 1, N + 1] s; infinite: it has none.
+    """Return the age of the newest sample that i has of j, [n, N + 1, N + 1] s; infinite if it has none.
 
-    Without periodic messages it is 0: what is known is the present state. i uses it from ``state.know`` on.
+    It is 0 without periodic messages, because then i knows the present state, from ``state.know`` on.
     """
     memory: Memory = state.memories[NAME]
     if not memory.is_periodic:
@@ -127,9 +127,10 @@ def require_pieces(
     needs: Sequence[str] = LOOK_AHEAD,
     senders: Sequence[int] | None = None,
 ) -> None:
-    """Raise ``InvalidInput`` if messages lack a piece that ``who``, who drives ``observers``, needs of ``senders``.
+    """Raise ``InvalidInput`` if messages lack a quantity that ``who``, the agent of ``observers``, needs.
 
-    ``senders`` None: all vehicles. Who drives several vehicles needs messages of them, too.
+    ``needs``: the quantities. ``senders``: vehicles whose messages are needed; None: all. An agent of several vehicles
+    needs their messages, too.
     """
     senders = range(1, state.vehicles + 1) if senders is None else senders
     for sender in senders if NAME in state.memories else ():

@@ -1,4 +1,4 @@
-"""How a scenario declares messages: the keys ``persistence`` and ``tells`` of ``v2x``."""
+"""The keys ``persistence`` and ``tells`` of a scenario's ``v2x``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _LISTED = {"type": "array", "items": {"enum": list(PIECES)}, "uniqueItems": True
 
 
 class Messages:
-    """The extension that the keys declare."""
+    """Extension that the keys ``persistence`` and ``tells`` of ``v2x`` switch on."""
 
     name = "messages"
     schemas: Mapping[str, dict[str, Any]] = {
@@ -70,7 +70,7 @@ class Messages:
         return read if by_name else read[""]
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Return the keys that later messages use; refuse keys that have no effect."""
+        """Return the keys of ``v2x`` that messages after the first use. Raises an error for keys without effect."""
         tells = _value(v2x, "tells")
         right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
         sent = v2x.hears != "none" and v2x.timing != "latency"
@@ -80,11 +80,11 @@ class Messages:
         return ("message_period_s", "loss_begins", "loss_ends") if _is_periodic(v2x) else ()
 
     def is_random(self, v2x: V2X) -> bool:
-        """May messages after the first be lost?"""
+        """Return whether messages after the first may be lost."""
         return _is_periodic(v2x) and v2x.loss_begins > 0.0
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse contents of unknown vehicles, and a delay of too many time steps."""
+        """Raise an error for contents of unknown vehicles, and for a delay of too many time steps."""
         v2x, tells = scenario.v2x, _value(scenario.v2x, "tells")
         for name in tells if isinstance(tells, Mapping) else ():
             right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
@@ -128,7 +128,7 @@ def _kept(scenario: Scenario) -> int:
 
 
 def _contents(scenario: Scenario) -> Bools:
-    """Return whether messages of each vehicle contain each piece, [N, PIECES]."""
+    """Return whether each vehicle's messages contain each quantity, [N, PIECES]."""
     tells = _value(scenario.v2x, "tells")
     each = (
         tells

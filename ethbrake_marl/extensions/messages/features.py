@@ -1,4 +1,4 @@
-"""Features of a neighbour that messages bring: ``age``, ``intent``, and ``PIECE_known`` for each piece of a message."""
+"""Features of a neighbour from its messages: ``age``, ``intent``, and ``PIECE_known`` for each of their quantities."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ethbrake_marl.registry import Part
 
 
 def age(state: State, body: int, other: int) -> Floats:
-    """Age of the newest state received from the neighbour; 0 if its present state is known."""
+    """Age of the newest sample received from the neighbour; 0 if its present state is known."""
     if NAME not in state.memories:
         return np.zeros(state.n)
     ages = ages_s(state)[:, body, other]

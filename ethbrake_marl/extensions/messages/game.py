@@ -1,4 +1,4 @@
-"""A game with messages: vehicles observe, and scripts act on, what they believe."""
+"""A game with messages: vehicles observe what they believe, and scripts act on it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ NEEDS = {  # feature of a neighbour -> pieces without which it reads 0
 
 
 class GameWithMessages(Game):
-    """A game whose states hold the ``Memory`` of messages."""
+    """A game whose states contain the ``Memory`` of messages."""
 
     __slots__ = ()
 
@@ -62,7 +62,6 @@ class GameWithMessages(Game):
         return _remembering(state, begin(alert, state.time_s, self.rules.time_step_s))
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """The memory of ``state`` is not reused."""
         after, step = super().follow(state, actions)
         return believed_after(state, after), step
 
@@ -70,7 +69,7 @@ class GameWithMessages(Game):
         return {body: believing(agent) for body, agent in drivers.items()}
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Return of whom vehicle ``body`` does not know everything at its first decision, [n, N + 1]."""
+        """Return which vehicles the vehicle ``body`` does not fully know at its first decision, [n, N + 1]."""
         memory: Memory = alert.memories[NAME]
         unseen = memory.seen_s[:, body] > alert.car[:, LATENCY, body, np.newaxis]
         lacks = ~memory.contents[:, :, [P_BRAKING, P_LATENCY, P_MASS]].all(axis=2)
@@ -80,8 +79,8 @@ class GameWithMessages(Game):
     def own_infos(self, state: State) -> dict[str, Any]:
         """Return the infos of messages, and those of the shield.
 
-        ``known_from_s_vehicle_2`` is the time from which a vehicle acts on news of Vehicle 2 (s), ``age_s_vehicle_2``
-        the age of its newest news with periodic messages (s); infinite: never, none.
+        ``known_from_s_vehicle_2``: time from which a vehicle acts on news of Vehicle 2 (s; infinite: never).
+        ``age_s_vehicle_2``: age of its newest sample of Vehicle 2, with periodic messages (s; infinite: none).
         """
         infos = super().own_infos(state)
         reports = {"known_from_s": state.know}
@@ -101,7 +100,7 @@ def _remembering(state: State, memory: Memory) -> State:
 
 
 def believing(agent: Any) -> Any:
-    """Return an agent that sees what its vehicle believes, if it is one that knows sensors and messages."""
+    """Return an agent that receives what its vehicle believes, if the agent uses only sensors and messages."""
     view = agent.policy.observation if isinstance(agent, LearnedAgent) else getattr(agent, "observation", None)
     if isinstance(agent, LearnedAgent | PolicyAgent):
         return replace(agent, observation=believed_view(view))
@@ -114,9 +113,9 @@ def believed_view(view: View) -> BelievedView:
 
 
 class BelievedView(View):
-    """A view of what the observer believes. A feature reads 0 if it needs a piece that the observer does not know.
+    """A view of what the observer believes. A feature is 0 if it needs a quantity that the observer does not know.
 
-    Groups of other packages see a body only if the observer knows all pieces but its intent.
+    Feature groups of other packages show a vehicle only if the observer knows all of its quantities but the intent.
     """
 
     def __init__(self, view: View) -> None:
@@ -148,7 +147,7 @@ class BelievedView(View):
 
 
 class PieceView(View):
-    """A view that replaces NaN, for lack of a piece, by a feature's value for an unknown neighbour."""
+    """A view that replaces NaN, for a quantity not received, by the feature's value for an unknown neighbour."""
 
     @cached_property
     def plan(self) -> Plan:
@@ -180,7 +179,8 @@ class Believer:
     def begin(self, alert: State, body: int) -> Any:
         """Begin the script. Raises ``InvalidInput`` if it will not know what it needs.
 
-        A script may have ``needs_ahead``: pieces of a message that it needs of the vehicle ahead, until it sees it.
+        A script may have ``needs_ahead``: quantities of the vehicle ahead that messages must contain until it is in
+        sight.
         """
         needs = getattr(self.script, "needs_ahead", ())
         if needs and body > 1 and np.isinf(alert.memories[NAME].seen_s[:, body, body - 1]).any():

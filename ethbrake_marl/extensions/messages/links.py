@@ -1,4 +1,4 @@
-"""What goes over the links: samples of all vehicles, which message arrives when, and where its sender may be now.
+"""Messages on the links between vehicles: their samples, which message arrives when, and where its sender may be now.
 
 A vehicle samples itself at the alert and at every decision, also at those before the first one. On each link a message
 is sent once per period, and used after a delay; it contains the newest sample of its sender. A link is good or bad
@@ -66,7 +66,7 @@ ON_GRID = 1e-9  # two moments that are closer are the same (s)
 
 
 class Memory(NamedTuple):
-    """What the vehicles of n worlds have sent and received. In arrays of links, [.., i, j] is what i receives of j."""
+    """What the vehicles of n worlds have sent and received. In arrays of links, [.., i, j] is what i has of j."""
 
     contents: Bools  # [n, N + 1, PIECES] whether messages of a body contain the piece
     heard_s: Floats  # [n, N + 1, N + 1] when the first message can be used (s); infinite: never
@@ -78,17 +78,17 @@ class Memory(NamedTuple):
 
     @property
     def is_periodic(self) -> bool:
-        """What is known may be old."""
+        """Whether messages are periodic, so that known values may be old."""
         return self.samples.shape[1] > 0
 
 
 def samples_kept(delay_s: float, time_step_s: float) -> int:
-    """Return how many samples must be kept so that every message in time contains one: those of a delay, and three."""
+    """Return how many samples to store so that every message finds its own: those of one delay, and three more."""
     return math.ceil(delay_s / time_step_s - ON_GRID) + 3
 
 
 def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, kept: int) -> Memory:
-    """Return the memory at the alert, before anything is sent. ``contents`` is [N, PIECES], times are [n, N, N]."""
+    """Return the memory at the alert, before any message. ``contents`` is [N, PIECES], times are [n, N, N]."""
     n, N = heard_s.shape[:2]
     whole = np.ones((n, N + 1, len(PIECES)), np.bool_)
     whole[:, 1:] = contents
@@ -102,9 +102,9 @@ def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, ke
 
 
 def present(state: State) -> Floats:
-    """Return the sample of all bodies now, [n, SAMPLE_ROWS, N + 1]; places are relative to Vehicle 1.
+    """Return the sample that each body would send now, [n, SAMPLE_ROWS, N + 1]; places are relative to Vehicle 1.
 
-    The intent of a vehicle is its last command. Before it knows of the alert, it has none: 0.
+    The intent of a vehicle is its last command; 0 before it knows of the alert.
     """
     sample = np.zeros((state.n, SAMPLE_ROWS, state.vehicles + 1))
     latency, time = state.car[:, LATENCY], state.time_s[:, np.newaxis]
@@ -116,9 +116,9 @@ def present(state: State) -> Floats:
 
 
 def begin(alert: State, start_s: Floats, time_step_s: float) -> Memory:
-    """Return the memory at the first decision, ``start_s`` [n]: with what has been received since the alert.
+    """Return the memory at the first decision, ``start_s`` [n], with what has been received since the alert.
 
-    ``alert.wanted`` is commanded until then.
+    Until then vehicles execute ``alert.wanted``.
     """
     memory, line = _own(alert.memories[NAME]), alert.line.copy()
     force = np.where(alert.car[:, LATENCY] <= 0.0, alert.wanted, 0.0)
@@ -147,7 +147,7 @@ def _own(memory: Memory) -> Memory:
 
 
 def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
-    """Return the state at ``until_s`` [n], and the way of Vehicle 1, [n] m: what the gap to a post ahead loses."""
+    """Return the state at ``until_s`` [n], and the way of Vehicle 1, [n] m: how much nearer a fixed post is."""
     line = state.line.copy()
     line[line[:, GAP, 0] >= FAR_M, GAP, 0] = POST_M
     after = advanced(state._replace(line=line), until_s)
@@ -155,7 +155,7 @@ def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
 
 
 def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:
-    """Add the sample of the worlds ``rows`` now, ``way_m`` after the last one, and receive what arrives; in place."""
+    """Add a sample of the worlds ``rows`` and receive what arrives, in place. ``way_m``: way since the last sample."""
     sample, samples = present(state), memory.samples
     sample[:, PLACE, 1:] += (samples[:, 0, PLACE, 1] + way_m)[:, np.newaxis]
     sample[:, PLACE, 0] = samples[:, 0, PLACE, 0]
@@ -183,7 +183,7 @@ def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats
 
 @large
 def receive_worlds(rows, time, channel, seen, samples, links, news):
-    """Receive all messages that can be used by ``time``, and measure who is in sight, in the worlds ``rows``."""
+    """Receive all messages that can be used by ``time``, and measure vehicles in sight, in the worlds ``rows``."""
     bodies = news.shape[3]
     for k in range(len(rows)):
         for link in range(bodies * bodies if rows[k] else 0):
@@ -204,7 +204,7 @@ def receive_worlds(rows, time, channel, seen, samples, links, news):
 
 @kernel
 def take_sample(samples, news, i, j, sent, rows):
-    """Let i receive the newest sample of j that is not after ``sent`` (s): all its rows, or those that are measured."""
+    """Copy to i's news the newest sample of j from ``sent`` (s) or before: the first ``rows`` rows of it."""
     for s in range(samples.shape[0]):
         if samples[s, AT, j] <= sent + ON_GRID:
             for row in range(rows):
@@ -214,7 +214,7 @@ def take_sample(samples, news, i, j, sent, rows):
 
 @kernel
 def chance(key, link, number):
-    """Return the number in [0, 1) that decides whether message ``number`` of a link is lost: a SplitMix64 hash."""
+    """Return the random number in [0, 1) that decides whether a message is lost: a SplitMix64 hash."""
     z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
     z ^= np.uint64(number + 1.0) * np.uint64(0xD1342543DE82EF95)
     for _ in range(2):
@@ -226,9 +226,9 @@ def chance(key, link, number):
 
 @kernel
 def moved_on(speed, force, limit, duration):
-    """Return a vehicle's speed (m/s) and way (m) after ``duration`` (s) without contact, under a constant force.
+    """Return a vehicle's speed (m/s) and way (m) after ``duration`` (s) under a constant force, without contact.
 
-    One that moves backward brakes until it is at rest, whatever the sign of its force.
+    A vehicle that moves backward brakes to rest, whatever the sign of its force.
     """
     if speed >= 0.0:
         after, way, _ = solo(speed, force, 0.0, limit, duration)
@@ -240,12 +240,12 @@ def moved_on(speed, force, limit, duration):
 
 @large
 def estimate_worlds(observer, time, limit, known, news, aged, line, place, fresh):
-    """Write lines as the body ``observer`` estimates them to ``line``, which holds the true ones.
+    """Overwrite ``line``, the true one, by the line as the body ``observer`` estimates it.
 
-    From the newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], it goes on with the same force and without
-    contact. Between two samples of now the gap is the true one. A place that is not ``known`` [n, N + 1, PIECES] is
-    the place of the next body towards the observer; an unknown speed or force is 0. If news may be old (``aged``), the
-    observer knows of no impact between others.
+    From the newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], it continues with the same force and without
+    contact. Between two samples of the present the gap is the true one. A place that is not ``known`` [n, N + 1,
+    PIECES] is the place of the next body towards the observer; an unknown speed or force is 0. If news may be old
+    (``aged``), the observer knows of no impact between others.
     """
     bodies = line.shape[2]
     for k in range(len(time)):

@@ -20,8 +20,8 @@ times are in s after it.
 - ``lack``: smallest amount (m/s2) by which the command until ``end`` differs from the extreme command.
 - ``floor``: known lower bound on the harm of the pair that does not have the first contact (m2/s2).
 - ``best``: smallest harm that the search has reached so far (m2/s2).
-- ``enough``: lower bound on the harm that is proven in another way (m2/s2). A function returns 0 if the harm that it
-  proves for some first contact is not above ``enough``.
+- ``enough``: lower bound on the harm that is proven in another way (m2/s2). A function may return 0 if its own bound
+  would not be above ``enough``.
 - ``cells``: memory for the search of ``branch_and_bound``, [CELLS, CELL_COLUMNS], overwritten; a row is a set of first
   contacts.
 """

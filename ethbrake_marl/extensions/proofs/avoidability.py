@@ -3,8 +3,7 @@
 The *largest trajectory* is farther ahead at every time than any other that stays behind the front vehicle. Contact with
 the rear vehicle can be avoided if and only if the rear vehicle stays behind the largest trajectory.
 
-docs/internals/proofs/avoidable-contact.md derives every formula. They use only + - * / and sqrt, so they give the same
-bits on every machine.
+docs/internals/proofs/avoidable-contact.md derives every formula.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ PROVEN_FOR = "4afc99e9cbbec014"  # digest of the physics; docs/internals/model.m
 
 
 class Avoidability(NamedTuple):
-    """Verdict on each of ``n`` worlds: can the controlled vehicle avoid all contact?"""
+    """Whether the controlled vehicle can avoid all contact, in each of ``n`` worlds, and how."""
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
     # full braking leads to contact with the front vehicle. 3, rear: the rear vehicle reaches the largest trajectory.
@@ -68,7 +67,7 @@ class Avoidability(NamedTuple):
 
     @property
     def avoidable(self) -> Bools:
-        """Some commands avoid all contact, and therefore every impact, [n]."""
+        """Whether some commands avoid all contact, and therefore every impact, [n]."""
         return np.asarray(self.reason == AVOIDABLE)
 
     @property
@@ -95,7 +94,7 @@ def spare_gap(gap, v_l, a_l, v_f, a_f):
 def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
     """Return how long (s) a vehicle can drive with ``u`` before it must brake fully to stay behind the braking leader.
 
-    Also the time at which the gap becomes 0 (s), and whether both still move then: if so, ``a_f > a_l`` and both are
+    Also return when the gap becomes 0 (s), and whether both vehicles still move then: if so, ``a_f > a_l`` and they are
     equally fast; otherwise the follower comes to rest behind the standing leader. Both times are infinite if the
     follower never moves. Requires ``spare_gap >= 0``.
     """
@@ -121,7 +120,7 @@ def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
 
 @large
 def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
-    """``drive_before_braking`` of a follower with the speed limit ``limit`` (m/s)."""
+    """Return the same as ``drive_before_braking``, for a follower with the speed limit ``limit`` (m/s)."""
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         drive, touch, moving = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
@@ -150,13 +149,13 @@ def lowest_while_coasting(at):
 
 @kernel
 def met(gap, closing):
-    """Has or had a pair with this gap (m) and closing speed (m/s) an impact?"""
+    """Return whether a pair with this gap (m) and closing speed (m/s) has or had an impact."""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > TOUCH_MPS)
 
 
 @kernel
 def plan_behind(at, ahead, v_l, out):
-    """Return the plan of the largest trajectory, and write the columns DRIVE, TOUCH and FOLLOW.
+    """Return the plan (``plans``) of the largest trajectory, and write the columns DRIVE, TOUCH and FOLLOW of ``out``.
 
     The vehicle drives as hard as it can, then brakes fully, then follows the front vehicle, which is ``ahead`` (m) at
     the start and has the speed ``v_l`` (m/s).
@@ -170,9 +169,9 @@ def plan_behind(at, ahead, v_l, out):
 
 @large
 def decide(at, out):
-    """Write the verdict on one world to ``out`` [VERDICT].
+    """Write whether one world's contact is avoidable to ``out`` [VERDICT].
 
-    Its columns: REASON; MARGIN (m); SPARE, what full braking leaves of the gap ahead (m); DRIVE and TOUCH, end of the
+    Its columns: REASON; MARGIN (m); SPARE, the gap ahead that full braking leaves (m); DRIVE and TOUCH, end of the
     drive and of the full braking after it (s after the *start*, from which the vehicle may act); FOLLOW, the command
     after that (m/s2).
     """
@@ -212,7 +211,6 @@ def decide(at, out):
 
 @large
 def decide_worlds(rows, out):
-    """``rows`` [n, COLUMNS] -> ``out`` [n, VERDICT]."""
     for k in range(len(out)):
         decide(rows[k], out[k])
 
@@ -220,9 +218,9 @@ def decide_worlds(rows, out):
 def avoidability(state: State, body: int = 2) -> Avoidability:
     """Decide for every world whether the vehicle ``body`` (1: Vehicle 1) can avoid all contact from now on.
 
-    If not, all its commands lead to contact, but not always to an impact (``LowerBound.impact_proven``). Proven for
-    Vehicle 2 of three and for either of two vehicles; all others brake fully from their latencies on. An overlap of at
-    most 1e-12 m in the computed motion is a rounding error, not contact.
+    If it cannot, all its commands lead to contact, but not always to an impact (``LowerBound.impact_proven``). Proven
+    for Vehicle 2 of three vehicles and for either of two; all others brake fully from their latencies on. An overlap of
+    at most 1e-12 m in the computed motion is a rounding error, not contact.
 
     Raises ``InvalidInput`` under other physics than ``PROVEN_FOR``, for any other line, if brakes build up, if the
     front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if Vehicle 1
@@ -240,7 +238,9 @@ def avoidability(state: State, body: int = 2) -> Avoidability:
 
 
 def _check_covered(state: State, body: int) -> None:
-    """An obstacle that Vehicle 1 does not reach under full braking is allowed: only a push could bring it there, and a
+    """Raise ``InvalidInput`` unless the proof covers these worlds.
+
+    An obstacle that Vehicle 1 does not reach under full braking is allowed: only a push could bring it there, and a
     push begins with an impact.
     """
     check_exact(state, "a proof")

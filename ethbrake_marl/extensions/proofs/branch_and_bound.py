@@ -28,10 +28,10 @@ CELL_COLUMNS = 5
 
 @large
 def gentlest_between(kind, at, early, late):
-    """Return the smallest closing speed (m/s) of first contacts between ``early`` and ``late``.
+    """Return a lower bound (m/s) on the closing speed of first contacts between ``early`` and ``late``.
 
-    It falls with the time, with one exception: a leader that brakes harder than the controlled vehicle lets it rise by
-    at most the difference of the braking capacities in each second.
+    The smallest closing speed falls with the time, with one exception: if the leader brakes harder than the controlled
+    vehicle, it rises by at most the difference of the braking capacities in each second.
     """
     least = gentlest(kind, at, late)[0]
     if kind == FRONT_FIRST and at[A_L] > at[A_F] and early * at[A_L] < at[V_L]:
@@ -41,9 +41,9 @@ def gentlest_between(kind, at, early, late):
 
 @kernel
 def decision_around(at, early, late):
-    """Return start and end (s) of the decision step that contains both ``early`` and ``late``.
+    """Return start and end (s) of the decision step that contains both times, ``early`` and ``late`` (s).
 
-    Twice ``late`` if there are no decision steps, or if the two lie in different ones.
+    If there is none, or if commands may change at any time, return ``late`` twice.
     """
     step = at[TIME_STEP]
     if step <= 0.0:
@@ -99,7 +99,7 @@ def put(kind, at, floor, cells, count, least, early, late, soft, hard):
 
 @kernel
 def lowest(cells, count):
-    """Return the row of the cell with the smallest bound, and this bound; without cells it is infinite."""
+    """Return the row of the cell with the smallest bound, and this bound; infinite without cells."""
     row = 0
     for k in range(1, count):
         if cells[k, HARM] < cells[row, HARM]:
@@ -111,7 +111,7 @@ def lowest(cells, count):
 def divide(kind, at, floor, count, row, cells):
     """Split the cell in ``row`` into two halves.
 
-    Returns the new number of cells, and the bound (m2/s2) for one first contact in the cell; the smallest bound of all
+    Return the new number of cells, and the bound (m2/s2) for one first contact in the cell; the smallest bound of all
     first contacts is at most this.
     """
     cell = cells[row]
@@ -138,9 +138,7 @@ def divide(kind, at, floor, count, row, cells):
 
 @large
 def least_harm(kind, at, first, last, floor, best, enough, cells):
-    """Return a lower bound (m2/s2) on the harm of every first contact from ``first`` to ``last`` (s), or ``best`` if
-    that is smaller.
-    """
+    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s)."""
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)
         closing = gentlest(kind, at, time)[0]
@@ -166,7 +164,7 @@ def least_harm(kind, at, first, last, floor, best, enough, cells):
 
 @kernel
 def next_split(kind, at, time, last):
-    """Return when (s) after ``time`` the next decision is due or the front vehicle comes to rest; at most ``last``."""
+    """Return the next time (s) of a decision or of the front vehicle's standstill after ``time``; at most ``last``."""
     until = last
     if at[TIME_STEP] > 0.0:
         until = min(until, (math.floor(time / at[TIME_STEP] + 1e-6) + 1.0) * at[TIME_STEP])

@@ -39,7 +39,7 @@ def flight_lead(pair, opening, flight):
 
 @kernel
 def best_flight(pair, opening):
-    """Return the duration (s) of the flight (time apart, with ``opening`` m/s at its begin) with the largest lead (m).
+    """Return the duration (s) of the flight with the largest lead among those that begin with ``opening`` (m/s).
 
     Infinite if a longer flight always has a larger lead.
     """
@@ -62,7 +62,7 @@ def best_flight(pair, opening):
 def lead(pair, opening, shortest, longest, lost):
     """Return the largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
-    The maximum over all opening speeds up to ``opening``: a smaller one may lead to more if the time is limited.
+    It is the maximum over all opening speeds up to ``opening``: with a limited time, a smaller one may lead to more.
     """
     share, press, reach, _ = pair
     if press <= 0.0:
@@ -81,9 +81,9 @@ def lead(pair, opening, shortest, longest, lost):
 
 @kernel
 def decays(pair):
-    """Return False if the vehicle may gain speed by accelerating less now and bouncing more strongly later.
+    """Return whether ``reach`` limits the speed that the vehicle can gain in any flight.
 
-    If True, ``reach`` limits the speed that the vehicle can gain in any flight.
+    False if the vehicle may gain speed by accelerating less now and bouncing more strongly later.
     """
     share, press, reach, bounce = pair
     if share <= 0.5:
@@ -132,8 +132,8 @@ def widest_flight(share, slack, press, drive, bounce, closing, back, time):
 
     p is the speed (m/s) at which vehicle and partner separate, s the gap (m) between them. Holds for ``time`` seconds;
     infinite if no bound is known. ``slack``: braking capacity of the partner minus the vehicle's (m/s2). ``drive``: the
-    largest acceleration that the vehicle can command (m/s2). ``closing``: closing speed of the first impact, ``back``:
-    backward speed of the vehicle after it (m/s).
+    vehicle's largest acceleration (m/s2). ``closing``: closing speed of the first impact (m/s). ``back``: backward
+    speed of the vehicle after it (m/s).
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:
         return math.inf

@@ -80,19 +80,18 @@ def least_closing(line, pair, opening, lost, late, end, until):
 
 @kernel
 def rear_after(at, early):
-    """Return how far (m) the rear vehicle is behind the leader at ``early``, its speed (m/s), and its onset (s) after
-    ``early``.
-    """
+    """Return the rear vehicle's distance to the leader (m) and speed (m/s) at ``early``, and its onset (s after it)."""
     speed, way = follower(at, early)
     return max(at[GAP_L] + at[GAP_R] + leader(at, early)[1] - way, 0.0), speed, max(at[ONSET_R] - early, 0.0)
 
 
 @large
 def pushed_by_leader(at, early, late, closing, end, lack):
-    """Return the smallest closing speed (m/s) of the rear pair after a first contact with the leader; 0: none proven.
+    """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with the leader.
 
-    From the centre of mass of leader and controlled vehicle. If the leader is at rest at ``early``, a later first
-    contact leads to the same motion at a later time, so ``late``, ``end`` and ``lack`` do not matter.
+    It follows from the motion of the centre of mass of leader and controlled vehicle; 0: none proven. If the leader is
+    at rest at ``early``, a later first contact leads to the same motion at a later time, so ``late``, ``end`` and
+    ``lack`` do not matter.
     """
     share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -118,9 +117,9 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 
 @large
 def held_by_leader(at, early, late, closing):
-    """Return the smallest closing speed (m/s) of the rear pair after a first contact with a leader that brakes harder.
+    """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with a harder braking leader.
 
-    The controlled vehicle stays near it. 0: none proven.
+    It holds because the controlled vehicle then stays near the leader. 0: none proven.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -154,9 +153,9 @@ def held_by_leader(at, early, late, closing):
 
 @large
 def after_front(at, early, late, closing, end, lack):
-    """Return the smallest squared closing speed (m2/s2) of the rear pair after a first contact with the leader.
+    """Return a lower bound (m2/s2) on the rear pair's squared closing speed after a first contact with the leader.
 
-    The largest of several lower bounds.
+    It is the largest of several lower bounds.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     behind, v_r, onset = rear_after(at, early)
@@ -177,8 +176,8 @@ def after_front(at, early, late, closing, end, lack):
 def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
     """Return the smallest squared closing speed (m2/s2) at which a braking vehicle (f) reaches the braking leader (l).
 
-    f brakes with at most ``a_f``. ``gap`` and ``least_gap`` are the largest and smallest possible gap (m); the latter
-    is used only if the leader brakes harder. The result is 0 if contact is not certain.
+    f brakes with at most ``a_f``. ``gap`` and ``least_gap`` are the largest and smallest possible gap (m);
+    ``least_gap`` is used only if the leader brakes harder. The result is 0 if contact is not certain.
     """
     squared = walk(gap, v_l, braking(0.0, a_l), v_f, braking(0.0, a_f), v_f / a_f)[2]
     if a_f < a_l:
@@ -189,10 +188,10 @@ def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
 
 @large
 def pushed_by_rear(at, early, late, closing, end, lack, gap):
-    """Return the smallest closing speed (m/s) of the front pair after the rear vehicle has hit the controlled vehicle.
+    """Return a lower bound (m/s) on the front pair's closing speed after the rear vehicle's first contact.
 
-    From the centre of mass of these two. The controlled vehicle must brake at least as hard as the rear vehicle.
-    ``gap``: gap to the front vehicle at ``early`` (m).
+    It follows from the motion of the centre of mass of rear and controlled vehicle. The controlled vehicle must brake
+    at least as hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m).
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -212,7 +211,7 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
 
 @large
 def after_rear(at, early, late, closing, end, lack):
-    """Return the smallest squared closing speed (m2/s2) of the front pair after the rear vehicle's first contact."""
+    """Return a lower bound (m2/s2) on the front pair's squared closing speed after the rear vehicle's first contact."""
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
@@ -231,7 +230,7 @@ def after_rear(at, early, late, closing, end, lack):
 
 @large
 def after(kind, at, early, late, closing, end, lack):
-    """Return the smallest harm (m2/s2) of the contact with the second neighbour that must follow a first contact."""
+    """Return a lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact."""
     if kind == FRONT_FIRST:
         return after_front(at, early, late, closing, end, lack)
     return after_rear(at, early, late, closing, end, lack)

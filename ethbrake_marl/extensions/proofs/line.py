@@ -37,20 +37,20 @@ HALVINGS = 60
 
 @kernel
 def leader(at, time):
-    """Return speed (m/s) and way (m) of the front vehicle at ``time`` if nothing pushes it and it brakes from now."""
+    """Return speed (m/s) and way (m) of the front vehicle at ``time`` if it brakes from now on without being pushed."""
     speed, way, _ = solo(at[V_L], -at[A_L], 0.0, math.inf, time)
     return speed, way
 
 
 @kernel
 def follower(at, time):
-    """Return speed (m/s) and way (m) of the rear vehicle at ``time`` if nothing pushes it."""
+    """Return speed (m/s) and way (m) of the rear vehicle at ``time`` if it is not pushed."""
     speed, way, _ = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, time)
     return speed, way
 
 
 def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
-    """Return the worlds as the vehicle ``body`` (1: Vehicle 1) meets them, [n, COLUMNS]."""
+    """Return one row of numbers for each world, [n, COLUMNS]; the controlled vehicle is ``body`` (1: Vehicle 1)."""
     line, car, at = state.line, state.car, np.zeros((state.n, COLUMNS))
     onset = np.maximum(car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0)
     at[:, [GAP_L, GAP_R]] = FAR_M

@@ -83,13 +83,13 @@ class LowerBound(NamedTuple):
 
     @property
     def impact_proven(self) -> Bools:
-        """Every command certainly leads to an impact, [n]. False: not proven; the impact may still be unavoidable."""
+        """Whether every command certainly leads to an impact, [n]. False: not proven; it may still be unavoidable."""
         return np.asarray(self.harm > 0.0)
 
 
 @kernel
 def front_bound(at):
-    """Return the smallest squared closing speed (m2/s2) at the front pair's first contact, and its latest time (s)."""
+    """Return the smallest squared closing speed (m2/s2) and the latest time (s) of the front pair's first contact."""
     _, time, squared = behind_leader(at, braking(0.0, at[A_F]), at[V_F] / at[A_F])
     if at[A_F] < at[A_L] and at[V_F] < at[V_L]:
         squared = min(squared, 2.0 * (at[A_L] - at[A_F]) * at[GAP_L])
@@ -98,14 +98,17 @@ def front_bound(at):
 
 @kernel
 def rear_bound(at):
-    """The same for the rear pair. Full drive attains both; the time is infinite if it avoids the contact."""
+    """Return the smallest squared closing speed (m2/s2) and the latest time (s) of the rear pair's first contact.
+
+    Full drive attains both; the time is infinite if it avoids the contact.
+    """
     _, time, squared = before_rear(at, driving_first(at, math.inf), rest_of_rear(at))
     return squared, time
 
 
 @large
 def last_first(kind, at, first, last):
-    """Return the latest time (s), at most ``last``, at which a contact can come before any with the other neighbour.
+    """Return the latest time (s), at most ``last``, of a contact with one neighbour before any with the other.
 
     By bisection, from ``first`` (s), at which it is possible. The later the contact in front, the shorter the vehicle
     drives, so the rear vehicle comes nearer; the later the contact behind, the shorter it brakes, so it comes nearer to
@@ -129,7 +132,7 @@ def last_first(kind, at, first, last):
 
 @large
 def last_meeting(at, first):
-    """Return the latest time (s) of a contact with the front vehicle, and the latest one before the rear vehicle comes.
+    """Return the latest time (s) of a contact with the front vehicle, and the latest before any with the rear vehicle.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed. ``first`` is the earliest time (s) of a contact with the front vehicle.
@@ -144,8 +147,9 @@ def last_meeting(at, first):
 
 @large
 def soft_harm(kind, at, early, late, floor, best):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late`` with any
-    closing speed.
+    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late``.
+
+    The closing speed of these contacts may have any value.
     """
     soft = 0.0
     while soft * soft < best:
@@ -164,7 +168,7 @@ def outer_contact(at):
 
 @large
 def front_first(at, floor, best, enough, cells):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all at once.
+    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all three.
 
     In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
     vehicle relative to the front vehicle, and the front pair's is at least the smallest possible one at this time. Such
@@ -222,7 +226,7 @@ def rear_first(at, floor, best, enough, cells):
 
 @kernel
 def last_rest(at):
-    """Return the time (s) by which all harm that the combined bound counts has happened."""
+    """Return the time (s) after which no more harm happens that the combined bound counts."""
     stand = rest_of_rear(at)
     way = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
     room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
@@ -234,7 +238,7 @@ def last_rest(at):
 def combined_bound(at, until, front, rear, cells):
     """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact, first in front or behind.
 
-    0 if some of the harm that it counts may come after the horizon ``until`` (s). ``front`` and ``rear`` are bounds on
+    0 if some of the counted harm may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds on
     the harm of each pair alone (m2/s2).
     """
     if not last_rest(at) < until:
@@ -254,8 +258,8 @@ def combined_bound(at, until, front, rear, cells):
 def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
     """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2).
 
-    ``rows`` [n, COLUMNS]; harm after ``until`` [n] (s) does not count. ``has_front`` and ``has_rear`` [n]: there is
-    this neighbour, and the pair's next impact counts. ``unavoidable`` [n]: contact is.
+    ``rows`` [n, COLUMNS]; harm after ``until`` [n] (s) does not count. ``has_front`` and ``has_rear`` [n]: the
+    neighbour exists, and the pair's next impact counts. ``unavoidable`` [n]: contact cannot be avoided.
     """
     for k in range(len(out)):
         for column in range(BOUNDS):
@@ -286,9 +290,9 @@ def lower_bound(
         count: ``first`` (of each pair only the first impact), ``total``, or ``honest``, which has the bound of
             ``total`` because the honest cost is never below total harm.
         horizon_s: time until which harm counts, s after the alert.
-        time_step_s: time between two decisions (s), the first when the vehicle may act, as for every agent. The bound
-            is larger than with None, but holds only for commands that change at decisions, and takes ten times as long.
-            None: commands may change at any time.
+        time_step_s: time between two decisions (s); the first is when the vehicle may act. The bound is larger than
+            with None, but holds only for commands that change at decisions, and takes ten times as long. None:
+            commands may change at any time.
 
     Raises ``InvalidInput`` where ``avoidability`` does, for an obstacle, an unknown count, a time step below
     ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.

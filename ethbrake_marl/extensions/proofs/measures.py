@@ -1,4 +1,4 @@
-"""The measures ``avoidable`` and ``proven_harm``, which are asked for by name: a proof takes longer than an episode."""
+"""The measures ``avoidable`` and ``proven_harm``. They are computed only on request, since a proof is slow."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from ethbrake_marl.registry import Part
 
 
 def avoidable(game: Game, alert: State, last: State) -> Given:
-    """Whether some commands avoid all contact (proven), and if not, why (``early``, ``front``, ``rear``).
+    """Return whether some commands avoid all contact (proven), [n], and if not, why: ``early``, ``front`` or ``rear``.
 
-    Of Vehicle 2 in a line of three (or of Vehicles 2 and 3 together), and of either of two; all others brake fully.
+    The commands are those of Vehicle 2 of three (or of Vehicles 2 and 3 together) or of either of two vehicles; all
+    others brake fully.
     """
     verdict = avoidability(alert, _controlled(game, alert, together=True))
     return {"": verdict.avoidable, "reason": verdict.reason_name}
@@ -27,7 +28,10 @@ _known: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: 
 
 
 def proven_harm(game: Game, alert: State, last: State) -> Given:
-    """Lower bound on the harm or honest cost of all commands that change at decisions; ``impact``: it is above 0."""
+    """Return a lower bound on the harm or honest cost of all commands that change at decisions, [n] m2/s2.
+
+    ``impact``: whether the bound is above 0.
+    """
     body, rules = _controlled(game, alert), game.rules
     asked = np.array([body, rules.horizon_s, rules.time_step_s]).tobytes() + alert.line.tobytes() + alert.car.tobytes()
     if asked not in _known:
@@ -38,7 +42,7 @@ def proven_harm(game: Game, alert: State, last: State) -> Given:
 
 
 def _controlled(game: Game, alert: State, *, together: bool = False) -> int:
-    """Return the controlled vehicle, or 2 for Vehicles 2 and 3 together."""
+    """Return the controlled vehicle, or 2 for Vehicles 2 and 3 together. Raises ``InvalidInput`` for other learners."""
     learners = game.rules.learners.tolist()
     others = [body for body in range(1, alert.vehicles + 1) if body not in learners]
     if game.scripts or (alert.wanted[:, others] != -alert.car[:, BRAKING, others]).any():

@@ -72,7 +72,7 @@ def braked_then_driven(at, brake, time):
 
 @large
 def braking_to_rear(at, time):
-    """Return the ``brake`` that leads to contact with the rear vehicle at ``time``."""
+    """Return how long (s) the vehicle must brake first to be in contact with the rear vehicle at ``time``."""
     place = follower(at, time)[1] - at[GAP_R]
     low, high = 0.0, time
     for _ in range(HALVINGS):
@@ -86,7 +86,7 @@ def braking_to_rear(at, time):
 
 @large
 def gentlest(kind, at, time):
-    """Return the smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake``.
+    """Return the smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake`` (s).
 
     To be at a place at a time with the largest speed, brake first and then drive. ``brake`` is infinite if the vehicle
     reaches its speed limit by then.
@@ -126,23 +126,23 @@ def rest_of_rear(at):
 
 @large
 def meet_front(at, drive):
-    """Return when (s) a vehicle that drives first meets the front vehicle; infinite: never."""
+    """Return when (s) a vehicle that drives first, for ``drive`` s, meets the front vehicle; infinite: never."""
     return behind_leader(at, driving_first(at, drive), math.inf)[1]
 
 
 @large
 def meet_rear(at, brake):
-    """Return when (s) a vehicle that brakes first meets the rear vehicle; infinite: never."""
+    """Return when (s) a vehicle that brakes first, for ``brake`` s, meets the rear vehicle; infinite: never."""
     return before_rear(at, braking_first(at, brake), rest_of_rear(at))[1]
 
 
 @large
 def stays_ahead(at, drive, until):
-    """Does a vehicle that drives first avoid the rear vehicle until ``until`` (s)?"""
+    """Return whether a vehicle that drives for ``drive`` s, then brakes, avoids the rear one until ``until`` (s)."""
     return before_rear(at, driving_first(at, drive), until)[0] >= -AHEAD_M
 
 
 @large
 def stays_behind(at, brake, until):
-    """Does a vehicle (``at``: its state) that brakes for ``brake`` s avoid the front vehicle until ``until`` (s)?"""
+    """Return whether a vehicle that brakes for ``brake`` s, then drives, avoids the front one until ``until`` (s)."""
     return behind_leader(at, braking_first(at, brake), until)[0] >= -AHEAD_M

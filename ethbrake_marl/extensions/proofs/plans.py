@@ -15,13 +15,13 @@ from ethbrake_marl.motion.contact import contact
 
 @kernel
 def braking(onset, deceleration):
-    """Coast until ``onset`` (s), then brake to rest."""
+    """Return the plan: coast until ``onset`` (s), then brake to rest."""
     return 0.0, onset, 0.0, onset, 0.0, onset, -deceleration, math.inf
 
 
 @kernel
 def with_window(u, late, end, change, turn, step):
-    """Accelerate with ``u``; by ``step`` more from ``turn`` on, and by ``change`` more from ``late`` to ``end``."""
+    """Return the plan: accelerate with ``u``, ``step`` more after ``turn``, ``change`` more ``late`` to ``end``."""
     second = u + step if turn < late else u + change
     third = u + step + change if turn < end else u
     return u, min(turn, late), second, min(max(turn, late), end), third, max(turn, end), u + step, math.inf
@@ -29,26 +29,26 @@ def with_window(u, late, end, change, turn, step):
 
 @kernel
 def time_to_limit(v, u, limit):
-    """Return the time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 if it does not."""
+    """Return the time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 if it never does."""
     return (limit - v) / u if u > 0.0 and v < limit else 0.0
 
 
 @kernel
 def drive_then_brake(v, u, limit, drive, deceleration):
-    """Drive with ``u`` (m/s2) up to the speed limit for ``drive`` seconds, then brake to rest."""
+    """Return the plan: drive with ``u`` (m/s2) up to the speed limit for ``drive`` seconds, then brake to rest."""
     return u, min(time_to_limit(v, u, limit), drive), 0.0, drive, 0.0, drive, -deceleration, math.inf
 
 
 @kernel
 def brake_then_drive(v, u, limit, brake, deceleration):
-    """Brake for ``brake`` seconds, at most to rest, then drive up to the speed limit."""
+    """Return the plan: brake for ``brake`` seconds, at most to rest, then drive up to the speed limit."""
     cap = brake + time_to_limit(max(v - deceleration * brake, 0.0), u, limit)
     return -deceleration, brake, u, cap, 0.0, cap, 0.0, math.inf
 
 
 @kernel
 def piece_at(plan, now, v):
-    """Return the acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops then."""
+    """Return a plan's acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops then."""
     k = 0
     while now >= plan[k + 1]:
         k += 2

@@ -1,7 +1,7 @@
 """Form chains of vehicles that follow each other.
 
-A *queue* is a sequence of vehicles, each of which follows the vehicle in front of it, at one moment of a recording. A
-queue is cut into *chains* of a fixed number of vehicles. Each chain is one row of gaps and speeds.
+A *queue* is a sequence of vehicles, each of which follows the next, at one moment of a recording. It is cut into
+*chains* of a fixed number of vehicles. Each chain is one row of gaps and speeds.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Chains(NamedTuple):
 
 
 def cut_chains(recording: Recording, vehicles: int) -> Chains:
-    """Return the chains of a recording, in order of time and of the vehicle at the front of the queue.
+    """Return the chains of a recording, ordered by time and by the front vehicle of the queue.
 
     The first chain of a queue begins with its front vehicle, the next one directly behind it, and so on. Raises
     ``InvalidInput`` if too many vehicles have faulty data.
@@ -61,10 +61,10 @@ def cut_chains(recording: Recording, vehicles: int) -> Chains:
 
 
 def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
-    """Return the states of vehicles that follow another one, with ``gap`` (m) and ``front_car``.
+    """Return the rows of ``states`` of vehicles that follow another one, with ``gap`` (m) and ``front_car``.
 
-    ``front_car`` is the index of the vehicle ahead in ``states``, which has each vehicle once per moment. Counts in
-    ``left_out`` what it leaves out.
+    ``front_car`` is the row of the vehicle ahead; each vehicle occurs once per moment. ``left_out`` counts what is left
+    out.
     """
     entry = recording.entry
     if entry.by_lane:

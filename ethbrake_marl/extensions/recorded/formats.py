@@ -1,4 +1,4 @@
-"""Formats of recorded traffic: names of files and columns, units, licence, and how much faulty data is accepted."""
+"""Formats of recorded traffic: files, columns, units, licence, and how much faulty data is accepted."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ class Format(NamedTuple):
 
     @property
     def gaps(self) -> bool:
-        """Files contain gaps instead of positions and lengths; an empty cell means that the gap was not measured."""
+        """Whether files contain gaps, empty if not measured, instead of positions and lengths."""
         return "gap" in self.columns
 
     @property
     def by_lane(self) -> bool:
-        """The vehicle ahead must be determined from lanes and positions, because no column contains its id."""
+        """Whether lanes and positions must determine the vehicle ahead, because no column contains its id."""
         return "ahead" not in self.columns and not self.gaps
 
 
@@ -93,9 +93,9 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
     """Return the format of recorded traffic with this name.
 
     ``columns`` is for the format ``table`` only: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
-    values except ``units`` are names of columns. ``time=t/1000`` means that the column ``t`` has times in 1/1000 s.
-    ``units`` is ``m`` (lengths in m, speeds in m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h).
-    Raises ``InvalidInput`` for missing, repeated or unknown keys, and unknown units.
+    values except ``units`` are names of columns. ``time=t/1000``: the column ``t`` has times in 1/1000 s. ``units``:
+    ``m`` (m and m/s), ``ft`` (ft and ft/s) or ``km/h`` (m and km/h). Raises ``InvalidInput`` for missing, repeated or
+    unknown keys, and unknown units.
     """
     if name != "table":
         if columns:

@@ -29,7 +29,7 @@ class NotARecording(InvalidInput):
 
 
 class Cells(NamedTuple):
-    """The columns of a format in a file. The index of ``frame`` is the number of the row, from 0."""
+    """The columns of a format in a file. The index of ``frame`` is the row's number, from 0."""
 
     file: Path
     names: Mapping[str, str]  # quantity -> name of its column; for numbered columns ``speed1``, ``speed2``, ...
@@ -45,7 +45,7 @@ class Cells(NamedTuple):
     def refuse(self, bad: Any, quantity: str, values: Any, right: str) -> None:
         """Raise ``InvalidInput``, with file, line and column, at the first value that is ``bad``.
 
-        ``bad`` and ``values`` are series with the number of the row as index; ``right`` says what a valid value is.
+        ``bad`` and ``values`` are series with the row's number as index; ``right`` says what a valid value is.
         """
         if bad.any():
             row = bad.idxmax()
@@ -54,7 +54,7 @@ class Cells(NamedTuple):
 
 @contextmanager
 def reading(file: Path) -> Iterator[BufferedReader]:
-    """Open a file. Bytes that are no text, and errors inside pyarrow, become ``InvalidInput``."""
+    """Open a file. Bytes that are no text, and errors of pyarrow, become ``InvalidInput``."""
     try:
         with open_plain(file, LARGEST_BYTES) as stream:
             yield stream
@@ -64,7 +64,7 @@ def reading(file: Path) -> Iterator[BufferedReader]:
 
 
 def read_cells(file: Path, entry: Format) -> Cells:
-    """Return the columns of a format in a file, whose first lines may be a heading.
+    """Return the columns of a format in a file; lines before the header are ignored.
 
     Raises ``InvalidInput``, which names file, line and column, if a column is missing or occurs twice, and for a cell
     that is empty or not a number; ``NotARecording`` if more than half of the columns are missing.
@@ -91,7 +91,6 @@ def read_cells(file: Path, entry: Format) -> Cells:
 
 
 def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str, Sequence[str], dict[str, int]]:
-    """Read up to the header; return its line, the separator, the names of all columns, and quantity -> column."""
     missing = list(entry.columns.values())
     for number in range(1, HEAD + 1):
         line = stream.readline(LONGEST_HEAD).decode("utf-8-sig")
@@ -124,7 +123,6 @@ def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, i
 
 
 def _numbers(cells: Cells, quantity: str, column: Any, may_be_empty: bool) -> Any:
-    """Return the numbers of a column, perhaps with commas between thousands."""
     try:
         values = column.cast(pyarrow.float64()).to_numpy()
     except pyarrow.ArrowException:

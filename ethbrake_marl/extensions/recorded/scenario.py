@@ -1,7 +1,4 @@
-"""Create a scenario (a YAML file, and a CSV file with gaps and speeds) from a folder of recorded traffic.
-
-Besides the rows, only one file's states are in memory at a time.
-"""
+"""Create a scenario (a YAML file, and a CSV file with gaps and speeds) from a folder of recorded traffic."""
 
 from __future__ import annotations
 
@@ -80,16 +77,16 @@ def scenario_from_data(
     every_s: float = 1.0,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> FromData:
-    """Create a scenario from the recordings in a folder and in all its subfolders; each world is a recorded chain.
+    """Create a scenario from the recordings in a folder and its subfolders; each world is a recorded chain of vehicles.
 
     At regular times, each queue of vehicles in a recording is cut into chains of as many vehicles as the scenario
     ``based_on`` has, beginning at the front of the queue. Each chain is one row of gaps and speeds. If there are more
     rows than the table of a scenario may have, only every k-th row is used.
 
     Args:
-        name: of the scenario.
+        name: name of the scenario.
         folder: folder with the files, or one file.
-        format: of the files.
+        format: format of the files.
         columns: for the format ``table`` only (``format_of``).
         based_on: scenario that provides the number of vehicles and all quantities that are not recorded.
         every_s: time between two moments at which chains are formed, s.
@@ -138,7 +135,7 @@ def read_rows(
 ) -> Rows:
     """Read the chains of vehicles in all recordings of a folder and its subfolders, or in one file.
 
-    A file with an error is refused as a whole. A file with the content of another one is skipped. Raises
+    A file with an error is refused completely. A file with the same content as another one is skipped. Raises
     ``InvalidInput`` if there is no recording of this format, or no row.
     """
     longest, left_out, refused, skipped = 0, Counter[str](), list[str](), list[str]()
@@ -191,8 +188,8 @@ def read_rows(
 def files_of(folder: Path, entry: Format, refused: list[str]) -> dict[str, Path]:
     """Return the files of a format in a folder and its subfolders, or the one file: printable name -> path.
 
-    ``refused`` gets the errors for subfolders that cannot be read. Files and folders whose names begin with a dot are
-    ignored, and links to folders are not followed.
+    Errors for subfolders that cannot be read are added to ``refused``. Names that begin with a dot, and links to
+    folders, are ignored.
     """
     if not folder.is_dir():
         return {plain_text(folder.name): folder} if folder.is_file() else {}

@@ -1,7 +1,4 @@
-"""Convert the columns of a recording to states of vehicles: position, direction, length and speed, in m and m/s.
-
-The states of all formats are one table, sorted by time and vehicle, so that the order of a file's rows has no effect.
-"""
+"""Convert the columns of a recording to states of vehicles: position, direction, length and speed, in m and m/s."""
 
 from __future__ import annotations
 
@@ -32,10 +29,10 @@ SLOPE, LEAST_M2 = (0.5, 2.0), 100.0
 class Recording(NamedTuple):
     """The states of the vehicles of one file at regular moments.
 
-    ``states`` has one line per vehicle and moment, sorted by ``moment`` (its number, from the file's first moment) and
-    ``vehicle``. ``ahead`` is the vehicle ahead, negative if there is none. ``front`` and ``side`` are x and y of its
-    front (m), ``dx`` and ``dy`` its direction of travel (1 and 0 if positions are along the road). ``length`` (m) is 0
-    if the data contain gaps. ``speed`` is in m/s, ``row`` the row in the file.
+    ``states`` has one row per vehicle and moment, sorted by ``moment`` (its number, from 0) and ``vehicle``. ``ahead``
+    is the vehicle ahead, negative if there is none. ``front`` and ``side`` are x and y of its front (m), ``dx`` and
+    ``dy`` its direction of travel (1 and 0 if positions are along the road). ``length`` (m) is 0 if the data contain
+    gaps. ``speed`` is in m/s, ``row`` the row in the file.
     """
 
     cells: Cells
@@ -48,10 +45,10 @@ class Recording(NamedTuple):
 
 
 def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
-    """Read the states of the vehicles in a file at regular times, ``every_s`` apart, from the file's first moment.
+    """Read the states of the vehicles in a file every ``every_s`` seconds, from the file's first moment on.
 
-    Raises ``InvalidInput``, which names file, line and column, for an impossible value, for instance a length of 0 m,
-    and if positions change otherwise than the speeds say.
+    Raises ``InvalidInput``, which names file, line and column, for an impossible value such as a length of 0 m, and if
+    positions contradict the speeds.
     """
     cells, names = read_cells(file, entry), dict[float, str]()
     raw = cells.frame
@@ -79,7 +76,7 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
 
 
 def moments(times_s: Floats, every_s: float) -> Floats:
-    """Return the number of the moment to which each time belongs, from 0; -1: to none.
+    """Return the number of the moment to which each time belongs, from 0; -1 if to none.
 
     Moment k is the recorded time nearest to ``first + k every_s``, at most half the smallest step between recorded
     times away. Raises ``InvalidInput`` if ``every_s`` is less than that step.
@@ -102,7 +99,7 @@ def moments(times_s: Floats, every_s: float) -> Floats:
 
 
 def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
-    """Replace the names of vehicles and lanes by numbers, in the order of the names; return the names by number."""
+    """Replace names of vehicles and lanes in ``raw`` by numbers; return number -> name."""
     for column in ("vehicle", "lane"):
         cells.refuse(raw[column] == "", column, raw[column], "must be a name")
     text = pd.concat([raw["vehicle"], raw["lane"]]).drop_duplicates()
@@ -131,7 +128,7 @@ def _along_road(raw: Any, cells: Cells, entry: Format) -> Any:
 
 
 def _turn_highd(states: Any, cells: Cells) -> None:
-    """Let positions increase in the direction of travel; x is the left edge of a vehicle and grows to the right."""
+    """Turn highD's positions (left edges, growing to the right) into fronts that grow in the direction of travel."""
     meta = read_cells(Path(f"{str(cells.file)[:-4]}Meta.csv"), HIGHD_META).frame
     direction = states["vehicle"].map(meta.drop_duplicates("vehicle").set_index("vehicle")["direction"])
     right = "must have the drivingDirection 1 or 2 in its tracksMeta.csv"
@@ -142,7 +139,6 @@ def _turn_highd(states: Any, cells: Cells) -> None:
 
 
 def _turn_exid(states: Any, raw: Any) -> None:
-    """Set the direction of travel, and move positions from the centre of a vehicle to its front."""
     heading = np.deg2rad(raw["heading"])
     states["dx"], states["dy"] = np.cos(heading), np.sin(heading)
     states["front"] += states["length"] / 2.0 * states["dx"]
@@ -181,7 +177,7 @@ def _check_positions(recording: Recording, every_s: float) -> None:
 
 
 def _openacc(raw: Any, cells: Cells, entry: Format) -> Any:
-    """Return the states of cars of which speeds and gaps were recorded, in numbered columns.
+    """Return the states of cars whose speeds and gaps were recorded, in numbered columns.
 
     Car k + 1 follows car k if the speeds of both cars and the gap between them (column ``IVS`` with the number k) are
     recorded. The first car of a queue has position 0, every other car minus the sum of the gaps up to the first.

@@ -24,7 +24,7 @@ ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a pictu
 
 
 def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
-    """Return 25 scenes per second from the alert on, and the final one."""
+    """Return 25 scenes per second from the alert on, and the last one."""
     motion, scenes = Motion(game, world, 0), list[Scene]()
     for _, state in play(game, world, team):
         motion.step(state)
@@ -35,9 +35,9 @@ def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
 
 
 def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> bytes:
-    """Let teams drive the same world; return their films, one below the other, as the bytes of one file.
+    """Let teams drive the same world; return their films, one below the other, as the content of one file.
 
-    The keys of ``teams`` are the titles. A film that ends before the longest shows its last scene on. ``ending``:
+    The keys of ``teams`` are the titles. A film that ends early shows its last scene until the end. ``ending``:
     ``.gif`` or ``.mp4``, or ``.png`` for three moments: the alert, the hardest impact under any team, and the end.
     Raises the errors of ``check_film``.
     """
@@ -47,7 +47,7 @@ def film(world: State, teams: Mapping[str, Team], ending: str, game: Game) -> by
 
 
 def check_film(ending: str) -> None:
-    """Raise ``InvalidInput`` for another ending of a file, ``MissingExtra`` for .mp4 without imageio-ffmpeg."""
+    """Raise ``InvalidInput`` for another file ending, and ``MissingExtra`` for .mp4 without imageio-ffmpeg."""
     if ending not in WRITERS:
         raise InvalidInput(f"film with the file ending {ending!r}: the ending must be one of {', '.join(WRITERS)}")
     if ending == ".mp4":

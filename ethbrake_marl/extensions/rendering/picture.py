@@ -34,29 +34,24 @@ COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#5
 
 
 def vehicle_colour(body: int) -> str:
-    """Return the colour of a vehicle (1: Vehicle 1) in all pictures."""
     return COLOURS[body % len(COLOURS)]
 
 
 @cache
 def font(size: int) -> Any:
-    """Return Pillow's own font; ``size`` is in pixels of the finished picture."""
     return ImageFont.load_default(size * FINE)
 
 
 def width_of(words: str, size: int) -> float:
-    """Return the width of a text (pixels)."""
     return float(font(size).getlength(words)) / FINE
 
 
 def fitting(choices: Sequence[str], width: float, size: int) -> str:
-    """Return the first of some texts that is at most so wide, or else the last."""
+    """Return the first text that is at most ``width`` pixels wide, or else the last one."""
     return next((words for words in choices if width_of(words, size) <= width), choices[-1])
 
 
 class Pen:
-    """Draws a scene in pixels of the finished picture."""
-
     def __init__(self, scene: Scene) -> None:
         self.scene, self.fronts_m, (self.left_m, self.right_m) = scene, scene.fronts_m, scene.shown_m
         self.image = Image.new("RGB", (WIDTH * FINE, HEIGHT * FINE), PAPER)
@@ -71,7 +66,6 @@ class Pen:
         return self.x(self.fronts_m[body - 1] - BODY_M), self.x(self.fronts_m[body - 1])
 
     def marks(self, every_m: float) -> list[float]:
-        """Return the multiples of a distance that are in view."""
         first, last = math.ceil(self.left_m / every_m), math.floor(self.right_m / every_m)
         return [k * every_m for k in range(first, last + 1)]
 
@@ -140,7 +134,7 @@ def draw_vehicle(pen: Pen, body: int) -> None:
 
 
 def draw_panel(pen: Pen, body: int) -> None:
-    """Draw what a vehicle does; its bar extends to the left for braking and to the right for driving."""
+    """Draw a vehicle's speed and command. The command's bar extends left for braking and right for driving."""
     scene, count = pen.scene, len(pen.scene.wanted) - 1
     gap = 24.0 if count <= 5 else 10.0
     width = min((WIDTH - 2 * MARGIN - gap * (count - 1)) / count, 240.0)
@@ -162,7 +156,7 @@ def draw_panel(pen: Pen, body: int) -> None:
 
 
 def write_gaps(pen: Pen) -> None:
-    """Write every gap above the road; one without enough space is written a line higher."""
+    """Write every gap above the road; a text without enough space is written a line higher."""
     free = math.inf
     for pair in range(0 if pen.scene.has_obstacle else 1, len(pen.scene.wanted) - 1):
         left, right = pen.ends(pair + 1)[1], pen.ends(pair)[0]
@@ -178,7 +172,7 @@ def write_gaps(pen: Pen) -> None:
 
 
 def show_impacts(pen: Pen) -> None:
-    """Draw a star at every recent impact, and name the two hardest."""
+    """Draw a star at every recent impact, and write the closing speeds of the two hardest."""
 
     def x(impact: Impact) -> float:
         return (pen.ends(impact.pair + 1)[1] + pen.ends(impact.pair)[0]) / 2

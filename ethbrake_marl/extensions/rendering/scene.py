@@ -1,4 +1,4 @@
-"""What a picture shows: one world at one moment, and how to find it inside a step."""
+"""A scene: one world at one moment; and the motion of a world between two decisions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ COLUMNS = 100  # width of the road in characters
 
 
 class Impact(NamedTuple):
-    """The first impact of a pair in a step."""
+    """First impact of a pair of vehicles in a step."""
 
     pair: int  # 0: Vehicle 1 and the obstacle
     closing_mps: float
@@ -48,7 +48,7 @@ class Impact(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """One world at one moment. Places are m ahead of Vehicle 1's front bumper at the first decision."""
+    """One world at one moment. Places are in m ahead of Vehicle 1's front bumper at the first decision."""
 
     title: str
     learners: tuple[int, ...]  # bodies
@@ -63,7 +63,7 @@ class Scene(NamedTuple):
 
     @property
     def fronts_m(self) -> list[float]:
-        """Places of the front bumpers: true gaps between bodies of length BODY_M."""
+        """Places of the front bumpers. Gaps are true, and every body has the length BODY_M."""
         behind = np.concatenate([[0.0], np.cumsum(self.line[GAP, 1:-1] + BODY_M)])
         return [float(self.front_m - way) for way in behind]
 
@@ -83,7 +83,7 @@ class Scene(NamedTuple):
         return self.front_m + float(self.line[GAP, 0])
 
     def command(self, body: int) -> float:
-        """Return the command that takes effect (m/s2); 0 before the body's latency has elapsed."""
+        """Return the command in effect (m/s2); 0 before the body's latency has elapsed."""
         return float(self.wanted[body]) if self.car[LATENCY, body] <= self.time_s else 0.0
 
     def share(self, body: int) -> float:
@@ -92,7 +92,7 @@ class Scene(NamedTuple):
         return command / float(self.car[BRAKING if command < 0.0 else DRIVING, body]) if command else 0.0
 
     def said_of(self, body: int) -> str:
-        """Return what a vehicle does, such as "brakes 3.0 m/s2"."""
+        """Return what a vehicle does, in words such as "brakes 3.0 m/s2"."""
         latency, command = float(self.car[LATENCY, body]), self.command(body)
         if latency > self.time_s:
             return f"acts from {latency:.2f} s" if latency < math.inf else "never acts"
@@ -131,10 +131,7 @@ class Scene(NamedTuple):
 
 
 class Motion:
-    """One world from one decision to the next. Every moment of it is computed with the exact physics.
-
-    Raises ``InvalidInput`` for worlds with another physics.
-    """
+    """Exact motion of one world between two decisions. Raises ``InvalidInput`` for worlds of another physics."""
 
     def __init__(self, game: Game, state: State, row: int) -> None:
         check_exact(state, "a picture")
@@ -175,9 +172,9 @@ class Motion:
 
 
 def whole_road(state: State, row: int) -> tuple[float, float]:
-    """Return the road on which the line comes to rest if all vehicles brake fully as soon as they can.
+    """Return the road (m) that the line needs until it rests, if all vehicles brake fully as soon as they can.
 
-    A rear vehicle that would come to rest further ahead is taken to push the others.
+    A rear vehicle that would come to rest farther ahead is taken to push the others.
     """
     speeds, braking = state.speeds_mps[row], state.braking_capacity_mps2[row]
     behind = np.concatenate([[0.0], np.cumsum(state.gaps_m[row])])

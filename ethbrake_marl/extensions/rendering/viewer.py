@@ -16,15 +16,12 @@ SMOOTH_FPS = 50  # frames per second in the window, and default of `step_frames`
 
 
 class Viewer:
-    """Draws the running episodes of an environment with one world, or with many (``num_envs``)."""
-
     def __init__(self, environment: Any) -> None:
         self.environment = environment
         self.many = hasattr(environment, "num_envs")
         self.motions: list[Motion] = []  # of each world, since its last decision
 
     def began(self, state: State) -> None:
-        """Start the pictures of new episodes; those that go on keep theirs."""
         if len(self.motions) != state.n:
             self.motions = [Motion(self.environment.game, state, row) for row in range(state.n)]
         self.stepped(state)
@@ -52,7 +49,7 @@ class Viewer:
         return picture(scene)
 
     def step_frames(self, fps: int = SMOOTH_FPS, row: int = 0) -> list[Any]:
-        """Return the last step of a world as pictures, ``fps`` per second of the episode."""
+        """Return the last step of world ``row`` as pictures, ``fps`` per second of the episode."""
         check_whole_number("step_frames: fps", fps, 1)
         motion = self.motion(row)
         count = max(round((motion.until_s - motion.start_s) * fps), 1)
@@ -64,14 +61,14 @@ class Viewer:
 
 
 class Words(Viewer):
-    """Mode ``ansi``: the present moment as plain text."""
+    """Viewer of the mode ``ansi``: the present moment as plain text."""
 
     def show(self, scene: Scene) -> Any:
         return scene.text()
 
 
 class Window(Viewer):
-    """Mode ``human``: a window that shows every step in real time. The user may close it until the next episode."""
+    """Viewer of the mode ``human``: a window that shows every step in real time. The user may close it."""
 
     def __init__(self, environment: Any) -> None:
         super().__init__(environment)
@@ -91,7 +88,7 @@ class Window(Viewer):
         self._play()
 
     def render(self) -> None:
-        """Return nothing: the window shows every step by itself."""
+        """Do nothing: the window shows every step by itself."""
 
     def _play(self) -> None:
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -116,13 +113,12 @@ class Window(Viewer):
                 return
 
     def close(self) -> None:
-        """Close the window; those of other environments stay open."""
         if self.window is not None:
             self.window.destroy()
             self.window = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy opens a window of its own."""
+        """Leave the window out, so that a copy opens its own."""
         return {**self.__dict__, "window": None}
 
 

@@ -1,4 +1,4 @@
-"""The best known harm of each world, if another extension has measured it: ``MEASURES`` are its names."""
+"""The best known harm of each world, if another extension has measured it."""
 
 from __future__ import annotations
 
@@ -41,11 +41,10 @@ class BestKnown(NamedTuple):
         return f"In {never:.1f} % of the worlds, no command avoids contact (proven). {words}"
 
     def regret(self, result: Result, agent: str, count: str) -> Floats:
-        """Return an agent's harm minus the best known harm, [n] m2/s2."""
         return np.asarray(result[agent][COLUMN[count]] - self.harm[count])
 
 
 def shown_counts(compared: Compared) -> dict[str, str]:
-    """Return both harms, and what the agents minimise if the best known is known of it: count -> column."""
+    """Return the counts to show, count -> column: both harms, and what agents minimise if its best is known, too."""
     known, minimised = BestKnown.of(compared.result), compared.harm_count
     return HARM if known is not None and minimised not in known.harm else {**HARM, minimised: COLUMN[minimised]}

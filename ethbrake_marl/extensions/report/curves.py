@@ -1,4 +1,4 @@
-"""Figure of estimates along an axis: harm over distance, training steps or delay."""
+"""Figure of curves with intervals: harm over distance, training steps or delay."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Curve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
 def over_seeds(trainings: Sequence[Mapping[Any, float]]) -> Curve:
     """Return the mean of several training runs, plus and minus one standard deviation over the seeds.
 
-    ``trainings`` has a mapping from step or progress to value for each run. The curve has the steps of all runs.
+    ``trainings``: for each run, step or progress -> value. The curve has the steps that all runs have.
     """
     curve = {}
     for step in sorted(set.intersection(*map(set, trainings))):
@@ -38,10 +38,10 @@ def curves_figure(
     lines: Mapping[str, Mapping[str, float]] | None = None,
     y_label: str = "",
 ) -> Figure:
-    """Draw curves with a band between the ends of their intervals, in a panel for each title.
+    """Draw curves with a band between the ends of their intervals, one panel for each title.
 
     ``panels``: title -> label of a curve -> curve; the first panel must have all labels, for the legend. ``lines``:
-    title -> label -> value of a horizontal line. ``y_label``: shared by all panels; "": each has its own.
+    value of a horizontal line, title -> label -> value. ``y_label``: shared by all panels; "": each has its own.
     """
     figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
     labels = [*dict.fromkeys(label for curves in panels.values() for label in curves)]

@@ -23,9 +23,9 @@ POINTS = 2001  # evenly spaced decelerations
 
 
 def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float) -> Floats:
-    """Return what vehicle ``body`` does by holding decelerations ``at`` [C] (m/s2), [3, C] m2/s2.
+    """Return the harm if vehicle ``body`` holds each of the decelerations ``at`` [C] (m/s2), [3, C] m2/s2.
 
-    Rows: predicted by the closed form, and simulated, first-impact and total. The others do as in ``world``.
+    Rows: first-impact harm predicted by the paper's closed form, and simulated first-impact and total harm.
     """
     braking, wait = np.ascontiguousarray(world.car[0, BRAKING]), world.car[0, LATENCY].copy()
     priced: Any = predicted_harm
@@ -39,7 +39,7 @@ def deceleration_figure(
 ) -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of the scenario's learner.
 
-    Marks are the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``known``: best known harm
+    Marks show the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``known``: best known harm
     of this world over all commands, ``first`` and ``total``, drawn as lines.
 
     Raises ``InvalidInput`` unless there is one world, one learner, and no script that looks at the state.

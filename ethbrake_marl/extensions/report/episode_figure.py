@@ -21,9 +21,9 @@ IMPACT: dict[str, Any] = {"marker": "X", "s": 60.0, "edgecolor": "black", "linew
 
 @in_our_style
 def trajectories(records: Mapping[str, EpisodeRecord]) -> Figure:
-    """Draw recorded episodes, one column each (title -> episode), all with the same scales.
+    """Draw recorded episodes (title -> episode), one column each, all with the same scales.
 
-    Below stand the quantities of the first world. Raises ``InvalidInput`` if there are no episodes.
+    A caption states the quantities of the first world. Raises ``InvalidInput`` if there are no episodes.
     """
     if not records:
         raise InvalidInput("trajectories: there are no records; give at least one recorded episode")

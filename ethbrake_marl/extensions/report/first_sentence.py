@@ -1,4 +1,4 @@
-"""The first sentence of a page: what an agent does against full braking, and in which test it fails."""
+"""The first sentence of a page: an agent's harm compared with full braking, and the tests in which it fails."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ WORDS = {  # count -> verb, noun, and what is counted
 
 
 def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
-    """Return the sentence about an agent. ``tests``: title -> the same agents in another test.
+    """Return the page's first sentence: an agent's harm compared with full braking.
 
-    It names the tests in which the agent does about as much harm as full braking, or more.
+    It names the tests in which the agent does about as much harm as full braking, or more. ``tests``: title -> results
+    of the same agents in another test.
     """
     count, harm = compared.harm_count, COLUMN[compared.harm_count]
     rows, known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
@@ -53,7 +54,7 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
 
 
 def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Compare an agent with full braking in the same worlds: "as much" if the 95 % interval contains 0."""
+    """Return how an agent's harm differs from full braking's: "as much" if the 95 % interval contains 0."""
     difference = row[f"{harm}_difference"]
     if difference is None or (difference.interval is None and row.episodes > 1):
         return "as much"
@@ -62,5 +63,5 @@ def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
 
 
 def value(row: SummaryRow, key: str) -> str:
-    """Return an estimate without its interval; a dash if there is none."""
+    """Return an estimate as text without its interval; a dash if there is none."""
     return Column("").show(row[key]).value

@@ -33,9 +33,9 @@ BINS = 12  # groups of worlds with similar gaps
 
 @in_our_style
 def harm_by_agent(compared: Compared, others: Mapping[str, Compared]) -> Figure:
-    """Draw the mean harm of each agent as a bar with its 95 % interval, narrow enough for a phone.
+    """Draw the mean harm of each agent as a bar with its 95 % interval.
 
-    A vertical line is the mean best known harm. Marks are the agents' means in other tests, title -> results.
+    A vertical line shows the mean best known harm. Marks show the agents' means in other tests, title -> results.
     """
     count, result, known = compared.harm_count, compared.result, BestKnown.of(compared.result)
     agents = list(result.columns)
@@ -63,7 +63,7 @@ def harm_by_agent(compared: Compared, others: Mapping[str, Compared]) -> Figure:
 
 @in_our_style
 def harm_above(compared: Compared) -> Figure:
-    """Draw, for every x, the share of worlds in which an agent's regret is above x; its harm if no best is known."""
+    """Draw, for every x, the share of worlds in which an agent's regret (or harm, if no best is known) is above x."""
     result, known, counts = compared.result, BestKnown.of(compared.result), shown_counts(compared)
     figure, panels = new_panels((10.0, 3.8), columns=len(counts), sharey=True)
     for axes, (count, harm) in zip(panels, counts.items(), strict=True):
@@ -86,8 +86,8 @@ def harm_above(compared: Compared) -> Figure:
 def harm_against_total_gap(result: Result) -> Figure:
     """Draw each agent's mean harm, with 95 % intervals, against the sum of the gaps at the alert.
 
-    The worlds are grouped by the sum, in ``BINS`` intervals of equal width. A third panel has the honest cost if agents
-    minimise it.
+    Worlds are grouped by this sum, in ``BINS`` intervals of equal width. If agents minimise the honest cost, a third
+    panel shows it.
     """
     minimised = result.about.get("agent_settings", {}).get("harm_count", "first")
     counts = ({**HARM, minimised: COLUMN[minimised]}).items()

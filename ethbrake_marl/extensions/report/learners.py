@@ -32,7 +32,6 @@ def _borne(compared: Compared, count: str) -> Sheet:
 
 
 def _added(compared: Compared) -> Sheet:
-    """For each learner: (harm if it brakes fully) - (harm of the whole team)."""
     result, counts, rows = compared.result, _counts(compared), list[Row]()
     for name in (compared.scenario.vehicle_names[body - 1] for body in compared.scenario.learners):
         pairs = ((result[without(name)][COLUMN[count]], result[TEAM][COLUMN[count]]) for count in counts)

@@ -35,14 +35,13 @@ class Section(NamedTuple):
 
 
 def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Sequence[Section]) -> str:
-    """Return a page. ``lead`` stands below its title; ``opening``, parts above the table of contents."""
+    """Return a page. ``lead`` is the text below its title; ``opening``, parts above the table of contents."""
     style, script = (Markup("\n".join(map(read_file, names))) for names in (_STYLES, _SCRIPTS))
     values = {"title": title, "lead": lead, "opening": opening, "sections": sections, "style": style, "script": script}
     return str(fill("page.html.j2", **values))
 
 
 def part(name: str, *values: object) -> Markup:
-    """Return the macro ``name`` of ``parts.html.j2``, filled with values."""
     macros = _environment().get_template("parts.html.j2").module
     return Markup(getattr(macros, name)(*values))
 
@@ -52,10 +51,7 @@ def table(sheet: Sheet) -> Markup:
 
 
 def drawing(figure: Figure, title: str, description: str) -> Markup:
-    """Return a figure with a title and a description.
-
-    Its caption becomes text of the page, because the text of a wide figure is too small on a phone.
-    """
+    """Return a figure with a title and a description; its caption becomes text of the page, readable on a phone."""
     caption = " ".join(figure.get_supxlabel().split())
     figure.supxlabel("")
     svg = base64.b64encode(picture_bytes(figure, "figure.svg")).decode()
@@ -65,7 +61,7 @@ def drawing(figure: Figure, title: str, description: str) -> Markup:
 
 
 def data(name: str, content: object) -> Markup:
-    """Return ``content`` as JSON for the scripts of the page, in an HTML element with the id ``name``.
+    """Return ``content`` as JSON for the page's scripts, in an HTML element with the id ``name``.
 
     The characters < > and & are escaped, so the content cannot end the element or begin a new one.
     """
@@ -76,12 +72,12 @@ def data(name: str, content: object) -> Markup:
 
 
 def fill(file: str, **values: Any) -> Markup:
-    """Return the template ``file``, filled with ``values``: HTML (``Markup``) unchanged, all else escaped."""
+    """Return a template filled with values. HTML (``Markup``) stays unchanged, everything else is escaped."""
     return Markup(_environment().get_template(file).render(values))
 
 
 def shown(value: object) -> str:
-    """Return ``value`` as text, with control characters and characters that change the writing direction escaped."""
+    """Return ``value`` as text; control characters, and characters that change the writing direction, are escaped."""
     return value if isinstance(value, Markup) else plain_text(str(value), keep=_STAY)
 
 
@@ -106,5 +102,5 @@ def _environment() -> Environment:
 
 
 def _sha256(text: str) -> str:
-    """Return the digest by which the page allows its own style and its own script, and no others."""
+    """Return the digest with which the page's security policy allows its own style and script, and no others."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"

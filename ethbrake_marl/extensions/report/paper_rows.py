@@ -64,7 +64,7 @@ SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant
 
 
 def is_papers_test(scenario: Scenario) -> bool:
-    """Can results in this scenario be compared with the paper's?"""
+    """Return whether results in this scenario can be compared with the paper's."""
     return scenario.name in SHOWN_WITH and is_as_shipped(scenario)
 
 

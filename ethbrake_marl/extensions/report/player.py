@@ -1,4 +1,4 @@
-"""The episode player of a page: its data are pieces of motion, between which the player computes places."""
+"""The episode player of a page. Its data are pieces of constant acceleration."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_SHOWN = 3  # agents that are shown at the start
 def player(
     compared: Compared, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
 ) -> Markup:
-    """Return the player of some worlds. It first shows the first agent, ``focus``, and the last.
+    """Return the player of some worlds. It shows ``focus`` and the last agent first.
 
     ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, with
     samples ``SAMPLE_S`` apart.
@@ -97,7 +97,7 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 
 
 def moved(pieces: Floats, t: Floats, N: int) -> Floats:
-    """Return the pieces as they are ``t`` (s) after their beginning, without the time."""
+    """Return pieces of motion (``pieces_of``, without their times) ``t`` seconds after their beginning."""
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
     gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]
@@ -110,7 +110,7 @@ def replaced_at_s(record: EpisodeRecord) -> list[float]:
 
 
 def _impacts(record: EpisodeRecord) -> list[list[float]]:
-    """Return seven numbers of each impact that is drawn, earlier ones first.
+    """Return seven numbers of each impact, in order of time.
 
     The time (s), the pair (-1: the obstacle), the closing speed (m/s), whether it is the pair's first impact, the
     number of impacts so far, and both harms so far (m2/s2), which end with those of the episode.

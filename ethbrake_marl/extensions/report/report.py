@@ -1,4 +1,4 @@
-"""The page about compared agents: what they did in the same worlds, in tables, figures and episodes to watch."""
+"""The page about compared agents: tables, figures, and episodes to watch."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def measured(agents: SummaryTable) -> list[Markup]:
 
 
 def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
-    """Return the ten worlds in which an agent did worst; those that the player shows have a button."""
+    """Return the ten worlds in which an agent did worst. Those that the player shows have a button."""
     result, known, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}

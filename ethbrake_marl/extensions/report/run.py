@@ -46,12 +46,10 @@ PAGE = "report.html"
 
 
 class RunReport:
-    """Report of an experiment (``training.experiment.Report``)."""
-
     measures: tuple[str, ...] = (*Tables.measures, *MEASURES)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Write results in the other tests, pictures and page; return tables to print, and where the page is."""
+        """Write the results in the other tests, pictures and page. Return tables to print, and where the page is."""
         compared, folder = experiment.compared, experiment.trained.directory
         single = experiment.learned != TEAM
         tests, done = other_tests(compared.scenario) if single else [], count()

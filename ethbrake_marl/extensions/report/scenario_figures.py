@@ -32,7 +32,7 @@ def write_worlds(path: Path, scenario: Scenario, episodes: int, *, seed: int, fo
 
 @in_our_style
 def worlds_figure(scenario: Scenario, drawn: Drawn, *, seed: int) -> Figure:
-    """Draw a distribution for each quantity that differs between worlds, and three of the worlds at the alert."""
+    """Draw the distribution of each quantity that differs between worlds, and three worlds at the alert."""
     varying = _varying(drawn)
     columns = min(max(len(varying), 1), ABREAST)
     rows = -(-len(varying) // columns)
@@ -50,7 +50,6 @@ def worlds_figure(scenario: Scenario, drawn: Drawn, *, seed: int) -> Figure:
 
 
 def _varying(drawn: Drawn) -> dict[Rule, dict[int, Floats]]:
-    """Return rule of a quantity -> vehicle or pair (from 0) -> values [n], where they are not all alike."""
     columns, varying = quantities_of(drawn.worlds, drawn.friction), dict[Rule, dict[int, Floats]]()
     for rule in (rule for rule in RULES.values() if rule.column):
         for i in range(rule.count(drawn.worlds.vehicles)):
@@ -82,7 +81,6 @@ def _distribution(axes: Axes, rule: Rule, entries: dict[int, Floats]) -> None:
 
 
 def _pictures(scenario: Scenario, drawn: Drawn) -> Frame:
-    """Pictures of some worlds at the alert, one below the other, with the same scale."""
     worlds = drawn.worlds
     ranked = np.argsort(worlds.gaps_m.sum(axis=1), kind="stable")
     rows = {name: int(ranked[round(rank * (worlds.n - 1))]) for name, rank in SHOWN.items()}

@@ -84,14 +84,14 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
     """Return a figure with ``rows`` times ``columns`` panels, and their axes, row by row.
 
-    ``size_in``: width and height in inches. ``how``: for matplotlib's ``subplots``.
+    ``size_in``: width and height in inches. ``how``: arguments of matplotlib's ``subplots``.
     """
     figure = new_figure(*size_in)
     return figure, list(figure.subplots(rows, columns, squeeze=False, **how).ravel())
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """Return the style of curve ``number`` (from 0) for matplotlib's ``plot``; curve 7 has the style of curve 0."""
+    """Return the style of curve ``number`` (from 0) for matplotlib's ``plot``. After the last style they repeat."""
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
@@ -118,7 +118,7 @@ def band(axes: Axes, x: Sequence[float] | Floats, low: Any, high: Any, style: Ma
 def finish(
     figure: Figure, caption: str, legend: Axes | None = None, *, columns: int = 6, fontsize: float = 9
 ) -> Figure:
-    """Add a caption and, with ``columns`` and ``fontsize``, the legend of one panel."""
+    """Add a caption and, if ``legend`` is given, the legend of this panel above all panels."""
     if legend is not None:
         named = legend.get_legend_handles_labels()
         figure.legend(*named, loc="outside upper left", ncols=columns, frameon=False, fontsize=fontsize)
@@ -151,11 +151,11 @@ def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> N
 
 
 def plain(value: float, _: int) -> str:
-    """Return the number at a tick of an axis as text such as 1000, not as a power of ten."""
+    """Return an axis label's number as text such as 1000, not as a power of ten."""
     return f"{value:g}"
 
 
 def quantities(world: State) -> str:
-    """Return the quantities of one world in words: ``d = (7, 7) m; v = (20, 18, 20) m/s; ...``."""
+    """Return the quantities of one world as text such as ``d = (7, 7) m; v = (20, 18, 20) m/s; ...``."""
     ranges = ranges_of(quantities_of(world))
     return caption({"scenario": "", "count": 1, **ranges}).partition("; ")[2]

@@ -1,4 +1,4 @@
-"""The three tests on which a policy is evaluated, and a table with the results of all three."""
+"""The three shipped tests of a policy, and a table with the results in all of them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ KEPT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the shor
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Is it the shipped scenario of its name, apart from title, description and source?"""
+    """Return whether a scenario equals the shipped one of its name, except title, description and source."""
     return scenario.content(without=WORDS) == load_scenario(scenario.name).content(without=WORDS)
 
 
@@ -39,14 +39,14 @@ def other_tests(scenario: Scenario) -> list[Scenario]:
 
 
 def title_of(name: str) -> str:
-    """Return the title of a test: ``Obstacle test``."""
+    """Return the title of a test, such as ``Obstacle test``."""
     return TESTS[name].partition(":")[0]
 
 
 def brief(compared: Compared, others: Mapping[str, Compared]) -> Sheet:
     """Return a short table: collision rate, both harms and, if agents minimise it, the honest cost with the push.
 
-    Below it, the same means in the other tests, name -> results.
+    ``others``: results in other tests, name -> results; their means follow below.
     """
     table = compared.table
     whole = table.terminal()

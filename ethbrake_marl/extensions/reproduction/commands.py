@@ -1,4 +1,4 @@
-"""The command ``reproduce``: the paper's figures and tables, and our results beside them."""
+"""The command ``reproduce``."""
 
 from __future__ import annotations
 
@@ -79,7 +79,10 @@ def reproduce_command(
 
 
 def chosen_policies(text: str) -> dict[str, str]:
-    """Return the specs of PPO and SAC; ``text`` replaces some. Raises ``InvalidInput`` if one cannot drive here."""
+    """Return the agents to use as PPO and SAC: name -> agent name. ``text`` replaces some, such as ``ppo=policy@RUN``.
+
+    Raises ``InvalidInput`` if one cannot drive here.
+    """
     from ethbrake_marl.extensions.reproduction.random_test import SHIPPED, WORLDS, drive_all
     from ethbrake_marl.extensions.reproduction.readings import STATED
     from ethbrake_marl.extensions.reproduction.search import NEAREST

@@ -39,26 +39,32 @@ EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "PPO, not
 
 
 def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy under a reading, [n]."""
+    """Return the first-impact harm of each strategy under a reading of the paper's text, [n]."""
     found = strategies(reading, episodes, policies)
     lines = {name: each["first"] for name, each in found.items()} | {EXPECTED: found[E_V2X_BM][PREDICTED]}
     return lines | ({PROVEN: least_harm(reading, episodes)} if reading.step_s is None else {})
 
 
 def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[str, Floats]:
-    """The same in the paper's map, with the policies of its process, [seeds, n]; nothing without trainings."""
+    """Return the harm in the paper's fixed-step map, with policies trained as in the paper: strategy -> [seeds, n].
+
+    Empty without such trainings.
+    """
     found = of_the_process(reading, episodes, settings)
     trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in found.items()}
     return {**lines_of(reading._replace(step_s=MAP_STEP_S), episodes, {}), **trained} if found else {}
 
 
 def estimate(line: Floats, rows: Floats) -> Estimate:
-    """Return the mean harm in some worlds; its interval is over the worlds, or over the seeds if there are several."""
+    """Return the mean harm in some worlds, with a 95 % interval.
+
+    The interval is over the worlds or, if there are several seeds, over the seeds.
+    """
     return mean(line[rows]) if line.ndim == 1 else mean(line[:, rows].mean(axis=1))
 
 
 def by_distance(reading: Reading, episodes: int, lines: Lines) -> Groups:
-    """Return the groups of worlds with similar sums of both gaps, ``10-12 m``, ...; none is empty."""
+    """Group worlds by the sum of both gaps: ``10-12 m`` and so on. No group is empty."""
     group = np.digitize(opened(reading.only(*WORLDS), episodes)[2].gaps_m.sum(axis=1), ENDS_M[1:-1])
     return {f"{ENDS_M[k]}-{ENDS_M[k + 1]} m": (lines, group == k) for k in np.unique(group).tolist()}
 
@@ -71,7 +77,10 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 
 
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequence[str], x_label: str) -> Made:
-    """A figure of mean harm, with a panel for each reading, and a table for each. ``shown``: in the figure."""
+    """Return a figure of mean harm, with a panel for each reading of the paper, and a table for each.
+
+    ``shown``: strategies that the figure shows.
+    """
     estimates = {
         reading: {
             name: {group: estimate(lines[name], rows) for group, (lines, rows) in groups.items()} for name in names
@@ -102,7 +111,7 @@ def over_distance(stem: str, readings: Mapping[str, Groups], shown: Sequence[str
 
 
 def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Groups]:
-    """Groups as stated and in the nearest reading."""
+    """Group worlds by distance, under the paper's parameters as stated and in the reading nearest to its results."""
     episodes, found = min(DISTANCE_WORLDS, settings.episodes), {}
     for name, reading in (("as stated", STATED), ("nearest reading", NEAREST)):
         there = reading._replace(base=DISTANCE)
@@ -148,7 +157,7 @@ ONE = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # the world 
 
 
 def reproduce_delays(settings: Settings) -> Made:
-    """Harm at three delays, in the single world of the paper's figure. The delays are our choice."""
+    """Reproduce the harm at three delays, of our choice, in the single world of the paper's figure."""
     groups, trained, one = {}, {}, np.array([True])
     for delay in DELAYS:
         reading = STATED._replace(base=f"paper-delay-{delay}", others=ONE)

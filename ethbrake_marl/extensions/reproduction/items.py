@@ -1,4 +1,4 @@
-"""The paper's figures and tables in its order, and what it leaves open: reproduce them, and write them to a folder."""
+"""The paper's figures and tables, in its order, and the list of what it leaves open; write them to a folder."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ QUICK = "Figures 2 and 3, the paper's own process and the search over the readin
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the items of these names in the order of the paper; all, if there are none. Raises ``UnknownName``."""
+    """Return the paper's figures and tables with these names; without names, all. Raises ``UnknownName``."""
     known = {item.name: item for item in ITEMS}
     for name in names:
         if name not in known:
@@ -131,9 +131,10 @@ def cost(settings: Settings, items: Sequence[Item]) -> str:
 def reproduce(
     settings: Settings, items: Sequence[Item], machine: str, *, force: bool = False
 ) -> dict[Item, Made] | None:
-    """Train what is missing, make the items, and write page, figures and tables. None: Ctrl-C stopped a training.
+    """Train what is missing, and write figures, tables and a page. Return None if Ctrl-C stopped a training.
 
-    Raises ``AlreadyExists`` if the folder has results, unless ``force`` is true. Trainings in the folder are used.
+    Finished trainings in the folder are used. Raises ``AlreadyExists`` if the folder has results and ``force`` is
+    false.
     """
     folder, results = settings.folder, {}
     check_folder(folder, (PAGE,), force=force)
@@ -187,12 +188,11 @@ def plain(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
 
 
 def overview(results: Mapping[Item, Made]) -> Sheet:
-    """Return the table of all claims, the paper's and ours."""
     return claims_sheet([claim for made in results.values() for claim in made.claims])
 
 
 def page(made_by: str, results: Mapping[Item, Made], settings: Settings) -> str:
-    """Return the page with all results as Markdown. ``made_by``: the command, the day, the machine."""
+    """Return the page with all results as Markdown. ``made_by``: the command, the day and the machine."""
     lead = f"Numbers, statements and figures of {PAPER}, and ours. Made by {made_by}."
     parts = ["# The paper, reproduced", lead, LEAD, *([] if settings.full else [QUICK]), overview(results).markdown()]
     for item, made in results.items():

@@ -1,8 +1,8 @@
 """Trainings by the paper's own process, and its learning curves.
 
-The process is the recipes ``ppo-paper`` and ``sac-paper`` in the paper's map: five seeds in the random test, three at
-a high and a low delay (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``). One more PPO of ours is stopped
-before it has converged.
+The process consists of the recipes ``ppo-paper`` and ``sac-paper`` in the paper's map: five seeds in the random test,
+three at a high and a low delay (``fig:ppo_sac_high_latency``, ``fig:ppo_sac_low_latency``). Another PPO training, with
+our recipe, is stopped before it has converged.
 """
 
 from __future__ import annotations
@@ -59,19 +59,22 @@ def is_finished(run: Path) -> bool:
 
 
 def trained(folder: Path, group: str) -> dict[str, list[Path]]:
-    """Return the runs of a group: recipe -> folder for each seed. A recipe with an unfinished run is left out."""
+    """Return the finished trainings of a group: recipe -> folder for each seed.
+
+    Recipes with an unfinished training are left out.
+    """
     every = {plan.recipe: runs_of(folder, group, plan) for plan in GROUPS[group]}
     return {recipe: runs for recipe, runs in every.items() if all(map(is_finished, runs))}
 
 
 def seconds_left(folder: Path, groups: Iterable[str]) -> float:
-    """Return about how much processor time the unfinished runs take (s)."""
+    """Return an estimate of the processor time that the unfinished runs take (s)."""
     plans = [(group, plan) for group in groups for plan in GROUPS[group]]
     return sum(plan.seconds for group, plan in plans for run in runs_of(folder, group, plan) if not is_finished(run))
 
 
 def train(settings: Settings, groups: Iterable[str]) -> bool:
-    """Do, or continue, the unfinished runs of some groups. Return False if Ctrl-C stopped one.
+    """Start, or continue, the unfinished trainings of some groups. Return False if Ctrl-C stopped one.
 
     Raises ``MissingExtra`` without torch, and the errors of ``eb.train`` and ``eb.resume``.
     """
@@ -98,13 +101,13 @@ def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
 
 
 def unconverged(folder: Path) -> str:
-    """Return the spec of the trained policy "obtained from training before convergence occurred"."""
+    """Return the agent name of the policy that the paper calls "obtained from training before convergence occurred"."""
     ((run,),) = trained(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"
 
 
 def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
-    """Return the trained policies of the paper's process, name -> one spec for each seed; nothing without ``full``."""
+    """Return the policies trained as in the paper: name -> one agent name per seed. Empty without ``settings.full``."""
     runs = trained(settings.folder, group) if settings.full else {}
     return {
         name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
@@ -119,7 +122,7 @@ Values = Sequence[Mapping[float, float]]  # for each seed: progress (%) -> value
 
 
 class Course(NamedTuple):
-    """Trainings by one recipe at one delay: two quantities over the progress, for each seed."""
+    """Learning curves of one recipe at one delay, for each seed, over the progress of the training (%)."""
 
     returns: Values  # mean return of training episodes
     harm: Values  # first-impact harm on the fixed list (m2/s2)
@@ -127,44 +130,44 @@ class Course(NamedTuple):
 
     @property
     def values(self) -> Floats:
-        """Returns, [seeds, k]."""
+        """Returns of the training episodes, [seeds, k]."""
         return np.array([[*each.values()] for each in self.returns])
 
     @property
     def late(self) -> Floats:
-        """Returns over the last quarter of the progress, [seeds, at least 2]."""
+        """Returns in the last quarter of the progress, [seeds, at least 2]."""
         return self.values[:, -max(self.values.shape[1] // 4, 2) :]
 
     @property
     def last(self) -> Floats:
-        """Mean return over the last tenth of the progress, [seeds]."""
+        """Mean return in the last tenth of the progress, [seeds]."""
         return np.asarray(self.values[:, -max(self.values.shape[1] // 10, 1) :].mean(axis=1))
 
     @property
     def rise(self) -> Floats:
-        """Growth of the return from the first value to the last ones, [seeds]."""
+        """Increase of the return from the first value to the last ones, [seeds]."""
         return np.asarray(self.last - self.values[:, 0])
 
     @property
     def converged(self) -> Floats:
-        """Decisions until nine tenths of the rise, [seeds]; all decisions without a rise."""
+        """Number of decisions until the return has made nine tenths of its rise, [seeds]; all if it does not rise."""
         risen = self.values >= (self.values[:, 0] + RISEN * self.rise)[:, np.newaxis]
         progress = np.where(self.rise > 0.0, np.array([*self.returns[0]])[risen.argmax(axis=1)], 100.0)
         return 0.01 * self.decisions * progress
 
     @property
     def unrest(self) -> Floats:
-        """Standard deviation of the return over the last quarter of the progress, [seeds]."""
+        """Standard deviation of the return in the last quarter of the progress, [seeds]."""
         return np.asarray(self.late.std(axis=1, ddof=1))
 
     @property
     def spread(self) -> Floats:
-        """Mean distance of the return from the mean of all seeds over the last quarter of the progress, [seeds]."""
+        """Mean distance of the return from the mean over all seeds, in the last quarter of the progress, [seeds]."""
         return np.asarray(np.abs(self.late - self.late.mean(axis=0)).mean(axis=1))
 
 
 def column(run: Path, name: str) -> dict[float, float]:
-    """Return a column of a run's table: decisions -> value, where there is one."""
+    """Return a column of the table of a training's progress: decisions -> value, without empty cells."""
     rows = csv.DictReader((run / "progress.csv").read_text("utf-8").splitlines())
     return {float(row["steps"]): float(row[name]) for row in rows if row.get(name)}
 
@@ -241,7 +244,7 @@ def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Clai
 
 
 def faster(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
-    """Does SAC converge faster? The paper's axis is the progress of trainings whose lengths it does not give."""
+    """Return the claim that SAC converges faster. The paper's axis is the progress of trainings of unknown length."""
     ends = {name: (course.converged.mean(), course.decisions) for name, course in courses.items()}
     text = ", ".join(f"{name} after {at:,.0f} of {whole:,.0f} decisions" for name, (at, whole) in ends.items())
     why = f"in decisions or in % of the training? The lengths are ours: {text} is at nine tenths of its rise"

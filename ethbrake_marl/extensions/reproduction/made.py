@@ -1,4 +1,4 @@
-"""Input and results of an item of a reproduction. An item is a figure or a table of the paper."""
+"""Input and results of an item of a reproduction, which is a figure or a table of the paper."""
 
 from __future__ import annotations
 

@@ -62,10 +62,10 @@ EXACT_ALONE = ("push", "drove", "still_moving")  # terms of a reward that the ma
 
 
 def exchange(line: Floats, car: Floats) -> None:
-    """Let the pairs that overlap and close have their impacts, and count their harm, in place.
+    """Apply eq. (13) to all pairs that overlap and close, and count the harm, in place. w is the closing speed:
 
-    With the closing speed w: ``v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})`` and
-    ``v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})`` (eq. 13).
+    v_i+ = v_i + m_{i+1} (1 + e) w / (m_i + m_{i+1})
+    v_{i+1}+ = v_{i+1} - m_i (1 + e) w / (m_i + m_{i+1})
     """
     speed, gap = line[:, SPEED], line[:, GAP]
     for p in range(speed.shape[1] - 2, 0, -1):
@@ -84,7 +84,7 @@ def exchange(line: Floats, car: Floats) -> None:
 
 
 def sample(state: State, step_s: float) -> State:
-    """Return the state one sample later: impacts, then a step with ``state.wanted`` [n, N + 1] m/s2."""
+    """Advance the state by one sampling period: impacts, then a step with ``state.wanted`` [n, N + 1] (m/s2)."""
     line, clock = state.line.copy(), state.clock.copy()
     exchange(line, state.car)
     now, speed, limit = clock[:, TIME, np.newaxis], line[:, SPEED], state.car[:, LIMIT]
@@ -119,10 +119,9 @@ class MappedGame(Game):
     __slots__ = ()
 
     def first_decision(self, alert: State) -> State:
-        """Return the episodes at the first sample.
+        """Return the episodes at the first decision.
 
-        Raises ``InvalidInput`` for worlds with an impact before it, and for worlds of a scenario with exact impacts,
-        with which agents would plan.
+        Raises ``InvalidInput`` for worlds with an impact before it, and for worlds of a scenario with exact impacts.
         """
         if PHYSICS not in alert.memories:
             raise InvalidInput(
@@ -139,7 +138,6 @@ class MappedGame(Game):
         return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """The memory of ``state`` is not reused."""
         before, rules = one_step.decided(self.rules, self.scripts, state, actions), self.rules
         after, over = sample(before, rules.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
@@ -159,10 +157,8 @@ class MappedGame(Game):
 
 
 class PaperMap:
-    """``physics: paper-map``."""
-
     def check(self, scenario: Scenario) -> None:
-        """Refuse an obstacle, brakes that build up, and messages."""
+        """Raise an error for an obstacle, brakes that build up, and messages."""
         right = "is not known to physics: paper-map; leave one of the two out"
         for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
             require(key not in scenario.sources, (key,), UNSHOWN, right)

@@ -1,6 +1,6 @@
 """The paper's random test (``Table:Random``) under a reading: collision rate and mean harm of its four strategies.
 
-A row of the table depends only on some fields of a reading: what readings have in common is simulated once.
+A row of the table depends only on some fields of a reading, so readings that share these are simulated once.
 """
 
 from __future__ import annotations
@@ -52,9 +52,9 @@ def outcome_of(last: State) -> Outcome:
 
 
 def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED) -> Table:
-    """Return the table under a reading, in the first worlds of the random test, with 95 % intervals.
+    """Return the table of the paper's random test, with 95 % intervals, under a reading of its text.
 
-    ``policies`` are the specs of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the coupled H* in the paper's map.
+    ``policies``: agent names of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the coupled H* in the paper's map.
     """
     specs = {HYBRID_SAC: policies["SAC"], HYBRID_PPO: policies["PPO"]}
     return {row: estimate(row, reading.only(*DEPENDS[row]), episodes, specs.get(row, "")) for row in DEPENDS}
@@ -67,9 +67,9 @@ def estimate(row: str, reading: Reading, episodes: int, spec: str) -> tuple[Esti
 
 
 def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
-    """Return whether there is a collision, and the harm (m2/s2), in each world, [n], as a reading reports them.
+    """Return collisions and harm (m2/s2) of each world, [n] each, as a reading of the paper reports them.
 
-    ``spec`` is the policy of a hybrid.
+    ``row``: strategy; ``spec``: agent name of the policy in a hybrid.
     """
     worlds, counted = reading.only(*WORLDS), reading.counted
     if row == NON_E:
@@ -90,13 +90,13 @@ def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple
 
 
 def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str = "first") -> Outcome:
-    """If the policy does more harm than ``bound`` (H*, [n] m2/s2), E-V2X-BM drives the whole episode."""
+    """Return the outcome of the policy where its harm is at most ``bound`` (H*, [n] m2/s2), else that of E-V2X-BM."""
     follows = policy[counted] <= bound
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
 
 
 def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
-    """Return what happens, or what was predicted at the alert."""
+    """Return collisions and harm, [n] each: as they happened, or as they were predicted at the alert."""
     if numbers == "predicted":
         return predicted > 0.0, predicted
     return collided, predicted if numbers == "predicted harm, realised collisions" else harm
@@ -110,7 +110,7 @@ def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
 
 @cache
 def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> Outcome:
-    """Let all vehicles brake fully, or Vehicle 2 as E-V2X-BM plans.
+    """Simulate full braking of all vehicles or, with ``plans``, Vehicle 2 with the deceleration of E-V2X-BM.
 
     After an impact vehicles brake on, or coast from the next decision on, or the episode ends.
     """
@@ -134,9 +134,9 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
 
 @cache
 def plan(plans: Reading, episodes: int) -> Choice:
-    """Return what E-V2X-BM plans by the paper's closed form, which knows neither restitution nor time step.
+    """Return the deceleration that E-V2X-BM chooses by the paper's closed form, without restitution and time steps.
 
-    Of all decelerations that do equally little harm it is the middle one, or the low or high end.
+    If several decelerations do the same least harm, the reading says which is taken: the smallest, middle or largest.
     """
     latencies = () if plans.plans_as_stated else ("acts_s", "rear_s")
     _, _, alert = opened(plans.only("base", "others", "seed", *latencies), episodes)
@@ -156,7 +156,7 @@ def plan(plans: Reading, episodes: int) -> Choice:
 
 @cache
 def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> Outcome:
-    """Let an agent drive Vehicle 2, also a policy that was trained elsewhere: the page says so."""
+    """Simulate an agent as Vehicle 2, without warning if it is a policy trained for other worlds."""
     scenario, game, alert = opened(worlds, episodes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Unfamiliar)

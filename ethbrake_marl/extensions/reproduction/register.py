@@ -1,4 +1,4 @@
-"""The register: what the paper leaves open, our default, and what the random test gives with another value."""
+"""The register: what the paper leaves open, our default, and the results of the random test with another value."""
 
 from __future__ import annotations
 

@@ -66,7 +66,7 @@ NEAREST = STATED._replace(
 
 
 def readings_of(grid: Grid) -> Iterator[Reading]:
-    """Yield all combinations of a grid; the paper's map has no coupled H*."""
+    """Yield all readings of the paper in a grid, except those with the coupled H* in the paper's map."""
     for values in product(*grid.values()):
         reading = STATED._replace(**dict(zip(grid, values, strict=True)))
         if reading.step_s is None or reading.hybrid != "realised, by the coupled H*":
@@ -81,9 +81,7 @@ def search(
 ) -> tuple[list[Reading], Floats]:
     """Return the R readings of a grid, and for each the 4 rows of Table III, [R, 4, 2]: collision rate and mean harm.
 
-    Of readings with the same numbers only the first is returned.
-
-    ``policies`` are the specs of ``SAC`` and ``PPO``.
+    Of readings with the same numbers only the first is returned. ``policies``: agent names of ``SAC`` and ``PPO``.
     """
     every, different = [*readings_of(grid)], dict[bytes, tuple[Reading, Floats]]()
     for number, reading in enumerate(every):
@@ -96,24 +94,24 @@ def search(
 
 
 def numbers_of(table: Table) -> Floats:
-    """Collision rate and mean harm (m2/s2) of the four rows, [4, 2]."""
+    """Return collision rate and mean harm (m2/s2) of the four rows of the random test's table, [4, 2]."""
     return np.array([[each.value for each in row] for row in table.values()])
 
 
 def differences(numbers: Floats, printed: Floats = PRINTED) -> Floats:
-    """Numbers [..., 4, 2], printed [4, 2] -> differences [..., 8]."""
+    """Return the relative differences |ours / printed - 1| of a table's numbers [..., 4, 2], as [..., 8]."""
     return np.abs(numbers / printed - 1.0).reshape(*numbers.shape[:-2], -1)
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> Any:
-    """Numbers [..., 4, 2] -> distance [...]."""
+    """Return the root mean square of the relative differences of a table's eight numbers, [...]."""
     return np.sqrt(np.square(differences(numbers, printed)).mean(axis=-1))
 
 
 def by_chance(numbers: Floats) -> Floats:
-    """Return the distance of the nearest reading from each of some tables that nobody has printed, [FAKES].
+    """Return the distance between each of some random tables and the reading nearest to it, [FAKES].
 
-    ``numbers`` [R, 4, 2]: all readings.
+    Each number of a random table comes from a random reading. ``numbers`` [R, 4, 2]: tables of all readings.
     """
     drawn = np.random.default_rng(0).integers(len(numbers), size=(FAKES, *PRINTED.shape))
     fakes = np.take_along_axis(numbers, drawn, axis=0)

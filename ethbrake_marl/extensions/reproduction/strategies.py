@@ -1,4 +1,4 @@
-"""What every strategy does under a reading: the paper's four, what we set beside them, and the paper's own process."""
+"""What each strategy does under a reading: the paper's four, ours for comparison, and the paper's own process."""
 
 from __future__ import annotations
 
@@ -31,9 +31,10 @@ MAP_STEP_S = 0.1
 
 
 def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Outcome]:
-    """Return what each strategy does; if impacts are exact, also E-V2X-BM (coupled) and its hybrids.
+    """Return the outcome of each strategy under a reading of the paper: name -> outcome.
 
-    ``policies``: name -> spec. Hybrids decide by first-impact harm.
+    If impacts are exact, E-V2X-BM (coupled) and its hybrids are included. ``policies``: name -> agent name. Hybrids
+    decide by first-impact harm.
     """
     worlds, plans = reading.only(*WORLDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
@@ -52,7 +53,10 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
 
 
 def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[str, list[dict[str, Outcome]]]:
-    """Return what the policies of the paper's process do in its map, alone and in the hybrid: name -> seeds."""
+    """Return the outcomes of policies trained as in the paper, alone and in the hybrid, in the paper's fixed-step map.
+
+    Policy -> for each seed, outcomes of all strategies.
+    """
     mapped = reading._replace(step_s=MAP_STEP_S)
     return {
         name: [strategies(mapped, episodes, {name: spec}) for spec in specs]
@@ -61,6 +65,6 @@ def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[
 
 
 def least_harm(reading: Reading, episodes: int) -> Floats:
-    """Return a proven lower bound for every strategy under exact impacts, [n] m2/s2."""
+    """Return a proven lower bound on the harm of every strategy under exact impacts, [n] m2/s2."""
     scenario, _, alert = opened(reading.only(*WORLDS), episodes)
     return lower_bound(alert, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm

@@ -1,4 +1,4 @@
-"""The paper's tables (``Table:hybrid``, ``Table:Random``) and its two contributions: every number, every conclusion."""
+"""The paper's tables (``Table:hybrid``, ``Table:Random``) and its two contributions, as numbers and conclusions."""
 
 from __future__ import annotations
 
@@ -72,9 +72,10 @@ def number_claims(
     *,
     not_ours: bool = False,
 ) -> list[Claim]:
-    """Return every number that the paper prints as a claim.
+    """Return every number that the paper prints in a table as a claim, compared with ours.
 
-    ``least`` [n] m2/s2: no strategy does less as stated. ``not_ours``: the policies are the user's.
+    ``stated``, ``nearest``: our outcomes under the paper's parameters as stated, and in the reading nearest to its
+    results. ``least`` [n] m2/s2: proven lower bound, as stated. ``not_ours``: the policies are the user's.
     """
     claims, proven = [], {RATE: rate(least > 0.0), AVERAGE: mean(least)}
     for row in printed:
@@ -108,7 +109,7 @@ def number_claims(
 
 
 def outcomes_sheet(title: str, found: Mapping[str, Outcome], least: Floats) -> Sheet:
-    """``least`` [n] m2/s2 is a proven lower bound for all strategies."""
+    """Return a table of the strategies' collision rates and harm. ``least`` [n] m2/s2: proven lower bound."""
     rows = [
         (
             *(name, rate(each["collided"]), mean(each["first"]), mean(each["total"])),
@@ -124,7 +125,10 @@ COLUMNS = PERCENT, *map(Column, ("First-impact harm", "Total harm", "Predicted h
 
 
 def process_sheet(settings: Settings, reading: Reading, episodes: int) -> list[Sheet]:
-    """The paper's process in its map, means over seeds with t intervals; nothing without trainings."""
+    """Return a table of policies trained as in the paper, in its fixed-step map: means over seeds with t intervals.
+
+    Empty without such trainings.
+    """
     found = of_the_process(reading, episodes, settings)
     if not found:
         return []
@@ -140,7 +144,7 @@ def process_sheet(settings: Settings, reading: Reading, episodes: int) -> list[S
 
 
 def compared(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less]:
-    """Compare both harms of a strategy with those of others, in the same worlds."""
+    """Compare both harms of the strategy ``smaller`` with those of the strategies ``larger``, in the same worlds."""
     return [
         Less.of_worlds(f"{smaller} minus {other}, {harm}", found[smaller][count], found[other][count])
         for other in larger
@@ -149,7 +153,7 @@ def compared(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[L
 
 
 def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less]:
-    """Compare the collision rate (%) of a strategy with those of others, in the same worlds."""
+    """Compare the collision rate (%) of the strategy ``smaller`` with those of ``larger``, in the same worlds."""
     percent = {name: 100.0 * each["collided"] for name, each in found.items()}
     return [
         Less.of_worlds(f"{smaller} minus {other}, % of worlds", percent[smaller], percent[other]) for other in larger
@@ -157,7 +161,10 @@ def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less
 
 
 def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: str, larger: str) -> list[Less]:
-    """Compare two strategies of the paper's process, ``{}`` for the policy, over its seeds."""
+    """Compare two strategies over the seeds of policies trained as in the paper.
+
+    ``{}`` in the strategies' names stands for the policy's name.
+    """
     parts = []
     for name, seeds in process.items():
         one, other = smaller.format(name), larger.format(name)
@@ -168,7 +175,7 @@ def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: 
 
 
 def conclusions(found: Mapping[str, Outcome], policies: Iterable[str]) -> dict[str, list[Less]]:
-    """Return what the paper concludes from its table: statement -> the comparisons that it needs."""
+    """Return the paper's conclusions from its table: statement -> the comparisons that must hold."""
     hybrids = [f"Hybrid {name}" for name in policies]
     baselines = [name for name in (E_V2X_BM, COUPLED) if name in found]
     return {
@@ -217,7 +224,7 @@ def reproduce_random_table(settings: Settings) -> Made:
 
 
 def reproduce_hybrid_table(settings: Settings) -> Made:
-    """The table of 5,000 worlds, with the speeds of the random test."""
+    """Reproduce the paper's table of 5,000 worlds, with the speeds of the random test."""
     episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged(settings.folder)
     least = least_harm(STATED, episodes)
 

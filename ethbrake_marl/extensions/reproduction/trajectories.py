@@ -40,9 +40,9 @@ def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Recor
 
 @in_our_style
 def road_figure(records: Records, caption: str) -> Figure:
-    """Draw vehicles along the road in four episodes, as the paper does: a row each, an arrow every second.
+    """Draw the vehicles along the road in four episodes, one row for each vehicle, with an arrow every second.
 
-    Dashes join equal times.
+    Dashed lines join equal times.
     """
     figure, panels = new_panels((10.0, 4.8), 2, 2, sharex=True, sharey=True)
     for axes, ((name, number), record) in zip(panels, records.items(), strict=True):
@@ -60,7 +60,7 @@ def road_figure(records: Records, caption: str) -> Figure:
 
 @in_our_style
 def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
-    """Draw the command of Vehicle 2 over time, a panel for each policy and scenario; ``curves``: label -> episodes."""
+    """Draw the command of Vehicle 2 over time, one panel per policy and scenario; ``curves``: label -> episodes."""
     figure, every = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
     for axes, key in zip(every, next(iter(curves.values())), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
@@ -75,7 +75,10 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 
 
 def all_records(settings: Settings) -> dict[str, Records]:
-    """As stated, in the nearest reading, and of the first seed of the paper's process."""
+    """Return recorded episodes under the paper's parameters as stated, and in the reading nearest to its results.
+
+    After trainings by the paper's own recipes, also the episodes of their first seed.
+    """
     policies = tuple(settings.policies.items())
     found = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
     trained = tuple((name, specs[0]) for name, specs in process(settings).items())
@@ -163,9 +166,9 @@ def reproduce_accelerations(settings: Settings) -> Made:
 
 
 def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
-    """Return a recorded quantity under PPO, and under SAC at the same times; an episode that has ended stays as it is.
+    """Return a recorded quantity under PPO, and under SAC at the same times; a finished episode keeps its last value.
 
-    ``what`` is an attribute of ``EpisodeRecord``, ``column`` a vehicle or pair from 0.
+    ``what``: attribute of ``EpisodeRecord``; ``column``: vehicle or pair, from 0.
     """
     pair = [records[name, number] for name in ("PPO", "SAC")]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
@@ -179,7 +182,10 @@ def apart(records: Records, number: int, what: str) -> float:
 
 
 def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
-    """Return claims about one world; each reading has: claim -> words, what should be smaller minus the larger one."""
+    """Return claims that one quantity is smaller than another in a world, as stated and in the nearest reading.
+
+    ``readings``: for both, claim -> words, (smaller quantity) - (larger one).
+    """
     claims = []
     for text in readings[0]:
         (words, stated), (_, nearest) = (each[text] for each in readings)
@@ -193,9 +199,9 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
 
 
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return the first command of Vehicle 2 and the sum of its changes (m/s2), and how long it brakes.
+    """Return the first command of Vehicle 2, the sum of its changes (m/s2), and the share of time in which it brakes.
 
-    The last is a share of the time in which it moves after its latency.
+    The share is of the time in which it moves after its latency.
     """
     acting = record.time_s >= float(record.initial.latency_s[0, VEHICLE_2])
     command, moving = record.command_mps2[acting, VEHICLE_2], record.speeds_mps[acting, VEHICLE_2] > 0.0

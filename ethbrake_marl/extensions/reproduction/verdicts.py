@@ -30,7 +30,7 @@ APART = Column("Difference", sign="+")
 
 
 class Claim(NamedTuple):
-    """A number or a statement of the paper, and what comes out here."""
+    """A number or a statement of the paper, and our result."""
 
     where: str  # in the paper
     paper: str  # what it says
@@ -46,7 +46,7 @@ class Claim(NamedTuple):
 
 
 def claims_sheet(claims: Sequence[Claim]) -> Sheet:
-    """Return a table with one row for each claim of the paper: theirs, ours, and why they differ."""
+    """Return a table with one row for each claim: the paper's, ours, and why they differ."""
     rows = [(each.where, each.paper, each.ours, each.nearest, each.verdict) for each in claims]
     headings = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
     return Sheet("", [Column(heading, text=True) for heading in headings], rows)
@@ -58,7 +58,7 @@ def chance(ours: Estimate) -> float:
 
 
 def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) -> Outcome:
-    """Compare a printed number, which is not 0, with ours. ``least``: a proven lower bound for all strategies."""
+    """Compare a printed number (not 0) with ours. ``least``: proven lower bound for all strategies."""
     if least is not None and least.value - printed > chance(least):
         return "cannot be"
     if abs(ours.value - printed) <= TOLERANCE * abs(printed):
@@ -87,7 +87,10 @@ class Less(NamedTuple):
 
 
 def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, Outcome, str]:
-    """Return in how many comparisons a statement holds, the outcome, and the comparisons that fail, or the nearest."""
+    """Judge a statement of the paper: in how many comparisons it holds, the outcome, and the comparisons that fail.
+
+    If none fails, the closest comparison is returned instead.
+    """
     compared = [part for part in parts if not part.both_are_0]
     failing = [part for part in compared if not part.holds]
     ties = f", both are 0 in {len(parts) - len(compared)} more" if len(compared) < len(parts) else ""
@@ -105,7 +108,10 @@ def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, O
 def judge(
     where: str, paper: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, why: str = "", show: Column = APART
 ) -> Claim:
-    """``why``: the reason if the statement differs."""
+    """Compare a statement of the paper with our results as stated and in the nearest reading.
+
+    ``why``: the reason to show if they differ.
+    """
     ours, outcome, numbers = judge_statement(stated, show)
     other = judge_statement(nearest, show)[0] if nearest else ""
     text = f"{why} ({numbers})" if why and outcome == "differs" else numbers

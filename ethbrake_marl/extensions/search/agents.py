@@ -37,9 +37,9 @@ class Memory(NamedTuple):
 
 
 class Planner:
-    """Drives commands that it chose at the alert; it assumes that other learners brake fully.
+    """Agent that chooses all its commands at the alert and then gives them, assuming that other learners brake fully.
 
-    If they do, ``predicted_harm`` is to the last bit the harm that happens.
+    If they do, ``predicted_harm`` is the harm that happens, to the last bit.
     """
 
     knows = MODEL
@@ -48,7 +48,7 @@ class Planner:
         self.name, self.scenario, self.count = name, scenario, count
 
     def begin(self, alert: State, body: int) -> Memory:
-        """Choose. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
+        """Choose the commands. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
         game, alert = alone(self.scenario, alert, body)
         problem = problem_of(game, alert, count=self.count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
@@ -65,7 +65,7 @@ class Planner:
 
 
 class BestHarm(Planner):
-    """Drives the best known profile: from a shipped table, or from a search.
+    """Agent that drives the best known commands: from a shipped table, or from a search.
 
     A search begins with E-V2X-BM. If this vehicle is the only learner, the better of its result and of a shipped
     policy's episode is improved once more, so the agent never does more harm than either.
@@ -76,13 +76,12 @@ class BestHarm(Planner):
         self.budget = budget
 
     def check(self, game: Game, body: int) -> None:
-        """Warn (``Unfamiliar``) if the scenario's table is for other physics, so that every world is searched."""
+        """Warn (``Unfamiliar``) if the scenario's table is of other physics, so that every world must be searched."""
         outdated = outdated_tables()
         if game.name in outdated:
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Search the worlds that are in no table, and all of them if the objective is not the line's harm."""
         known, profiles = best_known(problem, self.count)
         commands = profiles.stepwise(int(problem.last_step.max()))[:, :, 0]
         harm = problem.value(problem.follow(profiles))
@@ -109,9 +108,9 @@ class BestHarm(Planner):
 
 
 class Searched(Planner):
-    """Improves another agent's commands by a search at the alert.
+    """Agent that improves another agent's commands by a search at the alert.
 
-    It is never worse than that agent, if other vehicles keep their commands.
+    It never does more harm than that agent, if the other vehicles keep their commands.
     """
 
     def __init__(self, inner: Agent, scenario: Scenario, count: str = "first", candidates: int = CANDIDATES) -> None:
@@ -129,7 +128,7 @@ class Searched(Planner):
 
 
 def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
-    """Return the game in which one vehicle learns and the other learners brake fully, and its worlds.
+    """Return a game in which only vehicle ``body`` learns while other learners brake fully, and its worlds.
 
     Raises ``InvalidInput`` if an agent drives another vehicle, because its commands are not known at the alert.
     """

@@ -1,4 +1,4 @@
-"""The least harm known: search every world of a list, under one or more counts, for one or several vehicles."""
+"""Best known harm: search every world of a list for the commands with the least harm, for one or several vehicles."""
 
 from __future__ import annotations
 
@@ -44,17 +44,18 @@ def best_harm(
     """Search worlds at the alert for the profile of least harm; return a table.
 
     The harm is at most that of every profile in ``given``, and of one vehicle's best constant deceleration. With
-    several vehicles it is at most what the same search reaches with one of them, while the others brake fully. It
-    depends on no other world.
+    several vehicles it is at most what the same search reaches with one of them, while the others brake fully. A
+    world's result depends on no other world.
 
     Args:
         game: rules of the episodes.
         alert: worlds at the alert.
-        counts: which are searched, one after the other (``episode.counts``); every profile counts for all of them.
+        counts: counts of harm to search, one after the other (``episode.counts``). A profile found for one count is
+            also tried for the others.
         bodies: vehicles that are controlled (1: Vehicle 1); None: the learners.
-        budget: number of profiles that are simulated in each world, in each count.
-        seed: of the random search.
-        threads: None: one for each core.
+        budget: number of profiles that are simulated in each world, for each count.
+        seed: seed of the random search.
+        threads: number of threads; None: one for each core.
         given: profiles that are tried first, [n] each.
         objective: what is minimised, as under a scenario's key ``objective``; the table then holds its values.
 
@@ -81,7 +82,6 @@ def best_harm(
 def _searched(
     game: Game, alert: State, problem: Problem, given: Sequence[Profiles], objective: Declared, effort: dict[str, int]
 ) -> tuple[Profiles, dict[str, Floats]]:
-    """Search with all that a search can start from: with several vehicles, the best profile of each of them alone."""
     starts, bodies = starting_profiles(problem, alert, given), problem.bodies.tolist()
     for c, body in enumerate(bodies if len(bodies) > 1 else ()):
         own = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)
@@ -93,9 +93,9 @@ def _searched(
 
 
 def starting_profiles(problem: Problem, alert: State, given: Sequence[Profiles] = ()) -> list[Profiles]:
-    """Return the profiles with which a search begins: constant commands and ``given``.
+    """Return the profiles with which a search begins: constant commands, ``given``, and for a single vehicle some more.
 
-    With one vehicle also the choice of E-V2X-BM, and profiles of full driving and full braking.
+    These are E-V2X-BM's choice and profiles of full driving and full braking.
     """
     starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
     if len(problem.bodies) > 1:
@@ -112,7 +112,7 @@ def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
 
 
 def joined(parts: Sequence[Profiles], n: int) -> Profiles:
-    """Join parts of some profiles for each of n worlds, [n * Q]: first all profiles of world 0, and so on."""
+    """Join lists of profiles, each [n * q], into [n * Q]: first all profiles of world 0, and so on."""
     short = [part.shortened() for part in parts]
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in short], axis=1)
     B = parts[0].commands_mps2.shape[2]
@@ -132,20 +132,20 @@ def search_list(
     threads: int | None = None,
     **options: Any,
 ) -> BestHarmTable:
-    """Run ``best_harm`` on a long list of worlds, chunk by chunk; an interrupted run goes on where it stopped.
+    """Run ``best_harm`` on a long list of worlds, part by part; an interrupted run continues where it stopped.
 
     Args:
         game: rules of the episodes.
         alert: worlds at the alert.
-        chunks: folder of the finished chunks; those of the same search are read. None: no files.
+        chunks: folder in which finished parts are stored, and read if they are of the same search. None: no files.
         on_progress: called with the number of finished worlds, and of all.
         known: a table of the same vehicles, whose profiles are tried first.
-        teams: what they drive is tried first, too.
+        teams: agents whose commands are tried first, too.
         bodies: as for ``best_harm``.
         threads: as for ``best_harm``.
-        options: of ``best_harm``.
+        options: other arguments of ``best_harm``.
 
-    Raises ``InvalidInput`` if ``known`` holds none of the worlds, and the errors of ``best_harm``.
+    Raises ``InvalidInput`` if ``known`` contains none of the worlds, and the errors of ``best_harm``.
 
     """
     parts = []
@@ -178,7 +178,7 @@ def search_list(
 
 
 def commands_of(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
-    """Return the commands of a team at every decision of a problem, [n, T, B] m/s2; after an episode its last ones."""
+    """Let a team drive; return its commands at every decision of a problem, [n, T, B] m/s2, the last ones repeated."""
     bodies, states = sorted(team.drivers), play(game, alert, team)
     next(states)
     commands = np.stack([state.wanted[:, bodies] for _, state in states], axis=1)
@@ -186,6 +186,6 @@ def commands_of(problem: Problem, game: Game, alert: State, team: Team) -> Float
 
 
 def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
-    """Return what a team drives, as profiles with one phase for each change of command."""
+    """Let a team drive; return its commands as profiles with one phase for each change of command."""
     steps = Profiles.of_steps(commands_of(problem, game, alert, team), problem.last_step)
     return Profiles.join([compact(*one) for one in zip(*steps, strict=True)])

@@ -1,4 +1,4 @@
-"""Profiles of full driving and full braking, with which a search begins: a random one seldom draws them.
+"""Profiles of full driving and full braking, with which a search begins, because random profiles seldom contain them.
 
 The proof of the lower bound (``extensions.proofs``) shows that the best commands have one of two forms: drive fully,
 brake fully until the vehicle meets the one ahead, and drive fully again; or brake fully, drive fully until the vehicle
@@ -28,8 +28,8 @@ WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # steps by which the second cha
 def extreme_profiles(problem: Problem) -> Profiles:
     """Return the best extreme profiles of one controlled vehicle, [n * KEPT]: first those of world 0, and so on.
 
-    The meetings are computed as if the neighbours braked fully. Profiles of coasting fill up a world in which a vehicle
-    moves backward, or without neighbours.
+    The meetings are computed as if the neighbours braked fully. In worlds without neighbours, or with a vehicle that
+    moves backward, the profiles coast.
     """
     (body,), n, last = problem.bodies.tolist(), problem.n, problem.last_step
     at, random = rows_of(problem.state, body), seeded(problem.identity, 0)
@@ -65,10 +65,10 @@ def meeting_of(at, kind, change):
 
 @large
 def write_extreme(kind, change, meeting, early, share, step, last, low, high, ends, commands):
-    """Write the extreme profile that changes at ``change`` (s) and at ``meeting`` (s).
+    """Write the extreme profile that changes its command at ``change`` (s) and at ``meeting`` (s).
 
-    ``kind`` 0 drives, brakes and drives; 1 brakes, drives and brakes. Commands change between steps only: within the
-    step of a change the command is the mean of both, so that the speed after it is exact.
+    ``kind`` 0 drives, brakes and drives; 1 brakes, drives and brakes. Commands can change only between steps: in the
+    step of a change the command is the mean of both, so that the speed after the step is exact.
     """
     first, second = (high, low) if kind == 0 else (low, high)
     turn = int(min(change / step, float(last)))

@@ -1,7 +1,7 @@
-"""Compiled random search for the best commands in one world: follow a profile, gather good ones, improve one.
+"""Compiled random search for the best commands in one world: simulate profiles, keep good ones, improve the best.
 
-A profile has ``ends`` [K], the decisions at which its phases end, and ``commands`` [K, B] (m/s2). Every world has a
-random stream of its own, so its result does not depend on other worlds. Plans are profiles with one phase for each
+A profile has ``ends`` [K], the decisions at which its phases end, and ``commands`` [K, B] (m/s2). Each world has a
+random stream of its own, so its result does not depend on other worlds. *Plans* are profiles with one phase for each
 decision. No function of NumPy is used, so the kernels also compile for a GPU.
 """
 
@@ -40,7 +40,7 @@ MOVE_END = 3  # moves the border between two phases by whole steps
 
 
 class World(NamedTuple):
-    """One world, ready to be simulated again and again."""
+    """One world with its random stream, prepared for many simulations."""
 
     car: Floats  # [CAR_ROWS, N + 1]
     clock: Floats  # [CLOCK_COLUMNS] at the first decision
@@ -55,7 +55,7 @@ class World(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Working memory: a profile that is tried, and the states at the beginning of the phases."""
+    """Working memory of a search: the profile that is being tried, and the states at the beginning of its phases."""
 
     lines: Floats  # [K + 1, LINE_ROWS, N + 1] of the best profile; lines[0] is the state at the first decision
     tried: Floats  # [K + 1, LINE_ROWS, N + 1] of the profile that is tried
@@ -65,8 +65,6 @@ class Room(NamedTuple):
 
 
 class Field(NamedTuple):
-    """M profiles that are improved at the same time."""
-
     ends: Ints  # [M, K]
     commands: Floats  # [M, K, B]
     phases: Ints  # [M] number of phases in use; 0: an empty place
@@ -75,7 +73,7 @@ class Field(NamedTuple):
 
 @kernel
 def value_of(world, line):
-    """Return what is minimised (m2/s2), plus a little of the other count of harm."""
+    """Return what the search minimises (m2/s2), plus a little of the other count of harm, which decides ties."""
     aim = world.numbers[AIM]
     return worth(line, world.shares, world.weights[0], aim) + OTHER_WEIGHT * amount_so_far(line, world.weights[1])
 
@@ -91,9 +89,9 @@ def move_line(line, into):
 def follow(world, lines, ends, commands, phase, most):
     """Simulate a profile from ``phase`` on; return its value (m2/s2), and the number of phases until the end.
 
-    Begins with ``lines[phase]`` and writes the state after phase p to ``lines[p + 1]``. Ends when all vehicles are at
+    Starts from ``lines[phase]`` and writes the state after phase p to ``lines[p + 1]``. Ends when all vehicles are at
     rest, or the value reaches ``most`` (m2/s2). The number of phases is -1 if a check of the physics fails. Step by
-    step it has the bits of the episode; phase by phase it is several times faster and rounds differently.
+    step the result has the bits of the episode; phase by phase it is several times faster and rounds differently.
     """
     numbers, clock = world.numbers, world.clock
     value = value_of(world, lines[phase])
@@ -142,13 +140,13 @@ def draw_sign(random):
 
 @kernel
 def allowed(command, low, high):
-    """Return a command within the bounds, rounded toward 0 to a multiple of 1 / RESOLUTION (m/s2)."""
+    """Return a command limited to ``low`` ... ``high``, rounded toward 0 to a multiple of 1 / RESOLUTION (m/s2)."""
     return int(min(max(command, low), high) * RESOLUTION) / RESOLUTION
 
 
 @large
 def draw_command(world, b):
-    """Return a random command (m/s2) of vehicle b, often full braking or driving, coasting, or the command ahead."""
+    """Return a random command (m/s2) of vehicle b; likely are full braking, full driving, 0, and the command ahead."""
     random, body, low, high = world.random, world.bodies[b], world.bounds[b, 0], world.bounds[b, 1]
     u = draw(random)
     if u < 0.35:
@@ -164,10 +162,10 @@ def draw_command(world, b):
 
 @large
 def draw_profile(world, drawing, ends, commands):
-    """Draw a profile; return its number of phases.
+    """Draw a random profile; return its number of phases.
 
-    Six phases of random commands, of which short ones are likelier; or, for a plan, three: often full braking, another
-    command for a while, and full braking.
+    It has six phases of random commands, mostly short ones. A plan has three: often full braking, another command for a
+    while, and full braking.
     """
     random, bounds, last = world.random, world.bounds, int(world.clock[LAST])
     if drawing[KIND] == PLAN:
@@ -192,7 +190,7 @@ def draw_profile(world, drawing, ends, commands):
 
 @large
 def draw_change(world, active, drawing, change):
-    """Draw a change within the first ``active`` phases. The sizes of amounts are log-uniform."""
+    """Draw a random change of one of the first ``active`` phases of a profile. Amounts are log-uniform."""
     random, bounds = world.random, world.bounds
     if drawing[KIND] == PLAN:
         low, high = bounds[0, 0], bounds[0, 1]
@@ -257,7 +255,6 @@ def copy_profile(ends, commands, to_ends, to_commands):
 
 @kernel
 def largest(values):
-    """Return the index of the largest value, the first of equal ones."""
     place = 0
     for m in range(1, values.shape[0]):
         if values[m] > values[place]:
@@ -269,7 +266,7 @@ def largest(values):
 def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
     """Fill ``field`` with the best of the given profiles [Q, K] and of ``drawn`` random ones, in any order.
 
-    Of profiles whose values differ by less than ``same`` (m2/s2) it keeps the first.
+    Of profiles whose values differ by less than ``same`` (m2/s2), only the first is kept.
     """
     worst, number = 0, ends.shape[0]
     begin = min(worst, number)  # 0, but no literal: numba would compile the physics again for it
@@ -299,8 +296,8 @@ def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
 def improve(world, room, ends, commands, budget, drawing, least):
     """Improve a profile in place by at most ``budget`` random changes, until its value is at most ``least``.
 
-    Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its episode ends. An
-    amount that helps is doubled and tried again. Outside of plans, a change without effect costs nothing.
+    Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its episode ends. A
+    change that helps is tried again with twice the amount. A change without effect costs no budget, except in plans.
     """
     change, lines, tried = room.change, room.lines, room.tried
     value, active, spent, phase, again = math.inf, 0, -1, 0, False

@@ -1,4 +1,4 @@
-"""The measures ``limits``: the least harm and honest cost known in each world, and how far an agent is from them."""
+"""The measures ``limits``: the least known harm and honest cost of each world, and an agent's distance from them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from ethbrake_marl.registry import Part
 
 
 def least(game: Game, alert: State) -> dict[str, Floats]:
-    """Return the least known of each count, count -> [n] m2/s2; counts beside harm only if it is known in all worlds.
+    """Return the least known value of each count, count -> [n] m2/s2.
 
-    Raises ``InvalidInput`` if the least harm of a world is in no shipped table.
+    The honest cost is included only if it is known in all worlds. Raises ``InvalidInput`` if the least harm of a world
+    is in no shipped table.
     """
     problem = problem_of(game, alert)
     known = {count: stored(problem, count)[0] for count in COUNTS}
@@ -49,16 +50,12 @@ def _where_known(scenario: str) -> str:
 
 
 def best_known(game: Game, alert: State, last: State) -> Given:
-    """Least harm (honest: least honest cost) known in the same world: of a search that knows the whole world, or of an
-    agent.
-    """
+    """Least harm (honest: least honest cost) known in the same world, from a full-knowledge search or an agent."""
     return least(game, alert)
 
 
 def regret(game: Game, alert: State, last: State) -> Given:
-    """Harm minus the least harm known in the same world; honest: the same of the honest cost. Below 0: the agent did
-    even less.
-    """
+    """Harm (honest: honest cost) minus the least known in the same world. Below 0: the agent did even less."""
     return {count: last.harm(count) - harm for count, harm in least(game, alert).items()}
 
 

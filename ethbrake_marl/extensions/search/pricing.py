@@ -1,8 +1,8 @@
-"""What would happen if some vehicles braked like this? Problems, profiles of commands, and what they cost.
+"""Which harm do given commands lead to? Profiles of commands, and problems: worlds in which the best is searched.
 
 A *profile* holds the commands of the controlled vehicles from the first decision to the horizon: K phases, each with
-constant commands. Phases begin and end at decisions, so agents can follow a profile, and to the last bit its harm is
-the harm that happens. B is the number of controlled vehicles.
+constant commands. Phases begin and end at decisions, so agents can follow a profile, and its harm is the harm that then
+happens, to the last bit. B is the number of controlled vehicles.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Profiles(NamedTuple):
         return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
 
     def shortened(self) -> Profiles:
-        """Return profiles of ``MOST_PHASES`` phases; one that has more becomes its first command, held."""
+        """Return profiles with ``MOST_PHASES`` phases. A longer one is replaced by its first command, held."""
         ends, commands = Profiles.padded([self], MOST_PHASES)[0]
         fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
         ends = np.where(fits[:, np.newaxis], ends[:, :MOST_PHASES], ends[:, -1:])
@@ -84,7 +84,7 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def padded(parts: Sequence[Profiles], least: int = 1) -> list[Profiles]:
-        """Give all parts the same number of phases, at least ``least``, by empty phases."""
+        """Add empty phases so that all parts have the same number of phases, at least ``least``."""
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
             Profiles(
@@ -100,7 +100,7 @@ class Profiles(NamedTuple):
 
 
 def best_of(found: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
-    """Return the least of some harms [n] in each world, and the profile [n] with it; of equal ones, the first."""
+    """Return the least of several harms [n] in each world, and its profile [n]; of equal ones, the first."""
     harms = np.stack([harm for harm, _ in found])
     pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
     every = Profiles.padded([profiles for _, profiles in found])
@@ -108,7 +108,7 @@ def best_of(found: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]
 
 
 class Problem(NamedTuple):
-    """Which commands of some vehicles are best in each of n worlds? Made by ``problem_of``.
+    """n worlds in which the best commands of some vehicles are searched. Made by ``problem_of``.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.search.pricing import problem_of
@@ -116,7 +116,6 @@ class Problem(NamedTuple):
     >>> problem = problem_of(game, scenario.sample(2, seed=7))
     >>> problem.follow(problem.constant(problem.even_grid(3)[:, 1:2])).harm()
     array([80.51086128, 64.27142879])
-
     """
 
     bodies: Ints  # [B] vehicles that are controlled (1: Vehicle 1)
@@ -156,9 +155,9 @@ class Problem(NamedTuple):
         return np.minimum(low + share * (high - low), high)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Return profiles with constant commands [n, Q, B], [n * Q]: first the Q profiles of world 0, and so on.
+        """Return profiles with constant commands [n, Q, B], as [n * Q]: first the Q profiles of world 0, and so on.
 
-        The phases with the same command end at different decisions, so that a search can change them one by one.
+        Each consists of several phases with the same command, which a search can change one by one.
         """
         n, Q, B = commands_mps2.shape
         borders = np.array([2, 5, 9, 14, 20] + (MOST_PHASES - 5) * [np.iinfo(np.int64).max])
@@ -170,10 +169,10 @@ class Problem(NamedTuple):
         return Profiles(self.last_step[:, np.newaxis].copy(), np.zeros((self.n, 1, len(self.bodies))))
 
     def follow(self, profiles: Profiles) -> State:
-        """Return the last states of the episodes in which the controlled vehicles follow their profiles.
+        """Simulate the episodes in which the controlled vehicles follow ``profiles``; return their last states.
 
-        To the last bit these are the episodes in which agents do. Raises ``InvalidInput`` as ``check`` does, and
-        ``PhysicsError`` if a check of the physics fails.
+        They have the bits of the episodes in which agents give these commands. Raises ``InvalidInput`` as ``check``
+        does, and ``PhysicsError`` if a check of the physics fails.
         """
         self.check(profiles)
         line, car, clock, know, wanted, memories = self.state
@@ -189,7 +188,7 @@ class Problem(NamedTuple):
         return State(line, car, clock, know, wanted, memories)
 
     def value(self, last: State, count: str | None = None) -> Floats:
-        """Return what the search minimises in episodes with these last states, [n] m2/s2. ``count`` None: its own."""
+        """Return what the search minimises in episodes that end in ``last``, [n] m2/s2. ``count``: another count."""
         value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
         worths(last.line, self.shares, weights, self.aim, value)
         return value
@@ -200,7 +199,10 @@ class Problem(NamedTuple):
         return {count: self.value(last, count) for count in COUNTS}
 
     def minimising(self, weights: Floats, *, largest: bool = False) -> Problem:
-        """Return the problem that minimises the sum of the vehicles' harm times ``weights`` [n, N], or the largest."""
+        """Return the problem that minimises the sum of the vehicles' harm times ``weights`` [n, N].
+
+        ``largest``: the largest of these products instead.
+        """
         mass = self.state.car[:, MASS]
         weights = np.pad(np.broadcast_to(weights, (self.n, mass.shape[1] - 1)), ((0, 0), (1, 0)))
         front = mass[:, 1:] / (mass[:, :-1] + mass[:, 1:])  # 0 of the obstacle, whose mass is infinite
@@ -210,7 +212,7 @@ class Problem(NamedTuple):
         return self._replace(shares=shares, aim=LARGEST if largest else WEIGHTED)
 
     def check(self, profiles: Profiles) -> None:
-        """Raise ``InvalidInput`` for profiles that do not fit the worlds, or exceed a capacity of a vehicle."""
+        """Raise ``InvalidInput`` for profiles that do not fit the worlds, or exceed a vehicle's capacity."""
         K, B = profiles.ends.shape[-1], len(self.bodies)
         if profiles.ends.shape != (self.n, K) or profiles.commands_mps2.shape != (self.n, K, B):
             raise InvalidInput(
@@ -239,16 +241,16 @@ def problem_of(
     objective: Declared = "total",
     deciders: Sequence[int] | None = None,
 ) -> Problem:
-    """Return the problem of choosing commands of some vehicles in worlds at the alert.
+    """Return the problem of finding the best commands of some vehicles in worlds at the alert.
 
     Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles.
 
     ``bodies``: controlled vehicles (1: Vehicle 1); None: the learners. ``count``: what is minimised
-    (``episode.counts``). ``objective``: as a scenario's key. ``deciders``: the first decision is at their shortest
-    latency; None: ``bodies``.
+    (``episode.counts``). ``objective``: whose harm counts, as under a scenario's key ``objective``. ``deciders``:
+    vehicles whose shortest latency is the time of the first decision; None: ``bodies``.
 
-    Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is no weighted harm, and
-    a script that looks at the state, whose commands are not known at the alert.
+    Raises ``InvalidInput`` for vehicles that do not exist, an unknown count, an objective that is not a weighted sum of
+    harm or ``maximin``, and a script that looks at the state, whose commands are not known at the alert.
     """
     check_exact(alert, "a search for the best braking")
     check_count("count", count)
@@ -276,8 +278,8 @@ def problem_of(
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
     """Return a hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
-    These are the world, the commands of all other vehicles, who is controlled, and ``times`` [n, 4]: first decision,
-    time step, number of steps, horizon.
+    Hashed are the world, the commands of all other vehicles, which vehicles are controlled, and ``times`` [n, 4]: first
+    decision, time step, number of steps, horizon.
     """
     line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)
     controlled = np.zeros(alert.wanted.shape)
@@ -298,9 +300,9 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
 
 
 def aimed(problem: Problem, objective: Declared) -> Problem:
-    """Return the problem that minimises the objective of the controlled vehicles.
+    """Return the problem with the objective of the controlled vehicles.
 
-    Raises ``InvalidInput`` if it is neither a weighted sum of harm nor ``maximin``, or differs among them.
+    Raises ``InvalidInput`` if the objective is neither a weighted sum of harm nor ``maximin``, or differs among them.
     """
     car, chosen = problem.state.car, [body - 1 for body in problem.bodies.tolist()]
     objectives = objectives_of(objective, problem.state.vehicles)
@@ -320,7 +322,7 @@ def aimed(problem: Problem, objective: Declared) -> Problem:
 
 @kernel
 def worth(line, shares, weights, aim):
-    """Return what a search minimises (m2/s2) in one world; it never falls in an episode."""
+    """Return what a search minimises (m2/s2) in one world. It never decreases during an episode."""
     if aim == WHOLE:
         return amount_so_far(line, weights)
     value, from_ahead = 0.0, 0.0
@@ -343,7 +345,7 @@ def worths(line, shares, weights, aim, out):
 
 @large
 def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, horizon_s, scratch, failed):
-    """Follow every profile in place, decision by decision; set ``failed`` [n] where a check of the physics fails."""
+    """Simulate every profile in place, decision by decision. ``failed`` [n]: a check of the physics failed."""
     for k in range(len(failed)):
         phase = 0
         while clock[k, ENDED] == 0.0:

@@ -1,4 +1,4 @@
-"""Search every world of a problem: for the best profile, or around given commands."""
+"""Search every world of a problem for the best profile, or for an improvement of given commands."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ PROFILES = np.zeros(DRAWING, np.int64)  # random profiles and changes are those 
 def search_profiles(
     problem: Problem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1
 ) -> tuple[Profiles, dict[str, Floats]]:
-    """Search each world for the best profile; return it, and its values in all counts, [n] m2/s2.
+    """Search each world for the best profile; return it, and what it costs, count -> [n] m2/s2.
 
     It has at most ``MOST_PHASES`` phases and is at least as good as each of the profiles ``given``, [n * Q]: first the
     Q profiles of world 0, and so on. ``budget`` is about the number of profiles that are simulated in each world. The
-    result is the same for any number of threads.
+    result does not depend on the number of threads.
 
     Raises ``InvalidInput`` for a bad number, and ``PhysicsError`` for worlds in which no profile can be simulated.
     """
@@ -68,8 +68,9 @@ def search_profiles(
 def search_world(world: World, room: Room, given: Profiles, last: int, budget: int) -> Profiles | None:
     """Return the best profile of one world, [1]; None if no profile can be simulated.
 
-    Gathers a field, improves it in rounds that halve it, divides the phases of the best to improve it again, and at
-    last goes step by step: where the harm jumps, rounding decides how much harm a profile does.
+    First many profiles are improved in rounds, each of which keeps the better half. Then the phases of the best are
+    divided and it is improved again; at last with a step-by-step simulation: where harm jumps, rounding decides how
+    large it is.
     """
     K, B = room.commands.shape
     M, rounds = SMALLEST_FIELD, 3
@@ -107,7 +108,7 @@ def sort(field: Field, left: int) -> None:
 
 
 def compact(ends: Ints, commands: Floats) -> Profiles:
-    """Return a profile [1] without empty phases, and with one phase for neighbours of equal commands."""
+    """Return a profile [1] without empty phases, with neighbouring phases of equal commands joined."""
     there = np.diff(ends, prepend=0) > 0
     ends, commands = ends[there], commands[there]
     changes = (commands[1:] != commands[:-1]).any(axis=1)
@@ -115,7 +116,7 @@ def compact(ends: Ints, commands: Floats) -> Profiles:
 
 
 def divide(field: Field, attention: int) -> None:
-    """Halve phases of the best profile until it has all; always the one with the most steps within ``attention``."""
+    """Halve phases of the best profile until it has K; always the longest within the first ``attention`` steps."""
     used, K = field.phases[0], field.ends.shape[1]
     if used > 0 and field.values[0] > 0.0:
         (ends,), (commands,) = compact(field.ends[0, :used], field.commands[0, :used])
@@ -128,7 +129,7 @@ def divide(field: Field, attention: int) -> None:
 
 
 def select(world: World, room: Room, given: Profiles, field: Field) -> None:
-    """Simulate step by step from now on; the best of the field's first and of the given profiles becomes the first."""
+    """Simulate step by step from now on. Put the best profile of ``field`` and ``given`` first in ``field``."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
@@ -140,9 +141,8 @@ def select(world: World, room: Room, given: Profiles, field: Field) -> None:
 def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
     """Improve one vehicle's commands at every decision; return the best, [n, T] m/s2, and their values, [n] m2/s2.
 
-    They are at least as good as the given commands ``commands_mps2`` [n, T]. The best of some random templates is
-    improved as well, because small changes may miss the best commands. A template is one command, another for a while,
-    then full braking.
+    They are at least as good as the given ``commands_mps2`` [n, T]. Because small changes may miss the best commands,
+    the best of some random *templates* is improved as well: one command, another for a while, then full braking.
 
     Raises ``InvalidInput`` for several controlled vehicles, commands that do not fit, or a budget below 1, and
     ``PhysicsError`` for worlds in which the given commands cannot be simulated.
@@ -177,7 +177,7 @@ def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 
 
 
 def seeded(identity: UInt64s, seed: int) -> UInt64s:
-    """Return the initial state of each world's random stream, [n]."""
+    """Return the initial state of each world's random number generator, [n]."""
     with np.errstate(over="ignore"):
         z = identity ^ np.uint64((int(seed) * 0xD1342543DE82EF95) % 2**64)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

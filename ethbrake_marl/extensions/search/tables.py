@@ -1,4 +1,4 @@
-"""Tables of best known harm: for each world, looked up by a hash, the least harm that is known, and its profile."""
+"""Tables of best known harm: the least known harm of each world and its profile, found by a hash of the world."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class BestHarmTable:
 
     @classmethod
     def load(cls, path: Path) -> BestHarmTable:
-        """Read a table, without pickles. Raises ``InvalidInput`` without a file, ``CorruptBundle`` for a bad one."""
+        """Read a table. Raises ``InvalidInput`` if there is no file, and ``CorruptBundle`` for a damaged one."""
         if not path.exists():
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
@@ -59,7 +59,7 @@ class BestHarmTable:
         return cls(arrays["identity"], harm, profiles, header)
 
     def save(self, path: Path) -> None:
-        """Write a compressed .npz without pickles. If writing fails, an old file stays as it was."""
+        """Write a compressed .npz file. If writing fails, an existing file stays unchanged."""
         write_file(path, self.content())
 
     def content(self) -> bytes:
@@ -73,7 +73,6 @@ class BestHarmTable:
         return buffer.getvalue()
 
     def rows(self, identity: UInt64s) -> NDArray[np.int64]:
-        """Return the row of each world, [m]; -1: it is not in the table."""
         order = np.argsort(self.identity, kind="stable")
         rows = order[np.minimum(np.searchsorted(self.identity[order], identity), len(order) - 1)]
         return np.where(self.identity[rows] == identity, rows, -1)
@@ -107,12 +106,12 @@ def _shipped() -> tuple[BestHarmTable, ...]:
 
 
 def shipped_tables() -> tuple[BestHarmTable, ...]:
-    """Return the shipped tables for this installation's physics, in the order of their files' names."""
+    """Return the shipped tables that were made with this installation's physics, in the order of their files' names."""
     return tuple(table for table in _shipped() if table.header.get("physics") == physics_digest())
 
 
 def outdated_tables() -> dict[str, str]:
-    """Return why the other shipped tables are not used: name of the scenario -> one line."""
+    """Return why other shipped tables are not used: name of the scenario -> one line."""
     now = physics_digest()
     others = {table.header["scenario"]: table.header.get("physics") for table in _shipped()}
     return {
@@ -124,14 +123,13 @@ def outdated_tables() -> dict[str, str]:
 
 
 def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
-    """``stored`` in all shipped tables."""
+    """Return the least known harm in all shipped tables, [n] m2/s2, and its profiles (``BestHarmTable.stored``)."""
     found = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()
     return best_of([each for each in found if np.isfinite(each[0]).any()] or [nothing])
 
 
 def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
-    """Raises ``ValueError`` for a damaged or too large file."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())

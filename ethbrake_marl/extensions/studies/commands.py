@@ -1,4 +1,4 @@
-"""The group of commands ``study``, and its command ``study falsify``, which searches for an agent's worst worlds."""
+"""The group of commands ``study``, and its command ``study falsify``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ study_group = typer.Typer(
 
 @study_group.callback()
 def _group() -> None:
-    """Make this app a group of commands although it has only one; other extensions add theirs."""
+    """Make ``study`` a group of commands although this app has only one; other extensions add theirs."""
 
 
 @study_group.command("falsify", epilog=example("study falsify --agent ppo --against e_v2x_bm --output worst.csv"))

@@ -1,4 +1,4 @@
-"""Every world of a scenario as a point of a unit cube: a coordinate is one random number that the world depends on."""
+"""A scenario's worlds as points of a unit cube, with one coordinate for each random number that a world depends on."""
 
 from __future__ import annotations
 
@@ -36,17 +36,17 @@ class Cube(NamedTuple):
         return draw_once(self.scenario, numbers, index).worlds
 
     def accepts(self, worlds: State) -> Bools:
-        """Return whether the scenario accepts the worlds, [n]: it may reject those with an early impact."""
+        """Return whether the scenario accepts the worlds, [n]. Some scenarios reject worlds with an early impact."""
         if self.scenario.early_impacts == "keep" or not self.scenario.learners:
             return np.ones(worlds.n, np.bool_)
         return ~has_early_impact(self.scenario, worlds)
 
 
 def cube_of(scenario: Scenario) -> Cube:
-    """Return the coordinates of a scenario: of all random numbers, those whose change changes a world.
+    """Return the coordinates of a scenario: all random numbers whose change changes a world.
 
-    Raises ``InvalidInput`` if nothing is random, for a mixture, and for a channel with random delays or losses: a table
-    of worlds cannot store them.
+    Raises ``InvalidInput`` if nothing is random, for a mixture of scenarios, and for a channel with random delays or
+    losses, which a table of worlds cannot store.
     """
     if scenario.members:
         members = ", ".join(member.name for member in scenario.members)

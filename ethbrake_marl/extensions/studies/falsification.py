@@ -1,4 +1,4 @@
-"""Adaptive search of the unit cube for several points that have high scores and are far apart."""
+"""Adaptive search of the unit cube for several points with high scores that are far apart."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def search(
 ) -> tuple[Floats, Floats]:
     """Search the unit cube for points with a high score; return all tried points, [budget, d], and their scores.
 
-    The points are tried in rounds. Half of a round is spread evenly over the cube (scrambled Sobol points). Each other
-    point is one step away from a *parent*, one of the best points so far that are not close to each other: a normally
-    distributed step in some coordinates, or half the difference between two random parents (differential evolution). In
-    the first round, and later while no score is above the median score, all points are spread evenly. ``on_round`` gets
-    the number of points tried so far. The same seed gives the same points.
+    Points are tried in rounds. Half of a round is spread evenly over the cube (scrambled Sobol points). Each other
+    point is one step away from a *parent*, one of the best points so far that are not close to each other. The step is
+    normally distributed in some coordinates, or half the difference between two random parents (differential
+    evolution). While no score is above the median, all points are spread evenly. ``on_round`` gets the number of points
+    tried so far.
     """
     rng, spread = np.random.default_rng([seed, dimensions]), _spread(dimensions, seed)
     points, scores = np.empty((0, dimensions)), np.empty(0)
@@ -46,7 +46,7 @@ def search(
 
 
 def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
-    """Yield, without end, points [d] that are spread evenly over the unit cube (scrambled Sobol points)."""
+    """Yield, without end, points [d] that are evenly spread over the unit cube (scrambled Sobol points)."""
     from scipy.stats import qmc  # imported here, because it takes a second to load
 
     sobol = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, dimensions, 1]))
@@ -55,9 +55,9 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(points: Floats, scores: Floats, count: int) -> Ints:
-    """Return at most ``count`` rows of points with high finite scores, the highest first.
+    """Return at most ``count`` rows of points with high finite scores, highest first.
 
-    Any two of them differ by at least ``APART`` in some coordinate.
+    Any two of the points differ by at least ``APART`` in some coordinate.
     """
     order = np.argsort(-scores, kind="stable")
     order = order[np.isfinite(scores[order])]
@@ -69,7 +69,6 @@ def far_apart(points: Floats, scores: Floats, count: int) -> Ints:
 
 
 def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
-    """Return ``count`` new points [count, d], about equally many near each point of ``parents`` [m, d]."""
     if count == 0:
         return parents[:0]
     parent = parents[np.arange(count) % len(parents)]

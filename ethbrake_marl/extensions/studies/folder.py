@@ -1,4 +1,4 @@
-"""The folder of a study, for instance of an ablation: one process at a time, and always the same settings."""
+"""The folder of a study, such as an ablation: used by one process at a time, and always with the same settings."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from ethbrake_marl.files.store import check_folder, hold_lock, remove_unfinished
 def work_in(
     folder: Path, kind: str, settings: Mapping[str, Any], *, record: str, advice: str, writes: Collection[str] = ()
 ) -> Iterator[None]:
-    """Context manager that creates the folder of a study, and locks it against other processes while the block runs.
+    """Context manager that creates a study's folder, and locks it against other processes.
 
-    After an interruption, the same command continues the work in this folder. Unfinished files of killed processes are
-    removed before the block runs.
+    After an interruption, the same command continues the work in this folder; unfinished files of killed processes are
+    removed first.
 
     Args:
         folder: created if necessary.
-        kind: words for its content in messages, such as ``an ablation``.
+        kind: what it contains, in words for messages, such as ``an ablation``.
         settings: all settings and software versions on which the results depend, as plain data.
         record: name of the file that stores them.
-        advice: last words of an error message, which say what the user can do.
+        advice: end of error messages, which says what the user can do.
         writes: names of the files that the study will overwrite.
 
     Raises ``InvalidInput`` if the folder is not writable or stores other settings, and if another process works in it.
@@ -50,7 +50,6 @@ def work_in(
 
 
 def _differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return what differs between two settings, in words: ``seeds 2, now 5; recipes``."""
     differences = []
     for name in dict.fromkeys([*now, *before]):
         old, new = before.get(name), now.get(name)

@@ -29,7 +29,9 @@ class Measured(NamedTuple):
 
 
 class Measure(NamedTuple):
-    """``harm``: the agent's harm. ``regret``: its harm minus that of another agent, by default the best known harm.
+    """Measure of how badly an agent does in a world.
+
+    ``harm``: the agent's harm. ``regret``: its harm minus that of another agent, by default the best known harm.
     ``bound``: its harm minus the bound of its shield at the alert; above 0 the bound is broken.
     """
 
@@ -41,10 +43,11 @@ class Measure(NamedTuple):
 
     @classmethod
     def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> Measure:
-        """``against`` is the other agent; None: none, or the best known commands.
+        """Return the measure ``name`` of ``agent``.
 
-        Both are names or agents, as ``eb.evaluate`` takes them. Raises ``InvalidInput`` if another agent is not
-        compared, or a name means several, and the errors of ``teams_of``.
+        ``against``: the other agent; None: none, or the best known commands. Agents are names or objects, as for
+        ``eb.evaluate``. Raises ``InvalidInput`` if ``against`` is not used, or a name means several agents, and the
+        errors of ``teams_of``.
         """
         if name not in MEASURES:
             raise unknown_name("measure", name, MEASURES)
@@ -59,7 +62,7 @@ class Measure(NamedTuple):
         return cls(name, loaded, game, sum(teams, ()), harm_count)
 
     def __call__(self, worlds: State) -> Measured:
-        """Raises ``InvalidInput`` for ``bound`` without a shield."""
+        """Return the measure in some worlds. Raises ``InvalidInput`` for ``bound`` without a shield."""
         last, *other = (drive(self.game, worlds, team) for team in self.teams)
         harm = last.harm(self.harm_count)
         if self.name == "harm":
@@ -78,9 +81,9 @@ class Measure(NamedTuple):
     ) -> tuple[State, Measured, Floats]:
         """Search all worlds that the scenario can draw for those in which the agent does worst.
 
-        Returns the worst worlds at the alert, worst first, what the agent does in them, and the scores of all tried
-        worlds [budget] (m2/s2; minus infinity: the scenario rejects the world). For every measure but ``bound``, only
-        worlds with a score above 0 are returned, perhaps none. Any two of the at most ``most`` worlds differ clearly.
+        Returns the at most ``most`` worst worlds at the alert, worst first, the measure in them, and the scores of all
+        tried worlds [budget] (m2/s2; minus infinity: the scenario rejects the world). Except for ``bound``, only worlds
+        with a score above 0 are returned, perhaps none. Any two of the worlds differ clearly.
 
         Raises the errors of ``cube_of``, and ``InvalidInput`` if the scenario rejects every tried world.
         """
@@ -106,7 +109,7 @@ class Measure(NamedTuple):
 
 
 def states_of(worlds: State, scenario: Scenario) -> list[dict[str, float]]:
-    """Return the initial state of each world by column: gaps, speeds, and what the scenario does not fix."""
+    """Return each world's initial state: gaps, speeds, and what the scenario does not fix, by name of the column."""
     fixed = fixed_columns(scenario)
     columns = {name: values for name, values in quantities_of(worlds).items() if name not in fixed}
     return [

@@ -90,7 +90,6 @@ def proposed(way: str, seed: int) -> Iterator[Callable[[tuple[int, int]], np.nda
 
 
 def attacked(game: Game, truth: State, shield: Any, count: str, way: str, seed: int) -> Episodes:
-    """Let somebody propose as he likes, in these worlds at the alert."""
     game = game._replace(shield=shield)
     state, rises, decisions = game.reset(truth), 0, 0
     bound = first = state.memories["shield"].price.copy()

@@ -25,7 +25,7 @@ DEAF = BASE.replace(
 
 
 def lines_at(scenario: eb.Scenario, n: int = 20, steps: int = 0, action: float = 0.0) -> tuple[Lines, State, State]:
-    """The median lines of Vehicle 2, the true state, and the lines, after some steps."""
+    """Return estimated lines before any message, the true state after some steps, and the estimated lines then."""
     loaded, game = eb.open_game(scenario)
     lines, alert = Lines.of(loaded, 2, corners=False), loaded.sample(n, 7)
     state = game.reset(alert)
@@ -112,7 +112,7 @@ def test_a_piece_that_messages_lack__is_the_middle_of_its_range() -> None:
 
 
 def test_who_reacts_later_than_it_says__is_believed_to_react_from_then_on() -> None:
-    """News of the alert reach Vehicle 3 late; Vehicle 2 hears from it that it does not brake yet."""
+    """The alert reaches Vehicle 3 late; a message tells Vehicle 2 that Vehicle 3 does not brake yet."""
     _, state, median = lines_at(BASE.replace(v2x=CHANCE, latency_s=[0, 0.1, 0.1]), 200, steps=2)
     late = (state.car[:, LATENCY, 3] > state.time_s) & (state.know[:, 2, 3] <= state.time_s)
     assert late.any() and (median.car[late, OWN_LATENCY, 3] == 0.1).all()
@@ -162,7 +162,7 @@ def test_news_remove_corners__and_the_bound_falls() -> None:
 
 
 def test_news__never_make_the_shield_drop_a_better_plan() -> None:
-    """Every new plan here is full driving, which costs more than the plan that is held."""
+    """Every new plan here is full driving, which costs more than the present plan."""
     loaded, game = eb.open_game(NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]))
     shield = EstimatedShield(scenario=loaded, corners=True)
     game = game._replace(shield=shield)
@@ -214,7 +214,7 @@ CHANNELS = {
 
 
 def decided(spec: str, scenario: eb.Scenario, alert: State) -> tuple[Any, Any]:
-    """Commands of Vehicle 2 at its first four decisions, and whether it has heard or felt anything of Vehicle 3."""
+    """Return Vehicle 2's commands at its first four decisions, and whether it has received or felt Vehicle 3."""
     _, game = eb.open_game(scenario)
     team, commands, aware = eb.make_agent(spec, scenario=scenario), [], []
     team = team if isinstance(team, eb.Team) else eb.Team(spec, {2: team})

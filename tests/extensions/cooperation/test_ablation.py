@@ -21,7 +21,6 @@ from tests.fixtures.pictures import draw_nothing
 
 
 def columns(vehicles: list[list[float]]) -> dict[str, np.ndarray]:
-    """One seed, in as many worlds as there are rows of harm of three vehicles."""
     each = np.array([vehicles], np.float64)
     borne = {f"{name}_{i + 1}": each[:, :, i] for name in COLUMN.values() for i in range(3)}
     line = dict.fromkeys((*COLUMN.values(), "goal"), each.sum(axis=2))

@@ -44,7 +44,6 @@ SMALL = VINE.replace(n_envs=32, n_steps=6, tried=96, batch_size=32, holds=[1, 2,
 
 
 def both(recipe: Any, scenario: Any) -> tuple[Any, Any]:
-    """Return the processor's model and the twin's, which have visited the same decisions."""
     models = new_model(recipe, scenario), new_model(recipe.replace(device="twin"), scenario)
     models[0].ep_info_buffer, models[0].ep_success_buffer = [], []
     return models

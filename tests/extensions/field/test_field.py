@@ -30,7 +30,6 @@ TWO = eb.Scenario(
 
 
 def driven(spec, scenario=TWO, steps=22):
-    """Commands of Vehicle 2 at its first decisions."""
     loaded, game = eb.open_game(scenario)
     team = eb.Team("one", {2: eb.make_agent(spec, scenario=scenario)})
     states = [state for _, state in eb.play(game, loaded.sample(1, 7), team)]

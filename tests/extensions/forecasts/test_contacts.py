@@ -22,7 +22,6 @@ PAPER = load_scenario("paper-random")
 
 
 def seen(state: State, body: int, step_s: float = 0.1, view: View = CONTACT) -> dict[str, np.ndarray]:
-    """Return the forecasts of one vehicle by name, before they are scaled, [n] each."""
     values = view.observe(state, np.array([body]), step_s)[:, 0]
     return {f.name.partition(".")[2]: values[:, c] * f.scale for c, f in enumerate(view.features)}
 

@@ -124,18 +124,15 @@ def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> Non
 
 
 def experts(**changes: Any) -> Any:
-    """Return the recipe of a mixture of experts, with changes."""
     return EXPERTS.replace(experts=PLAN | changes)
 
 
 def start(name: str, **changes: Any) -> Callable[[], object]:
-    """Return what begins a training that starts from a policy."""
     recipe = load_recipe("vine").replace(start=name, **changes)
     return lambda: train(recipe, "paper-random", "new", measure=None, on_progress=None)
 
 
 def choose(**changes: Any) -> Callable[[], object]:
-    """Return what begins a training that chooses among policies."""
     return lambda: train(load_recipe("rollout-classification").replace(**changes), "paper-random", "new")
 
 

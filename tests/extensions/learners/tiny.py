@@ -42,7 +42,6 @@ EXPERTS = VINE.replace(experts=PLAN)
 
 
 def new_model(recipe: Any, scenario: Any = PAPER) -> Any:
-    """Return a model that has not learned yet, whose environment has been reset."""
     training = Training.of(recipe, scenario)
     model = algorithm_of(recipe).build(training, make_environment(training))
     model.set_logger(Logger(None, []))

@@ -16,13 +16,11 @@ LINE = Scenario(
 
 
 def played(v2x: Any, observation: Any = None, n: int = 1, scenario: Scenario = LINE) -> tuple[Game, State]:
-    """The game of a line with this channel, and its first n worlds at the first decision."""
     _, game = open_game(scenario.replace(v2x=v2x), observation=observation)
     return game, game.reset(game.draw(n, 7, 0))
 
 
 def seen_by(game: Game, state: State, body: int) -> dict[str, float]:
-    """What a body observes in world 0."""
     return dict(zip(game.views[body].names, game.observe(state, np.array([body]))[0][0].tolist(), strict=True))
 
 

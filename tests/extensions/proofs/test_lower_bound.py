@@ -146,7 +146,6 @@ def test_decisions__leave_less_room_and_no_plan_is_below():
 
 
 def at(**given):
-    """Return a row at the start, all else 0."""
     values = np.zeros(row.COLUMNS)
     for name, value in given.items():
         values[getattr(row, name)] = value
@@ -167,7 +166,6 @@ def random_rows(n, seed):
 
 
 def follows(kind, values, time, closing):
-    """Return the least squared closing speed of the other pair after such a contact."""
     return after(kind, values, time, time, closing, time, 0.0)
 
 

@@ -25,7 +25,6 @@ def worlds(gaps: Any, speeds: Any, braking: Any, latency: Any = 0.0, **settings:
 
 
 def paper_line(gaps: Any, speeds: Any, latency: Any) -> State:
-    """Return one world with the capacities and masses of the paper."""
     return worlds(gaps, speeds, [6, 7, 6], latency, drive=[6, 7, 6], mass=[4.5, 5.5, 5.9])
 
 

@@ -7,12 +7,10 @@ from tests.fixtures.recordings import write_files
 
 
 def rows_of(made: FromData) -> list[str]:
-    """The rows without the recording."""
     return [line.rpartition(",")[0] for line in made.csv.splitlines()[1:]]
 
 
 def scenario_of(vehicles: int, folder: Path) -> str:
-    """Path of a scenario with so many vehicles; Vehicle 2 learns."""
     every = "braking_capacity_mps2: 6, driving_capacity_mps2: 3, mass_t: 2, latency_s: 0, roles: {vehicle_2: learner}"
     text = f"{{name: base, vehicles: {vehicles}, gaps_m: 9, speeds_mps: 9, {every}}}"
     return str(write_files(folder, {"base.yaml": [text]}) / "base.yaml")

@@ -21,7 +21,6 @@ def good(folder: Path, name: str = "a.csv") -> Path:
 
 
 def bad(folder: Path, name: str) -> Path:
-    """A recording whose first speed is text."""
     file = good(folder, name) / name
     file.write_text(file.read_text().replace("0,20", "0,fast", 1))
     return folder

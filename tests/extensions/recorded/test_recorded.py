@@ -15,7 +15,6 @@ from tests.fixtures.recordings import HIGHD, write_files, write_highd, write_ngs
 
 
 def track(frame: int, who: int, x: float, width: float, v: float, ahead: int, lane: int = 6) -> str:
-    """A row of highD."""
     return f"{frame},{who},{x},8,{width},2,{v},0,0,0,0,0,0,0,0,0,{ahead},0,0,0,0,0,0,0,{lane}"
 
 
@@ -76,7 +75,6 @@ def test_platoon__gaps_are_as_recorded_and_a_blank_ends_a_queue(tmp_path: Path) 
 
 
 def scaled(text: str, lengths: float, speeds: float) -> str:
-    """The recording with other units of x, width and xVelocity."""
     head, *rows = (line.split(",") for line in text.splitlines())
     units = {2: lengths, 4: lengths, 6: speeds}
     changed = ([f"{float(cell) * units.get(k, 1):g}" for k, cell in enumerate(row)] for row in rows)

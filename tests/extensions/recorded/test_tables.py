@@ -30,17 +30,14 @@ ROWS = ["16.0,15.0,20.0,20.0,20.0"] * 2
 
 
 def table(folder: Path, cars: list[tuple[object, ...]] = CARS, separator: str = ",", name: str = "a.csv") -> Path:
-    """A folder with these cars as a table."""
     return write_files(folder, {name: [separator.join(map(str, row)) for row in [HEAD, *cars]]})
 
 
 def made_of(folder: Path, columns: str = COLUMNS, **options: object) -> FromData:
-    """A scenario of a table."""
     return scenario_from_data("mine", folder, "table", columns=columns, **options)  # type: ignore[arg-type]
 
 
 def scaled(lengths: float = 1.0, speeds: float = 1.0, times: float = 1.0) -> list[tuple[object, ...]]:
-    """The cars in other units."""
     return [(w, t * times, lane, x * lengths, long * lengths, v * speeds) for w, t, lane, x, long, v in CARS]
 
 
@@ -94,7 +91,6 @@ def test_missing_package__is_named_with_the_extra(monkeypatch: pytest.MonkeyPatc
 
 
 def one_more(*car: object) -> list[tuple[object, ...]]:
-    """The cars, and another one in line 17."""
     return [*CARS, car]
 
 

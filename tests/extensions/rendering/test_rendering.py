@@ -27,7 +27,6 @@ CRASH = Scenario(  # Vehicle 2 coasts into Vehicle 1 after 1 s: 14 and 20 m/s be
 
 
 def coasting(mode: str, steps: int = 0, **changes: Any) -> Any:
-    """The crash after so many steps in which Vehicle 2 coasts."""
     environment = EthBrakeEnv(CRASH.replace(**changes), render_mode=mode)
     environment.reset(seed=0)
     for _ in range(steps):
@@ -36,13 +35,11 @@ def coasting(mode: str, steps: int = 0, **changes: Any) -> Any:
 
 
 def scene_of(renderer: Any, row: int) -> Any:
-    """What a viewer shows of a world at present."""
     motion = renderer.motion(row)
     return motion.scene(motion.until_s)
 
 
 def flashes(frame: Any) -> bool:
-    """Whether a picture shows an impact."""
     return bool((frame == np.array(FLASH, np.uint8)).all(axis=2).any())
 
 

@@ -17,14 +17,13 @@ AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
 
 
 def compared_by(scenario: str, agents: object, episodes: int = 60, count: str = "first") -> Compared:
-    """Agents in the first worlds of the list of seed 7."""
     loaded = eb.load_scenario(scenario)
     teams = teams_of(agents, loaded, harm_count=count)
     return Compared.of(loaded, teams, episodes=episodes, seed=7, harm_count=count)
 
 
 def with_best_known(compared: Compared) -> Compared:
-    """The same, as if somebody had searched: half of the least harm of these agents, avoidable where that is 0."""
+    """Return the result with invented best known harm: half of these agents' least harm; avoidable where that is 0."""
     result = compared.result
     least = {
         count: 0.5 * np.min([own[harm] for own in result.columns.values()], axis=0) for count, harm in HARM.items()
@@ -38,11 +37,9 @@ def with_best_known(compared: Compared) -> Compared:
 
 @pytest.fixture(scope="session")
 def compared() -> Compared:
-    """Four agents in 120 worlds of paper-random, one of them behind a shield."""
     return compared_by("paper-random", AGENTS, 120)
 
 
 @pytest.fixture(scope="session")
 def searched(compared: Compared) -> Compared:
-    """The same with best known harm."""
     return with_best_known(compared)

@@ -22,7 +22,6 @@ FOCUS = "constant:4.5"
 
 
 def player_data(html: str) -> Any:
-    """The numbers that the player shows."""
     (text,) = re.findall(r'<script type="application/json" id="episode_data">(.*?)</script>', html)
     return json.loads(text)
 

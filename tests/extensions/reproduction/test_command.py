@@ -59,7 +59,6 @@ def test_policies__of_the_user_drive_and_the_page_says_so(ethbrake: Command, emp
 
 
 def planted(why: str) -> Item:
-    """An item that needs no time."""
     sheet = Sheet("A table, 1 m/s", ("Who", Column("Harm")), [("PPO | H*", Estimate(1.5, (1.25, 1.75)))], "Of 24.")
     made = Made([Claim("Fig. 9", "H* is less", "holds", "", "agrees", why)], [sheet], notes=["A note."])
     return Item("gaps", ("Fig:x",), "A title", "What it is.", lambda settings: made, 1.0)

@@ -33,7 +33,6 @@ def test_course__by_hand() -> None:
 
 
 def runs(*returns, apart: float = 0.001) -> Course:
-    """Three seeds, whose returns are this far apart."""
     return course(*(np.array(returns) + apart * seed for seed in range(3)))
 
 

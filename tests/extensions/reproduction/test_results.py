@@ -115,7 +115,6 @@ def test_numbers__by_hand() -> None:
 
 
 def by_text(made: Made) -> dict[str, tuple[str, str, Outcome]]:
-    """Ours, nearest and outcome of each claim."""
     texts = {each.paper: each[2:5] for each in made.claims}
     assert len(texts) == len(made.claims)
     return texts

@@ -88,8 +88,6 @@ def test_save__and_load_are_the_same(table: BestHarmTable, tmp_path: Path) -> No
 
 
 def changed(**arrays: Callable[[Any], Any]) -> Callable[[BestHarmTable], bytes]:
-    """The content of a table after some of its arrays were changed."""
-
     def content(table: BestHarmTable) -> bytes:
         with np.load(io.BytesIO(table.content())) as archive:
             members = {**archive, **{name: change(archive[name]) for name, change in arrays.items()}}

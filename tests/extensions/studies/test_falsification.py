@@ -18,7 +18,6 @@ SCENARIO = eb.load_scenario("paper-random")
 
 
 def in_hole(worlds: eb.State) -> Bools:
-    """A thousandth of the worlds: both gaps above 9.5 m, and Vehicle 2 slower than 18.4 m/s."""
     return (worlds.gaps_m > 9.5).all(axis=1) & (worlds.speeds_mps[:, 1] < 18.4)
 
 

@@ -18,7 +18,10 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """One browser for the tests of a module: while it is open, its event loop runs, and other tests have their own."""
+    """Return one browser for all tests of a module.
+
+    While it is open, its event loop runs, so tests of other modules have their own.
+    """
     api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install 'ethbrake-marl[dev]'")
     path = os.environ.get("ETHBRAKE_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if path is None:
@@ -31,7 +34,10 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
-    """Opens an address; by the end of the test the console was told nothing, and nobody else was asked for anything."""
+    """Return a function that opens an address.
+
+    At the end of the test, the console must be empty, and no other address may have been requested.
+    """
     told: list[str] = []
     contexts = []
 
@@ -53,9 +59,9 @@ def open_page(browser: Any) -> Iterator[Callable[..., Any]]:
 
 
 def wait_until(page: Any, condition: str) -> None:
-    """Wait up to two minutes.
+    """Wait up to two minutes for a JavaScript condition.
 
-    The pages' own policy forbids what Playwright would run there to wait.
+    Playwright's own waiting would run code that the pages' security policy forbids.
     """
     for _ in range(4_800):
         if page.evaluate(condition):

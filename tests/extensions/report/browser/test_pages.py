@@ -22,12 +22,10 @@ MOST_BYTES = 5 << 20
 
 @pytest.fixture
 def report_page(open_page: Open, report_file: Path) -> Any:
-    """The report, opened."""
     return open_page(report_file.as_uri())
 
 
 def write_report(path: Path, names: tuple[str, ...]) -> Path:
-    """A report of agents by these names in few worlds."""
     found = compared_by("paper-random", {name: f"constant:{k + 1}.5" for k, name in enumerate(names)}, 12)
     Report("t", found, "s", {names[0]: "1", names[1]: "y" * 64}, focus=names[0]).write(path)
     return path
