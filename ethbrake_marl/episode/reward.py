@@ -202,8 +202,8 @@ class Rewarding(NamedTuple):
             objectives = objectives_of(declared, vehicles)
         except InvalidInput as error:
             raise InvalidInput(f"reward: {error}") from None
-        whole = all(each.kind is OBJECTIVES["total"] for each in objectives)
-        if not whole and params.harm == 0.0:
+        line_only = all(each.kind is OBJECTIVES["total"] for each in objectives)
+        if not line_only and params.harm == 0.0:
             what = declared if isinstance(declared, str) else ", ".join(declared)
             warnings.warn(
                 WithoutEffect(
@@ -211,13 +211,14 @@ class Rewarding(NamedTuple):
                 ),
                 stacklevel=2,
             )
-            whole = True
+            line_only = True
         if isinstance(params.k_energy, tuple) and len(params.k_energy) != vehicles - 1:
             raise InvalidInput(
                 f"reward: k_energy has {len(params.k_energy)} entries; must be a number, or have one for each of the"
                 f" {vehicles - 1} pairs of vehicles"
             )
-        rules = Rules(learners, *times, params.harm if whole else 0.0, params.terminal, COUNTS[params.harm_count])
+        harm = params.harm if line_only else 0.0
+        rules = Rules(learners, *times, harm, params.terminal, COUNTS[params.harm_count])
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
         components = () if vector is None else components_of(vector, counted, vehicles)
         functions: dict[str, TermFunction] = {
@@ -231,7 +232,7 @@ class Rewarding(NamedTuple):
             **{name: TERMS[name].value for name in params.terms},
             **{name: component(name, params.harm_count) for name in components if name not in counted},
         }
-        needed = {*counted, *components} - ({"harm"} if whole else set())
+        needed = {*counted, *components} - ({"harm"} if line_only else set())
         terms = tuple((n, params.weights.get(n, 0.0), function) for n, function in functions.items() if n in needed)
         shaping = Shaping(rules, params.shaping_discount) if params.shaping else None
         return cls(params, counted, terms, shaping, components), rules

@@ -197,7 +197,10 @@ class State(NamedTuple):
         return out + own[:, :-1]
 
     def _check_count(self, count: Count) -> None:
-        if PHYSICS in self.memories and weights_of(count)[2:].any():  # more than harm of impacts
+        if PHYSICS not in self.memories:
+            return
+        _first_impacts, _all_impacts, *beside_harm = weights_of(count)
+        if any(beside_harm):
             check_exact(self, "the honest cost")
 
 

@@ -287,7 +287,10 @@ def step(
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
     scratch = scratch_for(wanted.shape[1])
-    refused, failed = step_worlds(line, car, clock, wanted, actions, scratch, out, reward, *rules)
+    refused, failed = step_worlds(
+        line, car, clock, wanted, actions, scratch, out, reward, rules.learners, rules.time_step_s, rules.horizon_s,
+        rules.harm, rules.terminal, rules.counting,
+    )  # fmt: skip
     if refused >= 0:
         _check_actions(rules, actions[refused])
     if failed >= 0:

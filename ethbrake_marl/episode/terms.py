@@ -173,12 +173,17 @@ def growth(objectives: Sequence[Objective], count: str, before: State, step: Ste
 
 def component(name: str, count: str) -> TermFunction:
     """Function of the component ``harm_K``, ``pair_J_K`` or ``obstacle``, which returns [n]."""
-    number = int(name.rpartition("_")[2]) if "_" in name else 1
-    return partial(_borne if name.startswith("harm_") else _of_pair, number - 1, count)
+    if name == "obstacle":
+        return partial(_of_pair, 0, count)
+    last_vehicle = int(name.rpartition("_")[2])
+    if name.startswith("harm_"):
+        return partial(_borne, last_vehicle - 1, count)  # columns of vehicles begin with Vehicle 1
+    return partial(_of_pair, last_vehicle - 1, count)  # columns of pairs begin with the obstacle and Vehicle 1
 
 
 def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
-    pairs, own = (_grown(amounts_of, count, before, after) for amounts_of in (pair_amounts, own_amounts))
+    pairs = _grown(pair_amounts, count, before, after)
+    own = _grown(own_amounts, count, before, after)
     return 0.0 - Harm.of(pairs, own, after.car).borne[:, vehicle]
 
 
