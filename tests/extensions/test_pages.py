@@ -26,7 +26,7 @@ def test_tutorial__its_changed_scenario_is_valid_and_evaluates_to_the_printed_ta
     monkeypatch.chdir(tmp_path)
     assert ethbrake("scenario", "new", "rainy").status == 0
     change_lines("rainy.yaml", TUTORIAL)
-    assert ethbrake("scenario", "validate", "rainy.yaml").out.strip() in TUTORIAL
+    assert ethbrake("scenario", "validate", "rainy.yaml").out.partition("\n")[0] in TUTORIAL
     command = "evaluate --scenario rainy.yaml --agents full_brake,e_v2x_bm --episodes 2000"
     printed = TUTORIAL.partition(f"$ ethbrake {command}\n")[2].partition("\n...")[0].splitlines()
     told = ethbrake(*command.split()).out.splitlines()
