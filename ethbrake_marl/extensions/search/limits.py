@@ -7,7 +7,7 @@ import numpy as np
 from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput, count_of
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import best_known as stored, outdated_tables, shipped_tables
@@ -24,28 +24,21 @@ def least(game: Game, alert: State) -> dict[str, Floats]:
     problem = problem_of(game, alert)
     known = {count: stored(problem, count)[0] for count in COUNTS}
     known = {count: each for count, each in known.items() if count in HARM or np.isfinite(each).all()}
-    missing = int(np.isinf([known[count] for count in HARM]).any(axis=0).sum())
-    if missing:
-        raise InvalidInput(
-            f"measures limits: scenario {game.name!r}: the least harm of {missing:,} of these"
-            f" {count_of(alert.n, 'world')} is not known; {_where_known(game.name)}; elsewhere compare with the agent"
-            " best_harm"
-        )
+    if any(np.isinf(known[count]).any() for count in HARM):
+        raise InvalidInput(f"measures limits: {_why_unknown(game.name)}; evaluate the agent best_harm beside yours")
     return known
 
 
-def _where_known(scenario: str) -> str:
+def _why_unknown(scenario: str) -> str:
     headers, outdated = {table.header["scenario"]: table.header for table in shipped_tables()}, outdated_tables()
     if scenario in outdated:
         return outdated[scenario]
     if scenario not in headers:
-        return (
-            f"shipped tables hold the first worlds of seed 7 of {', '.join(headers) or 'no scenario in this physics'}"
-        )
+        return f"scenario {scenario!r} has no table of best known harm"
     header = headers[scenario]
     return (
-        f"a shipped table holds the first {header['episodes']:,} worlds of seed {header['list_seed']} of this scenario"
-        f" without changes, where {', '.join(header['vehicles'])} learns"
+        f"the table of best known harm for {scenario} holds the first {header['episodes']:,} worlds of seed"
+        f" {header['list_seed']}, of the scenario without changes, where {', '.join(header['vehicles'])} learns"
     )
 
 

@@ -131,9 +131,9 @@ def test_best_harm__of_this_physics_does_not_warn() -> None:
 
 
 def test_limits__under_another_impact_law_are_refused_and_left_out_of_reports(other_law: str) -> None:
-    with refused(NOT_SHIPPED.format("paper-random", OUTDATED)):
+    with refused(f"measures limits: {OUTDATED}"):
         eb.evaluate(PAPER, "coast", episodes=3, measures="limits")
-    with refused("shipped tables hold the first worlds of seed 7 of no scenario in this physics; elsewhere compare"):
+    with refused(NO_TABLE):
         eb.evaluate("cooperation-3-pair", "coast", episodes=3, measures="limits")
     told: list[str] = []
 
@@ -150,8 +150,14 @@ def drive(scenario: eb.Scenario, agent: str, **options: object) -> Callable[[], 
 
 
 PLANS = KEPT.replace(roles={"vehicle_2": "learner", "vehicle_3": "ppo"})
-NOT_SHIPPED = "measures limits: scenario '{}': the least harm of 3 of these 3 worlds is not known; {}"
-FIRST = "the first 10,000 worlds of seed 7 of this scenario without changes, where vehicle_2 learns; elsewhere compare"
+NO_TABLE = (
+    "measures limits: scenario 'cooperation-3-pair' has no table of best known harm; evaluate the agent best_harm"
+    " beside yours"
+)
+OTHER_WORLDS = (
+    "measures limits: the table of best known harm for paper-random holds the first 10,000 worlds of seed 7, of the"
+    " scenario without changes, where vehicle_2 learns; evaluate the agent best_harm"
+)
 REFUSED: dict[str, Callable[[], object]] = {
     "agent 'best_harm:1.5': after the colon, give the number of profiles": drive(PAPER, "best_harm:1.5"),
     "agent 'best_harm:0': after the colon": drive(PAPER, "best_harm:0"),
@@ -159,12 +165,8 @@ REFUSED: dict[str, Callable[[], object]] = {
     "search: candidates = 0: must be a whole number": lambda: Searched(eb.make_agent("coast"), PAPER, candidates=0),
     "'full_brake+step+search': a search around a shield; write +search first": drive(PAPER, "full_brake+step+search"),
     "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": drive(PLANS, "full_brake+search"),
-    NOT_SHIPPED.format("paper-random", f"a shipped table holds {FIRST}"): drive(
-        PAPER, "coast", seed=8, measures="limits"
-    ),
-    NOT_SHIPPED.format(
-        "cooperation-3-pair", "shipped tables hold the first worlds of seed 7 of cooperation-2-b"
-    ): drive(eb.load_scenario("cooperation-3-pair"), "coast", measures="limits"),
+    OTHER_WORLDS: drive(PAPER, "coast", seed=8, measures="limits"),
+    NO_TABLE: drive(eb.load_scenario("cooperation-3-pair"), "coast", measures="limits"),
 }
 
 
