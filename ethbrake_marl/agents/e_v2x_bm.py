@@ -53,9 +53,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
 
 
 def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
-    """Return the harm of the decelerations ``tried`` [n, C], in ``count`` and in the count that breaks ties: [2, n, C]
-    m2/s2.
-    """
+    """Return the harm of the decelerations ``tried`` [n, C], in ``count`` and in the count for ties: [2, n, C] m2/s2."""
     return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
 
 
