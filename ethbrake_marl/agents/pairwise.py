@@ -37,7 +37,7 @@ class Choice(NamedTuple):
 
 @kernel
 def braking_now(speed, braking, onset, now):
-    """Return the acceleration (m/s2) of a vehicle that coasts until its onset and then brakes, and how long it lasts."""
+    """Return the acceleration (m/s2) of a vehicle that coasts until its onset, then brakes, and how long it lasts."""
     if now < onset:
         return 0.0, onset - now
     if speed > 0.0 and braking > 0.0:
