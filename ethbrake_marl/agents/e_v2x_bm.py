@@ -36,8 +36,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
 
     All other vehicles hold ``alert.wanted``. ``count`` is the harm to minimise (``episode.counts``). If the closed
     form's choice does no harm, it is the result. Ties: the least harm in the other count decides, then the middle
-    deceleration. The search samples: harm has kinks and jumps as a function of the deceleration, so a value between two
-    samples may do less.
+    deceleration. The harm has kinks and jumps, so a deceleration between two samples of the search may do less.
     """
     braking = np.maximum(-alert.wanted, 0.0)
     braking[:, body] = alert.car[:, BRAKING, body]
@@ -53,9 +52,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
 
 
 def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
-    """Return the harm of the decelerations ``tried`` [n, C], in ``count`` and in the count that breaks ties: [2, n, C]
-    m2/s2.
-    """
+    """Return the harm of the decelerations ``tried`` [n, C], in ``count`` and in the count for ties, [2, n, C]."""
     return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
 
 

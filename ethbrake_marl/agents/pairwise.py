@@ -37,9 +37,7 @@ class Choice(NamedTuple):
 
 @kernel
 def braking_now(speed, braking, onset, now):
-    """Return the present acceleration (m/s2) of a vehicle that coasts until its onset and then brakes, and how long it
-    lasts.
-    """
+    """Return the acceleration (m/s2) of a vehicle that coasts until its onset, then brakes, and how long it lasts."""
     if now < onset:
         return 0.0, onset - now
     if speed > 0.0 and braking > 0.0:
@@ -90,8 +88,7 @@ def predicted_harm(line, braking, wait, body, a):
 
 @large
 def find_candidates(line, braking, wait, body, at):
-    """Write the candidates of vehicle ``body`` in one world, decelerations where H may be least, to ``at`` [CANDIDATES]
-    (m/s2).
+    """Write to ``at`` [CANDIDATES] the decelerations (m/s2) of vehicle ``body`` where H may be least, in one world.
 
     The formulas use the state at the vehicle's onset: gap d, its speed v, the neighbour's speed u, closing speed w, and
     the time s for which the neighbour still coasts before it brakes with b. A candidate may be invalid: outside [0,
@@ -145,9 +142,7 @@ def choose(line, braking, wait, body, at, harm, best, least):
 
 
 def closed_form(alert: State, braking: Floats, body: int) -> Choice:
-    """Return the choice of vehicle ``body`` if the others brake to rest with the decelerations ``braking`` [n, N + 1]
-    (m/s2).
-    """
+    """Return the choice of vehicle ``body`` if the others brake to rest with ``braking`` [n, N + 1] (m/s2)."""
     wait = np.maximum(alert.car[:, LATENCY] - alert.time_s[:, np.newaxis], 0.0)
     choice = Choice(np.empty(alert.n), np.empty(alert.n))
     choose(alert.line, braking, wait, body, np.empty(CANDIDATES), np.empty(CANDIDATES), *choice)

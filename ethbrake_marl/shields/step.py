@@ -223,8 +223,7 @@ class StepShield:
     def accept(
         self, game: Game, state: State, memory: Memory, rows: Ints, actions: Floats, now: Ints, rests: list[Fallback]
     ) -> tuple[Ints, Floats]:
-        """Look for a plan that begins with ``actions`` and keeps the bound, in each world of ``rows``; store it if
-        there is one.
+        """Store, in each world of ``rows``, a plan that begins with ``actions`` and keeps the bound, if one is found.
 
         It tries the rest of the present plan first, then the fallbacks ``rests``. Returns the reasons, and the smallest
         price or estimate among the plans tried, [len(rows)] each.
