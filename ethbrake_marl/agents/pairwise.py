@@ -106,9 +106,7 @@ def find_candidates(line, braking, wait, body, at):
         _, d, u, v = meet(gap[i], speed[i], b, wait[i], speed[body], 0.0, onset, onset)
         w = v - u
         at[2] = v * v / (2.0 * (d + u * s + u * u / (2.0 * b)))  # stops right behind the neighbour
-        at[3] = (w * w + 2.0 * b * (d - w * s)) / (
-            2.0 * d - b * s * s
-        )  # reaches the neighbour at closing speed 0 while both brake
+        at[3] = (w * w + 2.0 * b * (d - w * s)) / (2.0 * d - b * s * s)  # touches it, closing at 0, while both brake
         at[4] = w * w / (2.0 * d)  # the same while the neighbour coasts
         at[5] = (w * w - 4.0 * TOUCH_MPS * TOUCH_MPS) / (2.0 * d)  # or at closing speed 2 TOUCH_MPS
         at[6] = 2.0 * (w * s - d) / (s * s)  # reaches the neighbour when it begins to brake
@@ -118,9 +116,7 @@ def find_candidates(line, braking, wait, body, at):
         _, d, v, u = meet(gap[body], speed[body], 0.0, onset, speed[i], b, wait[i], onset)
         w = u - v
         at[7] = v * v / (2.0 * (u * s + u * u / (2.0 * b) - d))  # the neighbour stops right behind
-        at[8] = (2.0 * b * (d - w * s) - w * w) / (
-            b * s * s + 2.0 * d
-        )  # the neighbour arrives at closing speed 0 while both brake
+        at[8] = (2.0 * b * (d - w * s) - w * w) / (b * s * s + 2.0 * d)  # it touches, closing at 0, while both brake
 
 
 @large

@@ -151,13 +151,13 @@ def _harm_among(compared: Compared, known: BestKnown, where: str, among: Bools) 
             (agent, rate(own["collided"], some.clusters), *(mean(x, some.clusters) for x in (*harms, *regrets)))
         )
     headings = [IN_WORDS[count] for count in counts]
-    columns = (
+    columns: list[Column | str] = [
         "Agent",
         Column("Collided", digits=1, scale=100.0, unit=" %"),
         *(Column(heading.capitalize()) for heading in headings),
         *(Column(f"Regret, {heading}") for heading in headings),
-    )
-    return Sheet(f"{where}: {count_of(some.n, 'world')}", [*columns], rows)
+    ]
+    return Sheet(f"{where}: {count_of(some.n, 'world')}", columns, rows)
 
 
 def _tested(test: Test) -> list[str]:
