@@ -86,7 +86,6 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 
 
 def _dependencies() -> Iterator[Check]:
-    """Yield for each required package whether the right version is installed. Packages of extras may be missing."""
     from packaging.requirements import Requirement
 
     wanted = [Requirement(line) for line in requires("ethbrake-marl") or []]

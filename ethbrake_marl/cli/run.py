@@ -88,7 +88,6 @@ def run_command(
 
 
 def quickest(*, several: bool = False) -> str:
-    """Return the default recipe's name for one learner, or for ``several``."""
     from ethbrake_marl.training.recipe import usable_recipes
 
     return next(name for name in (QUICKEST_TEAM if several else QUICKEST) if name in usable_recipes())

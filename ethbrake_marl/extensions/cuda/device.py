@@ -104,7 +104,6 @@ def _check_gpu(index: int) -> None:
 
 
 def as_arrays(given: Any) -> Any:
-    """Replace tensors in a kernel's arguments by NumPy arrays that share their memory."""
     return _with(given, Tensor.numpy)
 
 

@@ -116,8 +116,6 @@ def best_alone(problem: Problem, search: Callable[..., Any]) -> Profiles:
 
 
 def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kernel]:
-    """Return worlds as tensors on the device ``on``, and the kernel that searches them."""
-
     def moved(array: Any) -> Tensor:
         return torch.from_numpy(np.moveaxis(array, 0, -1).copy()).to(on)
 

@@ -105,7 +105,6 @@ class CudaVineModel(VineModel):
             return super().learn(*given, **more)
 
     def act(self, seen: Tensor) -> Tensor:
-        """Return the learners' actions, [n, L], for observations ``seen`` [n, L, F]."""
         outputs: Tensor = self.policy.learning(seen.flatten(0, 1))
         return outputs.clamp(-1.0, 1.0).view(seen.shape[:2])
 

@@ -183,8 +183,6 @@ def _search(pool: Pool, worlds: State, weights: Floats, effort: Mapping[str, int
 
 
 class Pool:
-    """Profiles that were tried in the same worlds, from which each world's best one for given weights can be chosen."""
-
     def __init__(self, problem: Problem, count: str) -> None:
         self.problem, self.count = problem, count
         self.profiles: list[Profiles] = []

@@ -185,7 +185,6 @@ class MixtureModel(VineModel):
         return Explored(start, gained, harm)
 
     def drive_from(self, state: State, act: Act, count: str) -> tuple[Floats, Floats]:
-        """Let one policy drive to the end; return the return and the harm, [n] each."""
         gained, last = play_on(self.game, state, lambda now: now.ask(act), self.recipe.gamma)
         return gained[:, 0], self.harm(last, count)[:, 0]
 

@@ -77,8 +77,6 @@ class BranchingRecipe(TrainingRecipe):
 
 
 class ActorShape(FileModel):
-    """The actor's network; there is no critic."""
-
     policy: Layers = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"
     initial_action: Annotated[Action | None, Field(exclude_if=lambda action: action is None)] = Field(

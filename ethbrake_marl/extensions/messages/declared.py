@@ -80,7 +80,6 @@ class Messages:
         return ("message_period_s", "loss_begins", "loss_ends") if _is_periodic(v2x) else ()
 
     def is_random(self, v2x: V2X) -> bool:
-        """Return whether messages after the first may be lost."""
         return _is_periodic(v2x) and v2x.loss_begins > 0.0
 
     def check(self, scenario: Scenario) -> None:
@@ -128,7 +127,6 @@ def _kept(scenario: Scenario) -> int:
 
 
 def _contents(scenario: Scenario) -> Bools:
-    """Return whether each vehicle's messages contain each quantity, [N, PIECES]."""
     tells = _value(scenario.v2x, "tells")
     each = (
         tells

@@ -99,7 +99,6 @@ def put(kind, at, floor, cells, count, least, early, late, soft, hard):
 
 @kernel
 def lowest(cells, count):
-    """Return the row of the cell with the smallest bound, and this bound; infinite without cells."""
     row = 0
     for k in range(1, count):
         if cells[k, HARM] < cells[row, HARM]:

@@ -99,7 +99,6 @@ def moments(times_s: Floats, every_s: float) -> Floats:
 
 
 def _number_names(raw: Any, cells: Cells) -> dict[float, str]:
-    """Replace names of vehicles and lanes in ``raw`` by numbers; return number -> name."""
     for column in ("vehicle", "lane"):
         cells.refuse(raw[column] == "", column, raw[column], "must be a name")
     text = pd.concat([raw["vehicle"], raw["lane"]]).drop_duplicates()

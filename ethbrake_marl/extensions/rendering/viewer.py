@@ -118,7 +118,6 @@ class Window(Viewer):
             self.window = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the window out, so that a copy opens its own."""
         return {**self.__dict__, "window": None}
 
 

@@ -63,5 +63,4 @@ def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
 
 
 def value(row: SummaryRow, key: str) -> str:
-    """Return an estimate as text without its interval; a dash if there is none."""
     return Column("").show(row[key]).value

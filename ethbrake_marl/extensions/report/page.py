@@ -102,5 +102,4 @@ def _environment() -> Environment:
 
 
 def _sha256(text: str) -> str:
-    """Return the digest with which the page's security policy allows its own style and script, and no others."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"

@@ -39,7 +39,6 @@ def other_tests(scenario: Scenario) -> list[Scenario]:
 
 
 def title_of(name: str) -> str:
-    """Return the title of a test, such as ``Obstacle test``."""
     return TESTS[name].partition(":")[0]
 
 

@@ -64,7 +64,6 @@ def estimate(line: Floats, rows: Floats) -> Estimate:
 
 
 def by_distance(reading: Reading, episodes: int, lines: Lines) -> Groups:
-    """Group worlds by the sum of both gaps: ``10-12 m`` and so on. No group is empty."""
     group = np.digitize(opened(reading.only(*WORLDS), episodes)[2].gaps_m.sum(axis=1), ENDS_M[1:-1])
     return {f"{ENDS_M[k]}-{ENDS_M[k + 1]} m": (lines, group == k) for k in np.unique(group).tolist()}
 
@@ -111,7 +110,6 @@ def over_distance(stem: str, readings: Mapping[str, Groups], shown: Sequence[str
 
 
 def distances(settings: Settings, policies: Mapping[str, str]) -> dict[str, Groups]:
-    """Group worlds by distance, under the paper's parameters as stated and in the reading nearest to its results."""
     episodes, found = min(DISTANCE_WORLDS, settings.episodes), {}
     for name, reading in (("as stated", STATED), ("nearest reading", NEAREST)):
         there = reading._replace(base=DISTANCE)

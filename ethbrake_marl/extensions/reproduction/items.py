@@ -107,7 +107,6 @@ QUICK = "Figures 2 and 3, the paper's own process and the search over the readin
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    """Return the paper's figures and tables with these names; without names, all. Raises ``UnknownName``."""
     known = {item.name: item for item in ITEMS}
     for name in names:
         if name not in known:
@@ -192,7 +191,6 @@ def overview(results: Mapping[Item, Made]) -> Sheet:
 
 
 def page(made_by: str, results: Mapping[Item, Made], settings: Settings) -> str:
-    """Return the page with all results as Markdown. ``made_by``: the command, the day and the machine."""
     lead = f"Numbers, statements and figures of {PAPER}, and ours. Made by {made_by}."
     parts = ["# The paper, reproduced", lead, LEAD, *([] if settings.full else [QUICK]), overview(results).markdown()]
     for item, made in results.items():

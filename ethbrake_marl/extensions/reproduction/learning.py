@@ -68,7 +68,6 @@ def trained(folder: Path, group: str) -> dict[str, list[Path]]:
 
 
 def seconds_left(folder: Path, groups: Iterable[str]) -> float:
-    """Return an estimate of the processor time that the unfinished runs take (s)."""
     plans = [(group, plan) for group in groups for plan in GROUPS[group]]
     return sum(plan.seconds for group, plan in plans for run in runs_of(folder, group, plan) if not is_finished(run))
 
@@ -167,7 +166,6 @@ class Course(NamedTuple):
 
 
 def column(run: Path, name: str) -> dict[float, float]:
-    """Return a column of the table of a training's progress: decisions -> value, without empty cells."""
     rows = csv.DictReader((run / "progress.csv").read_text("utf-8").splitlines())
     return {float(row["steps"]): float(row[name]) for row in rows if row.get(name)}
 

@@ -94,7 +94,6 @@ def search(
 
 
 def numbers_of(table: Table) -> Floats:
-    """Return collision rate and mean harm (m2/s2) of the four rows of the random test's table, [4, 2]."""
     return np.array([[each.value for each in row] for row in table.values()])
 
 

@@ -144,7 +144,6 @@ def process_sheet(settings: Settings, reading: Reading, episodes: int) -> list[S
 
 
 def compared(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less]:
-    """Compare both harms of the strategy ``smaller`` with those of the strategies ``larger``, in the same worlds."""
     return [
         Less.of_worlds(f"{smaller} minus {other}, {harm}", found[smaller][count], found[other][count])
         for other in larger
@@ -153,7 +152,6 @@ def compared(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[L
 
 
 def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less]:
-    """Compare the collision rate (%) of the strategy ``smaller`` with those of ``larger``, in the same worlds."""
     percent = {name: 100.0 * each["collided"] for name, each in found.items()}
     return [
         Less.of_worlds(f"{smaller} minus {other}, % of worlds", percent[smaller], percent[other]) for other in larger
@@ -224,7 +222,6 @@ def reproduce_random_table(settings: Settings) -> Made:
 
 
 def reproduce_hybrid_table(settings: Settings) -> Made:
-    """Reproduce the paper's table of 5,000 worlds, with the speeds of the random test."""
     episodes, spec = min(STOPPED_WORLDS, settings.episodes), unconverged(settings.folder)
     least = least_harm(STATED, episodes)
 

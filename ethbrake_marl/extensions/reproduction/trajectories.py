@@ -60,7 +60,6 @@ def road_figure(records: Records, caption: str) -> Figure:
 
 @in_our_style
 def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
-    """Draw the command of Vehicle 2 over time, one panel per policy and scenario; ``curves``: label -> episodes."""
     figure, every = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
     for axes, key in zip(every, next(iter(curves.values())), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)

@@ -30,8 +30,6 @@ APART = Column("Difference", sign="+")
 
 
 class Claim(NamedTuple):
-    """A number or a statement of the paper, and our result."""
-
     where: str  # in the paper
     paper: str  # what it says
     ours: str  # as the paper states its parameters
@@ -46,7 +44,6 @@ class Claim(NamedTuple):
 
 
 def claims_sheet(claims: Sequence[Claim]) -> Sheet:
-    """Return a table with one row for each claim: the paper's, ours, and why they differ."""
     rows = [(each.where, each.paper, each.ours, each.nearest, each.verdict) for each in claims]
     headings = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
     return Sheet("", [Column(heading, text=True) for heading in headings], rows)
@@ -73,12 +70,10 @@ class Less(NamedTuple):
 
     @classmethod
     def of_lists(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        """Compare the means of independent samples, [n] and [m]."""
         return cls(where, unpaired(mean(smaller), mean(larger)))
 
     @classmethod
     def of_worlds(cls, where: str, smaller: Floats, larger: Floats) -> Less:
-        """Compare two quantities in the same worlds, [n]."""
         return cls(where, difference(smaller, larger), not smaller.any() and not larger.any())
 
     @property

@@ -104,7 +104,6 @@ def starting_profiles(problem: Problem, alert: State, given: Sequence[Profiles] 
 
 
 def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
-    """Return the constant deceleration of E-V2X-BM for one controlled vehicle, [n]."""
     choice = coupled(
         alert._replace(wanted=problem.state.wanted), int(problem.bodies[0]), problem.harm_count, problem.horizon_s
     )

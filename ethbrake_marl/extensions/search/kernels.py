@@ -40,8 +40,6 @@ MOVE_END = 3  # moves the border between two phases by whole steps
 
 
 class World(NamedTuple):
-    """One world with its random stream, prepared for many simulations."""
-
     car: Floats  # [CAR_ROWS, N + 1]
     clock: Floats  # [CLOCK_COLUMNS] at the first decision
     wanted: Floats  # [N + 1] commands of all bodies (m/s2); overwritten

@@ -46,7 +46,6 @@ def search(
 
 
 def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
-    """Yield, without end, points [d] that are evenly spread over the unit cube (scrambled Sobol points)."""
     from scipy.stats import qmc  # imported here, because it takes a second to load
 
     sobol = qmc.Sobol(dimensions, rng=np.random.default_rng([seed, dimensions, 1]))
