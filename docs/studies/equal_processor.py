@@ -12,6 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from matplotlib.ticker import LogLocator, NullLocator
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import HARM
@@ -80,4 +81,6 @@ if __name__ == "__main__":
     figure = curves_figure(panels, axis, caption, lines=lines)
     for axes in figure.axes:
         axes.set_yscale("log")
+        axes.autoscale(axis="y")
+        axes.yaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}", minor_locator=NullLocator())
     write_picture(picture, figure, force=True)
