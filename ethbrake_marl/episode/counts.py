@@ -4,8 +4,8 @@
 first   harm of the first impact of each pair, as in the paper
 total   harm of every impact
 honest  harm of every impact, also where a contact passes it on to another pair, plus a price of conduct without impact:
-        ``10 s`` for a push s (m/s), the closing speed that forces build up and a contact takes up; ``10 s`` for a speed
-        s that a vehicle asks for by driving before the line's first impact; ``v^2`` for a vehicle that still moves at v
+        10 m/s times the push, the closing speed that forces build up and a contact takes up; 10 m/s times the speed
+        that a vehicle asks for by driving before the line's first impact; ``v^2`` for a vehicle that still moves at v
         at the horizon, as if it then hit a standing object
 ======  ================================================================================================================
 
@@ -53,7 +53,7 @@ def other_count(count: Count) -> str:
 
 @kernel
 def pair_amount(line, p, weights):
-    """Harm of pair p in one world so far (m2/s2), as the count with the ``weights`` [6] counts it."""
+    """Harm of pair ``p`` in one world so far (m2/s2); ``weights`` [6]: of a count (``COUNTS``)."""
     harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
     beside = weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
     return harm + (weights[2] * line[PASSED, p] + beside)
@@ -61,7 +61,7 @@ def pair_amount(line, p, weights):
 
 @kernel
 def own_amount(line, p, weights):
-    """Part of ``pair_amount`` for driving and motion, which the rear vehicle bears alone (m2/s2)."""
+    """Part of ``pair_amount`` for driving and motion (m2/s2), which the rear vehicle of pair ``p`` bears alone."""
     return weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
 
 

@@ -17,7 +17,11 @@ from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
 
 class Script(Protocol):
-    """Drives one vehicle by a script, policy or search. It sees the whole state, and decides when the learners do."""
+    """Drives one vehicle by a script, policy or search. It sees the whole state.
+
+    It decides at the alert, and then whenever the learners do. What it remembers is in ``memory``, never in the object:
+    simulations ask the same object, and one agent may drive several vehicles.
+    """
 
     def begin(self, alert: State, body: int) -> Any:
         """Memory of the script at the alert: None, an array with one row per world, or a tuple of memories."""

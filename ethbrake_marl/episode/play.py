@@ -41,7 +41,11 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, ho
 
 @large
 def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, memory, out):
-    """Write the harm under two counts to ``out`` [2, n, C] if ``bodies`` hold the commands ``tried`` [n, C, B]."""
+    """Write the harm to ``out`` [2, n, C] if ``bodies`` [B] hold the commands ``tried`` [n, C, B] (m/s2).
+
+    Row 0 of ``out`` counts by the weights ``count`` [6], row 1 by ``other``. ``time`` [n] and ``until`` (s): from when
+    to when they hold; ``memory``: ``working_memory``, overwritten.
+    """
     scratch, here, commands = memory
     for k in range(tried.shape[0]):
         for i in range(len(commands)):

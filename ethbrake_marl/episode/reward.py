@@ -110,7 +110,7 @@ class RewardParams(FileModel):
         for name in value:
             if name not in own_terms():
                 raise unknown_name("term", name, own_terms(), may_be_own=True)
-        return {name: value[name] for name in sorted(value) if value[name] != 0.0 and TERMS[name]}
+        return {name: value[name] for name in sorted(value) if value[name] != 0.0 and TERMS[name]}  # loads the term
 
     @field_validator("objective", mode="before")
     @classmethod
@@ -217,7 +217,7 @@ class Rewarding(NamedTuple):
                 f"reward: k_energy has {len(params.k_energy)} entries; must be a number, or have one for each of the"
                 f" {vehicles - 1} pairs of vehicles"
             )
-        harm = params.harm if line_only else 0.0
+        harm = params.harm if line_only else 0.0  # the compiled step rewards the line's harm; `growth` any other
         rules = Rules(learners, *times, harm, params.terminal, COUNTS[params.harm_count])
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
         components = () if vector is None else components_of(vector, counted, vehicles)

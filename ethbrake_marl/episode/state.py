@@ -185,7 +185,10 @@ class State(NamedTuple):
         return out
 
     def pair_harm(self, count: Count = "first") -> Floats:
-        """Harm of each pair of neighbours so far, [n, N - 1] m2/s2."""
+        """Harm of each pair of neighbours so far, [n, N - 1] m2/s2.
+
+        Without impacts with the obstacle and, in the honest cost, Vehicle 1's own driving and motion.
+        """
         self._check_count(count)
         return pair_amounts(self.line, count)[:, 1:-1]
 

@@ -161,7 +161,10 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
 
 @kernel
 def beside_harm(line: Floats, count: Floats) -> float:
-    """What a count adds to first-impact and total harm in one world so far (m2/s2)."""
+    """What a count adds to first-impact and total harm in one world so far (m2/s2).
+
+    ``amount_so_far`` sums in another order; the last bits of rewards depend on this one.
+    """
     amount = 0.0
     for p in range(line.shape[1] - 1):
         amount += count[2] * line[PASSED, p] + count[3] * line[PUSHED, p]

@@ -1,7 +1,8 @@
 """When a pair comes into contact. Between two events its gap is a polynomial of time, so the answer is exact.
 
-With the gap g, the closing speed w, the closing acceleration b and the closing jerk j (rear minus front, in m, m/s,
-m/s2 and m/s3), the gap after the time t is ``g - w t - b t^2 / 2 - j t^3 / 6``. Where brakes act at once, j is 0.
+With the gap g, the closing speed w (``closing``), the closing acceleration b (``pressing``) and the closing jerk j
+(``jerk``; rear minus front, in m, m/s, m/s2 and m/s3), the gap after the time t is ``g - w t - b t^2 / 2 - j t^3 / 6``.
+Where brakes act at once, j is 0.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ def resolve_cluster(line, car, scratch, first, last):
 
 @large
 def note_thrown(line, scratch, p):
-    """Add what an impact changes of pair p's closing speed to the row THROWN, if the pair has had an impact before.
+    """Add what an impact changes of the closing speed of pair p, which has had an impact before, to the row THROWN.
 
     If pair p itself closes in this impact, also add to PUSHED the part that forces had built up.
     """

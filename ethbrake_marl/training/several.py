@@ -80,7 +80,10 @@ class SeparatePolicies(BasePolicy):
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1]."""
+        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1].
+
+        The last column of an observation is the learner's number in its world.
+        """
         count = len(observation)
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
         for number, policy, rows in self._by_learner(observation):

@@ -193,7 +193,7 @@ CAR_ROWS = {
 
 
 def width_of(stream: tuple[int, ...], vehicles: int) -> int:
-    """Number of random numbers of a world in a stream."""
+    """Number of uniform random numbers that one world takes from a stream of random numbers (``MAIN``, ...)."""
     return BLOCK * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 

@@ -209,7 +209,10 @@ class Lines(NamedTuple):
         return np.asarray(~wrong)
 
     def told(self, state: State, news: Floats) -> Floats:
-        """Return the values in messages of all bodies, without intents, [n, N + 1, PIECES - 1]; places are relative."""
+        """Return what a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all pieces but the intent.
+
+        ``news``: as ``received`` returns it. A place is the distance (m) from this vehicle.
+        """
         car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
         car[:, :, 0] = 0.0
         own = news[:, PLACE, self.body, np.newaxis]

@@ -137,7 +137,8 @@ def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
 def lowest_while_coasting(at):
     """Return the smallest gap (m) to the rear vehicle until the controlled vehicle, which coasts, may act.
 
-    The gap is a convex function of time: it is smallest when both are equally fast, or at the start or end.
+    ``at``: the three vehicles at the alert, by the rows of ``line`` (``GAP_R``, ``V_F``, ...). The gap is a convex
+    function of time: it is smallest when both are equally fast, or at the start or end.
     """
     w = at[V_R] - at[V_F]
     if w <= 0.0:

@@ -123,7 +123,10 @@ def outdated_tables() -> dict[str, str]:
 
 
 def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
-    """Return the least known harm in all shipped tables, [n] m2/s2, and its profiles (``BestHarmTable.stored``)."""
+    """Return the least harm of each world in the shipped tables, [n] m2/s2, and the commands (profiles) that do it.
+
+    A world that is in no table has infinite harm and coasts.
+    """
     found = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()
     return best_of([each for each in found if np.isfinite(each[0]).any()] or [nothing])
