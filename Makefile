@@ -31,7 +31,7 @@ help:
 	@echo "make test [ARGS=...]  run the tests; ARGS=--all also runs the slow ones, as .ci/run does"
 	@echo "make lint             check the code: ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make docs             build the site in docs/_build/html and run its notebooks; a warning is an error"
-	@echo "make figures          make blocks, tables and pictures of README and docs again, and compare them (minutes)"
+	@echo "make figures          make blocks, tables and pictures of README and docs again, and compare them (half an hour)"
 	@echo "make programme NAME=NAME [ARGS=...]  run a long check (python -m tests.programmes); without NAME list all"
 	@echo "make clean            delete $(VENV), .venvs, caches and builds, but not runs/"
 	@echo "TORCH_INDEX=URL       package index for torch; default: uv chooses the build for this machine"
