@@ -63,8 +63,8 @@ class PushedAway:
 
 
 def pushed_m(game: Game, alert: State) -> PushedAway | None:
-    """How far a vehicle ends beyond the place where it would stop by itself. In reality it brakes for something, so
-    pushing is dangerous. Defined for vehicles that neither learn nor look at the state.
+    """How far a vehicle ends beyond the place where it would stop by itself, by impacts and by pushes. In reality it
+    brakes for something, so this is dangerous. Defined for vehicles that neither learn nor look at the state.
     """
     bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.rules.learners and i not in game.scripts]
     return PushedAway(bodies, game, alert) if bodies else None

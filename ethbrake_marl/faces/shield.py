@@ -28,7 +28,7 @@ def shield(
     mode: str = "step",
     *,
     scenario: AnyScenario | None = None,
-    harm_count: str = "first",
+    harm_count: str | None = None,
     **options: Any,
 ) -> Any:
     """Return a shielded copy of an environment, of the same class, or a shielded team.
@@ -43,7 +43,8 @@ def shield(
             plan.
         mode: ``step``, ``episode`` (the paper's Algorithm 1), or another shield, as after the ``+`` in an agent's name.
         scenario: scenario in which an agent drives; only for agents.
-        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``).
+        harm_count: what is bounded: ``first``, ``total`` or ``honest`` (``episode.counts``). None: the count of the
+            environment's reward, or ``first`` for an agent.
         options: of the mode: ``allowance`` (m2/s2) and ``cap`` (None or ``baseline``) for ``step``, ``bound``
             (``coupled`` or ``pairwise``) for ``episode``.
 
@@ -64,6 +65,8 @@ def shield(
         raise InvalidInput(f"shield: {env!r:.80}: {right}")
     base = getattr(env, "unwrapped", None)
     worlds: Any = getattr(base, "scenario", None) if scenario is None else load_scenario(scenario)
+    if harm_count is None:
+        harm_count = base.game.rewarding.params.harm_count if isinstance(base, Face) else "first"
     around = partial(guarded, mode=mode, scenario=worlds, harm_count=harm_count, options=options)
     if not is_agent and not isinstance(env, Team):
         return shielded_environment(env, base, policy, around, harm_count)

@@ -170,6 +170,17 @@ def test_teams_and_names() -> None:
     assert [each.shield.count for each in teams.values()] == ["total", "total"]
 
 
+def test_the_count__is_that_of_the_reward_unless_it_is_given() -> None:
+    for env, count in (
+        (EthBrakeEnv("paper-random"), "first"),
+        (EthBrakeEnv("paper-random", reward="honest"), "honest"),
+    ):
+        assert shield(env).unwrapped.game.shield.count == count
+        assert shield(env, "ppo", "episode").unwrapped.game.shield.count == count
+        assert shield(env, harm_count="total").unwrapped.game.shield.count == "total"
+    assert shield(COAST, scenario="paper-random").shield.count == "first"
+
+
 def test_a_shield_that_is_registered_for_names_is_a_mode() -> None:
     register_shield("lax", lambda team, argument, settings: team._replace(shield=StepShield(**settings.options)))
     register_shield("bare", lambda team, argument, settings: team)

@@ -15,7 +15,7 @@ from ethbrake_marl.registry import Part
 
 
 def avoidable(game: Game, alert: State, last: State) -> Given:
-    """Return whether some commands avoid all contact (proven), [n], and if not, why: ``early``, ``front`` or ``rear``.
+    """Whether some commands avoid all contact (proven), [n], and if not, why: ``early``, ``front`` or ``rear``.
 
     The commands are those of Vehicle 2 of three (or of Vehicles 2 and 3 together) or of either of two vehicles; all
     others brake fully.
@@ -28,7 +28,7 @@ _known: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: 
 
 
 def proven_harm(game: Game, alert: State, last: State) -> Given:
-    """Return a lower bound on the harm or honest cost of all commands that change at decisions, [n] m2/s2.
+    """Lower bound on the harm or honest cost of all commands that change at decisions, [n] m2/s2.
 
     ``impact``: whether the bound is above 0.
     """
