@@ -48,7 +48,7 @@ def best_known(game: Game, alert: State, last: State) -> Given:
 
 
 def regret(game: Game, alert: State, last: State) -> Given:
-    """Harm (honest: honest cost) minus the least known in the same world. Below 0: the agent did even less."""
+    """Harm (or honest cost) minus the least known in the same world. Below 0: the agent did even less."""
     return {count: last.harm(count) - harm for count, harm in least(game, alert).items()}
 
 

@@ -132,7 +132,7 @@ def test_load__refuses_a_missing_file(tmp_path: Path) -> None:
 
 def test_meanings__of_regret_and_of_the_share_differ() -> None:
     told = eb.summarise(eb.evaluate("paper-random", "full_brake,best_harm", episodes=20, measures="limits")).meanings()
-    assert told["Regret, first-impact"].startswith("Harm minus")
+    assert told["Regret, first-impact"].startswith("Harm (or honest cost) minus the least known")
     assert told["Share of possible, first-impact"].startswith("How much of what the best known braking saves")
     assert "Regret, honest cost" not in told
 
