@@ -208,7 +208,10 @@ class State(NamedTuple):
 
 
 def check_exact(state: State, what: str) -> None:
-    """Raise ``InvalidInput`` unless impacts in these worlds are exact. ``what`` names the feature that needs this."""
+    """Raise ``InvalidInput`` if these worlds have another physics than exact impacts (key ``physics`` of a scenario).
+
+    ``what`` names the feature that needs exact impacts.
+    """
     if PHYSICS in state.memories:
         raise InvalidInput(
             f"{what} needs exact impacts, and these worlds have another physics (key physics of their scenario);"
@@ -259,7 +262,7 @@ def _harm(line, weights, out):
 
 @kernel
 def front_share(harm, front_mass, rear_mass):
-    """Part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)`` (eq. harm).
+    """Part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)``, with masses in t.
 
     The larger part is computed and the smaller one is the rest, so both sum to ``harm`` exactly.
     """

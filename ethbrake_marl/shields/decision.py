@@ -65,7 +65,7 @@ def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
 
 
 def intervention(before: State, step: Step, after: State) -> Floats:
-    """Return minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
+    """Minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0, [n, N]."""
     memory = after.memories.get("shield")
     if memory is None:
         raise InvalidInput(
