@@ -71,7 +71,11 @@ def read_settings(
 
 
 def _counted(rules: Override, given: Sequence[Override], owner: str) -> Override:
-    """Return the setting that ``rules=NAME`` stands for: ``reward.harm_count`` of a recipe, else ``harm_count``."""
+    """Return the setting for which ``rules=NAME`` is short: ``reward.harm_count`` of a recipe, else ``harm_count``.
+
+    ``owner`` is ``recipe`` or another owner of settings. Raises ``InvalidInput`` for an unknown NAME, and if one of the
+    settings ``given`` sets the same.
+    """
     name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
     if not isinstance(name, str) or name not in RULES:
         raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(RULES)}")
