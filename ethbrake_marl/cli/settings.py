@@ -40,8 +40,9 @@ def read_settings(
 ) -> Settings:
     """Sort the settings ``KEY=VALUE`` of a command by what they change: scenario, recipe or the command itself.
 
-    A key that scenario and recipe share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an
-    unknown key, and ``InvalidInput`` for an ambiguous key or a bad value.
+    ``recipe_keys`` and ``of_command`` are the keys of the recipe and of the command. A key that scenario and recipe
+    share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an unknown key, and ``InvalidInput``
+    for an ambiguous key or a bad value.
     """
     known = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
     known["command"] = {*of_command}

@@ -64,7 +64,7 @@ def pair_amount(line, p, weights):
 
 @kernel
 def own_amount(line, p, weights):
-    """Part of ``pair_amount`` for driving and motion (m2/s2), which the rear vehicle of pair ``p`` bears alone."""
+    """Part of ``pair_amount`` for driving and motion (m2/s2), which the rear vehicle of the pair bears alone."""
     return weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
 
 

@@ -115,7 +115,7 @@ class Game(NamedTuple):
         return one_step.first_decision(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """``step`` without the shield, and without reward terms other than harm and terminal."""
+        """``step`` (same arguments) without the shield, and without reward terms other than harm and terminal."""
         return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:

@@ -226,9 +226,10 @@ def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: b
 
 
 def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: str) -> Floats:
-    """Increase of each vehicle's amount since ``before`` (None: since the alert), [n, N].
+    """Increase of what each vehicle should minimise, since ``before`` (None: since the alert), [n, N].
 
     A weighted sum is computed from the harm since then; other objectives are amount after minus amount before.
+    ``count`` says which harm (``episode.counts``).
     """
     now, own = pair_amounts(after.line, count), own_amounts(after.line, count)
     whole = Harm.of(now, own, after.car)

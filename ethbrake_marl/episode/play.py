@@ -29,9 +29,10 @@ def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
 
 @large
 def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, count, scratch, out):
-    """Follow plans [n, T, L], in place; write the harm to ``out`` [n]. An episode stops above ``most`` [n].
+    """Follow plans [n, T, L] of the L learners, in place; write the harm to ``out`` [n].
 
-    The other arguments are those of ``step.step_worlds``.
+    An episode stops above the harm ``most`` [n]. After T decisions the last one repeats. The other arguments are those
+    of ``step.step_worlds``.
     """
     for k in range(len(out)):
         harm = amount_so_far(line[k], count)

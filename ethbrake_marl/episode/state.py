@@ -244,7 +244,7 @@ def take(memory: Any, rows: Any) -> Any:
 
 
 def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
-    """A memory with ``new`` in ``rows``: a copy, or the same arrays if they are donated."""
+    """A memory (``mapped``) with ``new`` in ``rows``: a copy, or with ``donate`` the same arrays."""
 
     def written(old: Any, part: Any) -> Any:
         array = old if donate else old.copy()

@@ -325,7 +325,7 @@ def scripted(scripts: Mapping[int, Any], state: State) -> State:
 
 
 def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None) -> State:
-    """State with the commands of scripts and learners, as at the beginning of a step."""
+    """State with the commands of scripts and learners, as at the beginning of a step; arguments of ``step``."""
     given = proposals(rules, numbers_of(rules, actions, state.n), state.n)
     if np.isnan(given).any():
         _check_actions(rules, given[np.isnan(given).any(axis=1).argmax()])
@@ -337,7 +337,7 @@ def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Flo
 
 
 def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
-    """Actions as float64 [n, L]. Raises ``InvalidInput`` for another type or shape."""
+    """Actions of the L learners as float64 [n, L]. Raises ``InvalidInput`` for another type or shape."""
     shape = n, len(rules.learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
         raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")

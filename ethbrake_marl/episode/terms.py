@@ -48,7 +48,7 @@ BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
 
 
 class Term(NamedTuple):
-    """A registered term."""
+    """A registered term of rewards (``register_term``)."""
 
     name: str
     function: TermFunction
@@ -101,7 +101,7 @@ BUILT_IN = {  # name -> (unit, meaning)
 
 
 def collision(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Term collision with exact impacts, [n]; ``params`` are ``RewardParams``."""
+    """Term collision (formula: module docstring) with exact impacts, [n]; ``params`` are ``RewardParams``."""
     check_exact(before, "the sum of the term collision")
     if isinstance(params.k_energy, float):
         return -params.k_energy * step.total_harm
@@ -120,7 +120,7 @@ def jerk(before: State, step: Step, after: State) -> Floats:
 
 
 def risk(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Term risk, [n, N]; ``params`` are ``RewardParams``."""
+    """Term risk (formula: module docstring), [n, N]; ``params`` are ``RewardParams``."""
     closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
     room = np.maximum(after.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0

@@ -38,7 +38,7 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def caption(parameters: Mapping[str, Any]) -> str:
-    """Return one line with scenario, number of worlds, seed, recordings and quantities."""
+    """Return one line with scenario, number of worlds, seed, recordings and quantities of a table's ``parameters``."""
     parts = []
     for key, (symbol, unit) in SYMBOLS.items():
         if key in parameters:

@@ -156,10 +156,7 @@ def predicted_harm(game: Game, alert: State, last: State) -> Given:
 
 
 def replaced(game: Game, alert: State, last: State) -> Given:
-    """Shield. actions: number of actions that it replaced, [n]; none: whether it replaced none, [n].
-
-    Algorithm 1 has only none: whether the policy drove. Not defined without a shield.
-    """
+    """actions: number that the shield replaced, [n]; none: whether it replaced none (Algorithm 1: policy drives)."""
     memory: Any = last.memories.get("shield")
     if hasattr(memory, "chosen"):
         return {"none": memory.chosen}

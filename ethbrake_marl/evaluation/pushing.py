@@ -38,7 +38,7 @@ def with_post(state: State) -> Floats:
 
 
 class PushedAway:
-    """Distance that a vehicle travels, minus the distance until the horizon if nobody touched it.
+    """A ``Watch`` of the distance that vehicles travel, minus the distance until the horizon if nobody touched them.
 
     It is negative if the vehicle ends nearer, for instance because an obstacle threw it back.
     """

@@ -81,7 +81,7 @@ def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel 
 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
-    """Worlds ``index`` from these random numbers, not drawn again if they have an early impact. No mixture."""
+    """Worlds ``index`` from these random numbers, not drawn again if they have an early impact. Not for mixtures."""
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
     if line is not None:
