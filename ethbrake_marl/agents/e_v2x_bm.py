@@ -183,7 +183,7 @@ class EV2XBMPairwise:
     name, knows = "e_v2x_bm:pairwise", STATE
 
     def begin(self, alert: State, body: int) -> Memory:
-        """Choose the deceleration. Raises ``InvalidInput`` where the closed form does not hold."""
+        """Choose the deceleration. Raises ``InvalidInput`` where the closed form does not hold (see ``pairwise``)."""
         deceleration, harm = pairwise(alert, body)
         return Memory(-deceleration, harm)
 

@@ -34,7 +34,7 @@ def still_moving(before: State, step: Step, after: State) -> Floats:
 
 
 def first_impact_s(before: State, after: State) -> Floats:
-    """Time of the line's first impact, [n] s; ``before.time_s`` if it was earlier, ``after.time_s`` if it is later.
+    """Time of the line's first impact, [n] s; ``before.time_s`` if it was earlier, ``after.time_s`` if later or never.
 
     There must be no decision between the two states.
     """

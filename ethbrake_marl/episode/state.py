@@ -235,7 +235,7 @@ def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """``rows`` of every array in a memory. A slice is copied, so that compiled code gets the usual array layout."""
+    """``rows`` of every array in a memory (``mapped``). Slices are copied: compiled code then gets the usual layout."""
     if isinstance(rows, slice):
         return mapped(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)

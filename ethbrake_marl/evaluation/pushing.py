@@ -48,7 +48,7 @@ class PushedAway:
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the distance of Vehicle 1. Without an obstacle, the step is simulated again with a post."""
+        """Add the distance of Vehicle 1. Without an obstacle, the step is simulated again ``with_post``."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         times = np.ascontiguousarray(before.time_s), np.ascontiguousarray(after.time_s)

@@ -53,7 +53,7 @@ class Actor:
         return y
 
     def expert(self, x: Float32s) -> NDArray[np.int64]:
-        """Return the number (from 0) of the expert that acts on each column of ``x`` [F, rows], [rows]."""
+        """Return the number (from 0) of the expert that acts on each column of ``x`` [F, rows]."""
         return np.asarray(self.forward(self.gate, x).argmax(axis=0))
 
     def chosen(self, choice: NDArray[np.int64], x: Float32s) -> Float32s:

@@ -298,16 +298,16 @@ def trials(learners: int) -> Bools:
 def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
     """Fallback of ``accept``: return plans that go on with the best constant actions, and an estimate of their harm.
 
-    If scripts look at the state, the estimate is 0 (unknown).
+    It is 0 (unknown) if scripts look at the state.
     """
     plans, estimate = best_constant(game, after, plans, shield.count)
     return plans, np.zeros(len(plans)) if game.scripts else estimate
 
 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback of ``accept``: return plans in which the shield's agents drive on from ``after``, and 0 [n].
+    """Fallback of ``accept``: return plans in which the shield's agents drive on from ``after``.
 
-    The 0 is the estimate of their harm: unknown.
+    The other result, an estimate of their harm, is 0 (unknown).
     """
     nominal = after if after.n == len(plans) else after.take(np.arange(0, after.n, after.n // len(plans)))
     return shield.rolled_out(game, nominal, plans, most), np.zeros(len(plans))
