@@ -113,7 +113,7 @@ def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
 
 
 def collided(game: Game, alert: State, last: State) -> Given:
-    """Whether each world had an impact, [n]. The interval of the rate is Wilson's."""
+    """Whether each world had an impact. The interval of the rate is Wilson's."""
     return last.collided
 
 
@@ -129,27 +129,27 @@ def harm(count: str, game: Game, alert: State, last: State) -> Given:
 
 
 def impacts(game: Game, alert: State, last: State) -> Given:
-    """Number of impacts in each world, [n], those with an obstacle included."""
+    """Number of impacts in each world, those with an obstacle included."""
     return np.asarray(last.line[:, COUNT].sum(axis=1), np.int64)
 
 
 def hardest_impact_mps(game: Game, alert: State, last: State) -> Given:
-    """Largest closing speed of a pair's first impact in each world, [n]."""
+    """Largest closing speed of a pair's first impact in each world."""
     return np.asarray(np.sqrt(last.line[:, FIRST].max(axis=1)))
 
 
 def end_s(game: Game, alert: State, last: State) -> Given:
-    """Time from the alert to the end of each episode, [n]."""
+    """Time from the alert to the end of each episode."""
     return last.time_s
 
 
 def ended(game: Game, alert: State, last: State) -> Given:
-    """How each episode ended, [n]. at_rest: all vehicles came to rest; horizon: the horizon came first."""
+    """How each episode ended. at_rest: all vehicles came to rest; horizon: the horizon came first."""
     return np.where(last.at_rest, AT_REST, HORIZON)
 
 
 def predicted_harm(game: Game, alert: State, last: State) -> Given:
-    """Harm that the only predicting agent or shield predicted at the alert, in the count that it minimises, [n]."""
+    """Harm that the only predicting agent or shield predicted at the alert, in the count that it minimises."""
     memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.rules.learners.tolist())]
     predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
     return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None

@@ -75,7 +75,7 @@ def pushed_m(game: Game, alert: State) -> PushedAway | None:
 
 def pushed_mps(game: Game, alert: State, last: State) -> Given:
     """Push: closing speed that vehicles build up and contacts take up, as long as a contact lasts and in the impacts
-    after a pair's first. Of the whole line, [n]; with the number of a vehicle: by the vehicle behind it; obstacle: by
+    after a pair's first. Of the whole line; with the number of a vehicle: by the vehicle behind it; obstacle: by
     Vehicle 1 against the obstacle.
     """
     check_exact(last, "pushed_mps")
@@ -113,7 +113,7 @@ def drove_towards(game: Game, alert: State) -> DroveTowards:
 
 
 def still_moving(game: Game, alert: State, last: State) -> Given:
-    """Whether a vehicle of each world still moves at the end, [n], which is then at the horizon."""
+    """Whether a vehicle of each world still moves at the end, which is then at the horizon."""
     return ~last.at_rest
 
 

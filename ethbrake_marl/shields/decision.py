@@ -65,7 +65,7 @@ def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
 
 
 def intervention(before: State, step: Step, after: State) -> Floats:
-    """Minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0, [n, N]."""
+    """Minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
     memory = after.memories.get("shield")
     if memory is None:
         raise InvalidInput(
