@@ -156,7 +156,7 @@ def predicted_harm(game: Game, alert: State, last: State) -> Given:
 
 
 def replaced(game: Game, alert: State, last: State) -> Given:
-    """actions: number that the shield replaced, [n]; none: whether it replaced none (Algorithm 1: policy drives)."""
+    """actions: number the shield replaced; none: whether it replaced none, or let the policy drive (Algorithm 1)."""
     memory: Any = last.memories.get("shield")
     if hasattr(memory, "chosen"):
         return {"none": memory.chosen}
