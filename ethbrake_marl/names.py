@@ -130,7 +130,8 @@ WRAPPERS: Registry[Entry] = Registry("shield or search", "shields", register_shi
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
     """Return the agent or team with a name, such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: module docstring).
 
-    Teams, wrappers and agents that look ahead need ``scenario``. A Python file in the name runs with all your rights.
+    Teams, wrappers and agents that look ahead need ``scenario``. ``harm_count``: what optimising agents minimise
+    (``episode.counts``). A Python file in the name runs with all your rights.
     Raises ``UnknownName`` for an unknown name, and ``InvalidInput`` for a bad argument.
 
     >>> import ethbrake_marl as eb

@@ -157,7 +157,7 @@ class Registry(Mapping[str, T]):
         return list(parts)
 
     def add(self, name: str, part: T, is_same: Callable[[T], bool]) -> None:
-        """Add an object. Raises ``AlreadyExists`` if another object has the name.
+        """Add the object ``part``. Raises ``AlreadyExists`` if another object has the name.
 
         ``is_same`` says whether the existing object equals ``part``; then there is nothing to add.
         """

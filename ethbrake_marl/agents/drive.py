@@ -141,7 +141,10 @@ def drive(game: Game, alert: State, team: Team) -> State:
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Return the agents' actions, [n, L] in the order of ``drivers``, and body -> new memory."""
+    """Return the agents' actions, [n, L] in the order of ``drivers``, and body -> new memory.
+
+    ``drivers`` is body -> agent, ``memories`` body -> memory.
+    """
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
         commands, after[body] = asked(agent, state, memories[body], body)

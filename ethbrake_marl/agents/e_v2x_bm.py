@@ -52,7 +52,10 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.
 
 
 def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
-    """Return the harm of the decelerations ``tried`` [n, C], in ``count`` and in the count for ties, [2, n, C]."""
+    """Return the harm if vehicle ``body`` holds each of the decelerations ``tried`` [n, C] (m/s2), [2, n, C].
+
+    The first row is the harm in ``count``, the second in the count that breaks ties.
+    """
     return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
 
 
@@ -110,7 +113,10 @@ def find_cells(rows, at, harm, step, best, cells):
 
 @kernel
 def take_middle(at, harm, known):
-    """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] equals ``known[1:]``."""
+    """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] equals ``known[1:]``.
+
+    ``known`` [3] is the best deceleration so far (m/s2), with its harm in both counts.
+    """
     ties = 0
     for c in range(len(at)):
         ties += 1 if compare(harm[:, c], known) == 0 else 0
@@ -123,7 +129,7 @@ def take_middle(at, harm, known):
 
 @kernel
 def compare(harm, known):
-    """Return -1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more."""
+    """Return -1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more (``known`` as in ``take_middle``)."""
     for count in range(2):  # the other count decides ties
         if abs(harm[count] - known[count + 1]) > TIE:
             return -1 if harm[count] < known[count + 1] else 1
@@ -141,7 +147,7 @@ class EV2XBM:
     If they do, the predicted harm is, to the last bit, the harm of the episode.
 
     Args:
-        rules: of the episodes.
+        rules: rules of the episodes (``Game.rules``).
         agents: body -> role, for vehicles driven by agents whose commands are not known at the alert.
         count: harm to minimise: ``first``, ``total`` or ``honest`` (``episode.counts``).
 
@@ -177,7 +183,7 @@ class EV2XBMPairwise:
     name, knows = "e_v2x_bm:pairwise", STATE
 
     def begin(self, alert: State, body: int) -> Memory:
-        """Choose the deceleration. Raises ``InvalidInput`` where the closed form does not hold."""
+        """Choose the deceleration. Raises ``InvalidInput`` where the closed form does not hold (see ``pairwise``)."""
         deceleration, harm = pairwise(alert, body)
         return Memory(-deceleration, harm)
 

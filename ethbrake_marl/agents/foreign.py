@@ -36,7 +36,7 @@ INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """Return the function that asks a policy without a memory for its actions.
+    """Return the function ``(policy, observations) -> actions`` for this kind of policy, one without a memory.
 
     Raises ``InvalidInput``, beginning with ``who``, for an unknown kind of policy, and for a model whose actions would
     be random or depend on the rest of the batch.
@@ -120,7 +120,7 @@ def _opened(content: bytes) -> Any:
 
 
 def _refuse_training_mode(module: Any, who: str) -> None:
-    """Raise ``InvalidInput`` for a layer that is random, or depends on the other worlds of a batch."""
+    """Raise ``InvalidInput`` for a layer of a torch module whose training mode is on and affects its results."""
     for layer in module.modules():
         shares = [getattr(layer, name, None) for name in ("p", "dropout")]
         random = any(isinstance(share, float | int) and share > 0.0 for share in shares)
@@ -142,7 +142,8 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
 def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
     """Return the number of discrete actions of a policy; None if it returns numbers in [-1, 1].
 
-    Raises ``InvalidInput`` if its action space is neither a box from -1 to 1 nor ``given`` discrete actions.
+    ``given`` is the number that the user states, or None. Raises ``InvalidInput``, beginning with ``who``, if the
+    policy's action space does not fit: ``given`` actions, or without it a box from -1 to 1.
     """
     space: Any = getattr(policy, "action_space", None)
     if given is None and getattr(space, "evenly_spaced", False):  # of an environment of this package

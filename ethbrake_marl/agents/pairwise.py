@@ -37,7 +37,10 @@ class Choice(NamedTuple):
 
 @kernel
 def braking_now(speed, braking, onset, now):
-    """Return the acceleration (m/s2) of a vehicle that coasts until its onset, then brakes, and how long it lasts."""
+    """Return the acceleration of a vehicle at time ``now`` (m/s2), and how long it lasts (s).
+
+    The vehicle coasts until its ``onset`` (s), then brakes from ``speed`` (m/s) to rest with ``braking`` (m/s2).
+    """
     if now < onset:
         return 0.0, onset - now
     if speed > 0.0 and braking > 0.0:
@@ -49,9 +52,10 @@ def braking_now(speed, braking, onset, now):
 def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset, until):
     """Move a pair to its first impact, or to ``until`` (s); return its harm (m2/s2), the gap (m) and both speeds (m/s).
 
-    Each vehicle coasts until its onset (s), then brakes to rest. So accelerations are constant in pieces: both coast,
-    one brakes, both brake, one stands (regimes A to C of the proof); the function looks for a contact in each piece. A
-    contact without a closing speed is no impact. If the rear vehicle then presses on, they stay together: harm 0.
+    ``front`` and ``rear`` are the vehicles' speeds. Each coasts until its onset (s), then brakes to rest. So
+    accelerations are constant in pieces: both coast, one brakes, both brake, one stands (regimes A to C of the proof);
+    the function looks for a contact in each piece. A contact without a closing speed is no impact. If the rear vehicle
+    then presses on, they stay together: harm 0.
     """
     now = 0.0
     while now < until:
@@ -75,7 +79,10 @@ def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset,
 
 @large
 def predicted_harm(line, braking, wait, body, a):
-    """Return H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2)."""
+    """Return H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2).
+
+    Other arguments as in ``choose``, without the axis of worlds.
+    """
     gap, speed, harm = line[GAP], line[SPEED], 0.0
     if body > 1:
         i = body - 1
@@ -90,9 +97,9 @@ def predicted_harm(line, braking, wait, body, a):
 def find_candidates(line, braking, wait, body, at):
     """Write to ``at`` [CANDIDATES] the decelerations (m/s2) of vehicle ``body`` where H may be least, in one world.
 
-    The formulas use the state at the vehicle's onset: gap d, its speed v, the neighbour's speed u, closing speed w, and
-    the time s for which the neighbour still coasts before it brakes with b. A candidate may be invalid: outside [0,
-    capacity], or not a number.
+    Other arguments as in ``choose``, without the axis of worlds. The formulas use the state at the vehicle's onset: gap
+    d, its speed v, the neighbour's speed u, closing speed w, and the time s for which the neighbour still coasts before
+    it brakes with b. A candidate may be invalid: outside [0, capacity], or not a number.
     """
     gap, speed, onset = line[GAP], line[SPEED], wait[body]
     at[:] = 0.0
@@ -120,9 +127,10 @@ def find_candidates(line, braking, wait, body, at):
 def choose(line, braking, wait, body, at, harm, best, least):
     """Write the best deceleration of vehicle ``body`` in each world to ``best`` [n] (m/s2), and its H to ``least`` [n].
 
-    ``braking`` [n, N + 1] is each vehicle's braking capacity or present deceleration (m/s2), ``wait`` [n, N + 1] the
-    time until it may begin to brake (s). If several candidates are equally good, the result is the middle of the outer
-    two, provided that H is as small there.
+    ``line`` is the array of a ``State``, ``braking`` [n, N + 1] each vehicle's braking capacity or present deceleration
+    (m/s2), ``wait`` [n, N + 1] the time until it may begin to brake (s); ``at`` and ``harm`` [CANDIDATES] are working
+    memory. If several candidates are equally good, the result is the middle of the outer two, provided that H is as
+    small there.
     """
     for k in range(line.shape[0]):
         find_candidates(line[k], braking[k], wait[k], body, at)
@@ -142,7 +150,10 @@ def choose(line, braking, wait, body, at, harm, best, least):
 
 
 def closed_form(alert: State, braking: Floats, body: int) -> Choice:
-    """Return the choice of vehicle ``body`` if the others brake to rest with ``braking`` [n, N + 1] (m/s2)."""
+    """Return the best deceleration of vehicle ``body``, and H, if the others brake to rest as ``braking`` says.
+
+    ``braking`` is [n, N + 1] m/s2.
+    """
     wait = np.maximum(alert.car[:, LATENCY] - alert.time_s[:, np.newaxis], 0.0)
     choice = Choice(np.empty(alert.n), np.empty(alert.n))
     choose(alert.line, braking, wait, body, np.empty(CANDIDATES), np.empty(CANDIDATES), *choice)

@@ -17,9 +17,10 @@ ANY = ("policy", "team")  # names that stand for whatever algorithm has trained 
 def make_trained(argument: str | None, settings: Any) -> Agent | Team:
     """Return the agent or team of a run or bundle, or of a shipped policy if the name has no path.
 
-    ``argument`` is the algorithm that must have trained it, unless the name says so. A run in which each learner has
-    its own policy gives a team, or one agent if only one vehicle is asked for. Raises ``InvalidInput`` for a policy of
-    another algorithm, and the errors of ``load_policy``.
+    ``argument``, or else the name before the ``@``, is the algorithm that must have trained it; ``policy`` and ``team``
+    allow any. ``settings`` are ``names.AgentSettings``. A run in which each learner has its own policy gives a team, or
+    one agent if only one vehicle is asked for. Raises ``InvalidInput`` for a policy of another algorithm, and the
+    errors of ``load_policy``.
     """
     spec, path = settings.spec, settings.policy
     name = argument or spec.partition("@")[0]

@@ -40,8 +40,9 @@ def read_settings(
 ) -> Settings:
     """Sort the settings ``KEY=VALUE`` of a command by what they change: scenario, recipe or the command itself.
 
-    A key that scenario and recipe share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an
-    unknown key, and ``InvalidInput`` for an ambiguous key or a bad value.
+    ``recipe_keys`` and ``of_command`` are the keys of the recipe and of the command. A key that scenario and recipe
+    share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an unknown key, and ``InvalidInput``
+    for an ambiguous key or a bad value.
     """
     known = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
     known["command"] = {*of_command}
@@ -71,7 +72,11 @@ def read_settings(
 
 
 def _counted(rules: Override, given: Sequence[Override], owner: str) -> Override:
-    """Return the setting that ``rules=NAME`` stands for: ``reward.harm_count`` of a recipe, else ``harm_count``."""
+    """Return the setting for which ``rules=NAME`` is short: ``reward.harm_count`` of a recipe, else ``harm_count``.
+
+    ``owner`` is ``recipe`` or another owner of settings. Raises ``InvalidInput`` for an unknown NAME, and if one of the
+    settings ``given`` sets the same.
+    """
     name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
     if not isinstance(name, str) or name not in RULES:
         raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(RULES)}")

@@ -10,25 +10,31 @@ from ethbrake_marl.motion.layout import COUNT, DROVE, NEXT_TIME, PUSHED, Floats
 
 
 def push(before: State, step: Step, after: State) -> Floats:
-    """Term push, [n]: minus the push of all contacts (m/s), including the obstacle's (``motion.push``)."""
+    """Term push of rewards (``episode.terms``), [n]: minus the push (m/s) of all contacts in the step.
+
+    It includes the contact with the obstacle. Formula: ``motion.push``.
+    """
     check_exact(before, "the term push")
     return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
 
 
 def drove(before: State, step: Step, after: State) -> Floats:
-    """Term drove, [n, N]: minus the speed that positive commands ask for before the line's first impact (m/s)."""
+    """Term drove of rewards (``episode.terms``), [n, N]: minus the speed that commands ask for by driving (m/s).
+
+    That is a positive command times its duration, until the line's first impact.
+    """
     check_exact(before, "the term drove")
     return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
 
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
-    """Term still_moving, [n]: -1 if the episode ends at the horizon with a vehicle in motion."""
+    """Term still_moving of rewards (``episode.terms``), [n]: -1 if a vehicle moves at the horizon, otherwise 0."""
     check_exact(before, "the term still_moving")
     return 0.0 - step.out[TRUNCATED]
 
 
 def first_impact_s(before: State, after: State) -> Floats:
-    """Time of the line's first impact, [n] s; ``before.time_s`` if it was earlier, ``after.time_s`` if it is later.
+    """Time of the line's first impact, [n] s; ``before.time_s`` if it was earlier, ``after.time_s`` if later or never.
 
     There must be no decision between the two states.
     """

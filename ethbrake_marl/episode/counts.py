@@ -47,13 +47,16 @@ def check_count(what: str, count: object) -> None:
 
 
 def other_count(count: Count) -> str:
-    """The count that decides between equal harms."""
+    """The count that decides where harms in ``count`` are equal: total for ``first``, first for all others."""
     return "total" if isinstance(count, str) and count == "first" else "first"
 
 
 @kernel
 def pair_amount(line, p, weights):
-    """Harm of pair ``p`` in one world so far (m2/s2); ``weights`` [6]: of a count (``COUNTS``)."""
+    """Harm of pair ``p`` (0: with the obstacle) so far, in one world's ``line`` (``motion.layout``), m2/s2.
+
+    ``weights`` [6] are a value of ``COUNTS``.
+    """
     harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
     beside = weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
     return harm + (weights[2] * line[PASSED, p] + beside)
@@ -61,13 +64,13 @@ def pair_amount(line, p, weights):
 
 @kernel
 def own_amount(line, p, weights):
-    """Part of ``pair_amount`` for driving and motion (m2/s2), which the rear vehicle of pair ``p`` bears alone."""
+    """Part of ``pair_amount`` for driving and motion (m2/s2), which the rear vehicle of the pair bears alone."""
     return weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
 
 
 @kernel
 def amount_so_far(line, weights):
-    """Harm of one world so far, as a count counts it (m2/s2), always summed from the obstacle to the rear."""
+    """Harm of one world so far (m2/s2): ``pair_amount`` of all pairs, always summed from the obstacle to the rear."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
         amount += pair_amount(line, p, weights)
@@ -75,7 +78,10 @@ def amount_so_far(line, weights):
 
 
 def pair_amounts(line: Floats, count: Count) -> Floats:
-    """Harm of each pair so far, as ``count`` counts it, [n, N + 1] m2/s2; column 0 is the pair with the obstacle."""
+    """Harm of each pair so far, as ``count`` counts it, [n, N + 1] m2/s2; column 0 is the pair with the obstacle.
+
+    ``line``: the array of a ``State``.
+    """
     first, total, passed, push, drove, moving = weights_of(count)
     harm = first * line[:, FIRST] + total * line[:, TOTAL]
     beside = push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING]

@@ -77,7 +77,7 @@ SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 
 class Own(NamedTuple):
-    """A feature that is computed by a function of its own."""
+    """A feature of the observer or of a neighbour, computed by a function of its own (``register_feature``)."""
 
     feature: Feature
     of: Of
@@ -86,7 +86,7 @@ class Own(NamedTuple):
 
 
 class Group(NamedTuple):
-    """Features that a package computes together."""
+    """Features that one function computes together (``register_feature_group``)."""
 
     features: tuple[Feature, ...]
     function: Callable[[State, Ints, float], Floats]  # (state, bodies, time step) -> values, [n, bodies, ...], unscaled

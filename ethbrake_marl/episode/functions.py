@@ -13,9 +13,10 @@ from ethbrake_marl.motion.layout import Floats
 
 
 def described(kind: str, name: object, function: object, pattern: str, form: str) -> str:
-    """Docstring, on one line, of a function that is being registered.
+    """Docstring, on one line, of a ``function`` that is being registered as a ``kind``, such as ``term``.
 
-    Raises ``InvalidInput`` if there is none, or for a name that does not match ``pattern`` (``form``: in words).
+    Raises ``InvalidInput`` if there is none, or for a name that does not match ``pattern``, which ``form`` says in
+    words.
     """
     if not isinstance(name, str) or re.fullmatch(pattern, name) is None:
         raise InvalidInput(f"{kind} {name!r:.80}: the name must be 1 to 64 characters {form}")
@@ -25,7 +26,10 @@ def described(kind: str, name: object, function: object, pattern: str, form: str
 
 
 def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *shapes: tuple[int, ...]) -> Floats:
-    """Result of ``function(*given)``, as numbers. Raises ``InvalidInput`` if it fails or has none of the ``shapes``."""
+    """Result of ``function(*given)``, as an array of numbers.
+
+    Raises ``InvalidInput``, beginning with ``what``, if it fails or its result has none of the ``shapes``.
+    """
     try:
         value = np.asarray(function(*given))
     except InvalidInput as error:
@@ -41,7 +45,10 @@ def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *sha
 
 
 def check_finite(what: str, value: Floats, times_s: Floats) -> None:
-    """Raise ``InvalidInput`` unless all values, [n] or [n, N], are finite."""
+    """Raise ``InvalidInput`` unless all of ``value``, [n] or [n, N], are finite.
+
+    The message names ``what`` and the first bad row, with its time from ``times_s`` [n].
+    """
     for row, *vehicle in np.argwhere(~np.isfinite(value))[:1]:
         whose = "".join(f" for vehicle_{i + 1}" for i in vehicle)
         raise InvalidInput(

@@ -34,12 +34,13 @@ class Shield(Protocol):
     """Decides which proposed actions are applied, and which are replaced."""
 
     def begin(self, game: Game, alert: State, state: State) -> Any:
-        """Memory of the shield for new episodes, at their first decision ``state``."""
+        """Memory of the shield for new episodes: their worlds at the ``alert``, and at the first decision ``state``."""
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Any]:
-        """Actions to apply, [n, L], and the new memory.
+        """Actions to apply, [n, L] of the L learners, and the new memory.
 
         ``proposed`` [n, L] are actions in [-1, 1], or NaN for no proposal. None: the shield's own agents propose.
+        ``donate``: the arrays of ``state`` may be overwritten.
         """
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
@@ -114,7 +115,7 @@ class Game(NamedTuple):
         return one_step.first_decision(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """``step`` without the shield, and without reward terms other than harm and terminal."""
+        """``step`` (same arguments) without the shield, and without reward terms other than harm and terminal."""
         return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
@@ -122,7 +123,7 @@ class Game(NamedTuple):
         return drivers
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Whether vehicle ``body`` does not know everything about each body at its first decision, [n, N + 1]."""
+        """Whether something about each body is hidden from vehicle ``body`` at its first decision, [n, N + 1]."""
         return alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
 
     def own_infos(self, state: State) -> dict[str, Any]:
@@ -132,7 +133,7 @@ class Game(NamedTuple):
         return {f"shield_{name}": value for name, value in self.shield.infos(self, state).items()}
 
     def observe(self, state: State, bodies: Ints) -> list[Observations]:
-        """Observations of each body, a list of arrays [n, F]."""
+        """Observations of each body: a list of arrays [n, F], with the F features that this body observes."""
         return [self.views[i].observe(state, np.array([i]), self.rules.time_step_s)[:, 0] for i in bodies.tolist()]
 
     def observe_alike(self, state: State, bodies: Sequence[int] | Ints) -> Observations:

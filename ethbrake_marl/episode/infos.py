@@ -47,7 +47,10 @@ OF_FIRST, OF_ALL = COUNTS["first"], COUNTS["total"]
 
 @large
 def report(line, car, clock, wanted, bodies, borne, out):
-    """Write NUMBERS of the bodies to ``out`` [n, bodies, len(NUMBERS)]; ``borne`` [2, N] is working memory."""
+    """Write the infos ``NUMBERS`` of the bodies to ``out`` [n, bodies, len(NUMBERS)].
+
+    ``line`` to ``wanted`` are arrays of a ``State``; ``borne`` [2, N] is working memory.
+    """
     for k in range(len(out)):
         split_world(line[k, FIRST], car[k, MASS], borne[0])
         split_world(line[k, TOTAL], car[k, MASS], borne[1])

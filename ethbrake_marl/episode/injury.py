@@ -50,16 +50,18 @@ def risks(changes: Floats, curve: str) -> Floats:
     """Probability of an injury in each vehicle by an impact at its front, and at its rear, [n, 2, N].
 
     ``changes`` [n, 2, N] are the vehicle's changes of speed there (m/s). Where it was not hit the probability is 0.
+    ``curve`` is a name in ``CURVES``.
     """
     each = [CURVES[curve].front(changes[:, 0].copy()), CURVES[curve].rear(changes[:, 1].copy())]
     return np.where(changes > 0.0, np.stack(each, axis=1), 0.0)
 
 
 def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
-    """Expected injuries in 1,000 lines, [n], as if a single impact had done each pair's harm [n, N + 1] (m2/s2).
+    """Expected injuries in 1,000 lines, [n], as if a single impact had done each pair's harm ``pairs``.
 
-    A vehicle that is hit on both sides counts with the larger of its two risks. Exact for first impacts of two
-    vehicles; too large if several impacts of a pair add up.
+    ``pairs`` is [n, N + 1] m2/s2, column 0 for the obstacle; ``car``: parameters of the ``State``. A vehicle that is
+    hit on both sides counts with the larger of its two risks. Exact for first impacts of two vehicles; too large if
+    several impacts of a pair add up.
     """
     rebound = (1.0 + car[:, RESTITUTION, :-1]) * np.sqrt(pairs[:, :-1])
     mass = car[:, MASS, 1:]

@@ -50,7 +50,7 @@ FIRST_WEIGHT = 1000.0  # weight of A in ``first:A,then:B``; B keeps the scale fo
 
 
 class Harm(NamedTuple):
-    """Harm of n worlds over some time."""
+    """Harm of n worlds over some time: of each pair, of each vehicle, and of the line."""
 
     pairs: Floats  # [n, N + 1] harm of each pair, m2/s2; column 0: with the obstacle
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
@@ -59,7 +59,11 @@ class Harm(NamedTuple):
 
     @classmethod
     def of(cls, pairs: Floats, own: Floats, car: Floats) -> Harm:
-        """Harm from that of pairs, [n, N + 1], of which the rear vehicle bears the part ``own`` [n, N + 1] alone."""
+        """Harm of pairs, vehicles and line, from the harm ``pairs`` of each pair (column 0: with the obstacle).
+
+        The rear vehicle of a pair bears the part ``own`` alone; the two share the rest by their masses. ``pairs`` and
+        ``own`` are [n, N + 1] m2/s2, ``car`` the parameters of a ``State``.
+        """
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             whole = whole + pairs[:, p]
@@ -105,7 +109,7 @@ class Objective(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """Whether vehicles with this objective have amounts of their own."""
+        """Whether the amount may differ between vehicles with this objective, as for ``own``."""
         return self.kind.name in PERSONAL or self.kind.function is not None or any(part.differs for part in self.parts)
 
     def amount(self, harm: Harm, vehicle: int) -> Floats:
@@ -113,7 +117,10 @@ class Objective(NamedTuple):
         return self.kind.amount(harm, vehicle, self)
 
     def weights(self, car: Floats, vehicle: int) -> Floats:
-        """Weight of each vehicle's harm, [n, N]. Raises ``InvalidInput`` unless the objective is a weighted sum."""
+        """Weight of each vehicle's harm in the amount of ``vehicle`` (from 0), [n, N]; ``car``: array of a ``State``.
+
+        Raises ``InvalidInput`` unless the objective is a weighted sum.
+        """
         if self.kind.weights is None:
             known = ", ".join(kind.form for kind in OBJECTIVES.loaded.values() if kind.weights)
             raise InvalidInput(
@@ -207,7 +214,7 @@ def _check_vehicles(text: str, objective: Objective, vehicles: int) -> None:
 
 
 def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: bool) -> list[int]:
-    """Pairs whose impacts cost ``vehicle`` (from 0) nothing: K for Vehicles K and K + 1, 0 for the obstacle.
+    """Pairs whose impacts cost ``vehicle`` (from 0) nothing: K for Vehicles K and K + 1, 0 for an ``obstacle``.
 
     Only for ``weighted`` and ``vehicle_K``, whose weights of 0 may be a mistake. With ``own`` or ``social:90``
     indifference is intended: the result is empty.
@@ -219,9 +226,10 @@ def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: b
 
 
 def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: str) -> Floats:
-    """Increase of each vehicle's amount since ``before`` (None: since the alert), [n, N].
+    """Increase of what each vehicle should minimise, since ``before`` (None: since the alert), [n, N].
 
     A weighted sum is computed from the harm since then; other objectives are amount after minus amount before.
+    ``count`` says which harm (``episode.counts``).
     """
     now, own = pair_amounts(after.line, count), own_amounts(after.line, count)
     whole = Harm.of(now, own, after.car)

@@ -143,7 +143,8 @@ def scaled(values: Floats, scaling: Floats) -> Floats:
 def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[np.bool_]) -> Floats:
     """Observed value of a feature that has a function, [n].
 
-    ``offset`` leads to the neighbour, who is ``known`` [n] or not; 0: the feature describes the vehicle itself.
+    ``offset`` leads from the body to the neighbour that is described (-1: the vehicle ahead), where it is ``known``
+    [n]; 0: the feature describes the body itself.
     """
     what = f"feature {own.feature.name!r} of vehicle_{body}"
     if offset and not known.any():
@@ -158,7 +159,10 @@ def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[n
 
 @kernel
 def full_stop_m(speed, latency_left, capacity):
-    """Distance (m) in which a vehicle stops whose brakes act at once (``forces.stopping_m``)."""
+    """Distance to a stop (m): ``v tau + v^2 / (2 a)``, if brakes act at once (``forces.stopping_m``).
+
+    Speed v (m/s), time ``latency_left`` tau (s) without braking, braking ``capacity`` a (m/s2).
+    """
     speed = max(speed, 0.0)
     return speed * latency_left + speed * speed / (2.0 * capacity)
 
@@ -167,7 +171,8 @@ def full_stop_m(speed, latency_left, capacity):
 def fitting_deceleration(speed, latency_left, room):
     """Deceleration (m/s2) that stops a vehicle within ``room`` (m): ``v^2 / (2 (room - v tau))``.
 
-    If less than 1 mm is left after the latency tau, it counts as 1 mm; the observation is clipped there.
+    Speed v (m/s), time ``latency_left`` tau (s) without braking. If less than 1 mm is left after tau, it counts as 1
+    mm; the observation is clipped there.
     """
     speed = max(speed, 0.0)
     return speed * speed / (2.0 * max(room - speed * latency_left, 1e-3))
@@ -182,8 +187,10 @@ def bounded(value, scaling, f):
 def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out):
     """Write the scaled features of the groups own, neighbours, role and obstacle to ``out`` [n, observers, F].
 
-    All are computed in this order in ``value``. ``places`` [F] are the positions to write (-1: none); if it is empty,
-    all values are written in order.
+    All are computed in this order in ``value``; ``role`` and ``obstacle`` say whether these groups are. ``places`` [F]
+    are the positions to write (-1: none); if it is empty, all values are written in order. ``line`` to ``know`` are
+    arrays of a ``State``, ``offsets`` lead to the neighbours (-1: the vehicle ahead), ``scaling`` is from
+    ``scaling_of``.
     """
     bodies = line.shape[2]
     for k in range(len(out)):

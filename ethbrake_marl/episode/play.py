@@ -29,7 +29,11 @@ def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
 
 @large
 def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, count, scratch, out):
-    """Follow each plan [T, L], in place; write the harm to ``out`` [n]. An episode stops above ``most`` [n]."""
+    """Follow plans [n, T, L] of the L learners, in place; write the harm to ``out`` [n].
+
+    An episode stops above the harm ``most`` [n]. After T decisions the last one repeats. The other arguments are those
+    of ``step.step_worlds``.
+    """
     for k in range(len(out)):
         harm = amount_so_far(line[k], count)
         while clock[k, ENDED] == 0.0 and harm <= most[k]:
@@ -43,8 +47,9 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, ho
 def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, memory, out):
     """Write the harm to ``out`` [2, n, C] if ``bodies`` [B] hold the commands ``tried`` [n, C, B] (m/s2).
 
-    Row 0 of ``out`` counts by the weights ``count`` [6], row 1 by ``other``. ``time`` [n] and ``until`` (s): from when
-    to when they hold; ``memory``: ``working_memory``, overwritten.
+    The other bodies hold ``wanted``. Row 0 of ``out`` counts by the weights ``count`` [6], row 1 by ``other``. ``time``
+    [n] and ``until`` (s): from when to when they hold. ``line``, ``car`` and ``wanted`` are arrays of a ``State``;
+    ``memory``: ``working_memory``, overwritten.
     """
     scratch, here, commands = memory
     for k in range(tried.shape[0]):
@@ -115,8 +120,8 @@ def descend(
 ) -> tuple[Floats, Floats]:
     """Choose the best constant share of each body's brakes, one body after the other, while all others brake fully.
 
-    The bodies take turns in ``rounds`` rounds, each with the others' latest choice. Returns the commands of all bodies,
-    [n, N + 1] m/s2, and the harm of the episode, [n] m2/s2.
+    ``shares`` are the candidates, in [0, 1]. The bodies take turns in ``rounds`` rounds, each with the others' latest
+    choice. Returns the commands of all bodies, [n, N + 1] m/s2, and the harm of the episode, [n] m2/s2.
     """
     wanted, least = -state.car[:, BRAKING], np.zeros(state.n)
     for body in list(bodies) * rounds:

@@ -208,7 +208,10 @@ class State(NamedTuple):
 
 
 def check_exact(state: State, what: str) -> None:
-    """Raise ``InvalidInput`` unless impacts in these worlds are exact. ``what`` names the feature that needs this."""
+    """Raise ``InvalidInput`` if these worlds have another physics than exact impacts (key ``physics`` of a scenario).
+
+    ``what`` names the feature that needs exact impacts.
+    """
     if PHYSICS in state.memories:
         raise InvalidInput(
             f"{what} needs exact impacts, and these worlds have another physics (key physics of their scenario);"
@@ -232,7 +235,7 @@ def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """``rows`` of every array in a memory. A slice is copied, so that compiled code gets the usual array layout."""
+    """``rows`` of every array in a memory (``mapped``). Slices are copied: compiled code then gets the usual layout."""
     if isinstance(rows, slice):
         return mapped(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)
@@ -241,7 +244,7 @@ def take(memory: Any, rows: Any) -> Any:
 
 
 def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
-    """A memory with ``new`` in ``rows``: a copy, or the same arrays if they are donated."""
+    """A memory (``mapped``) with ``new`` in ``rows``: a copy, or with ``donate`` the same arrays."""
 
     def written(old: Any, part: Any) -> Any:
         array = old if donate else old.copy()
@@ -259,7 +262,7 @@ def _harm(line, weights, out):
 
 @kernel
 def front_share(harm, front_mass, rear_mass):
-    """Part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)`` (eq. harm).
+    """Part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)``, with masses in t.
 
     The larger part is computed and the smaller one is the rest, so both sum to ``harm`` exactly.
     """

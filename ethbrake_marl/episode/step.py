@@ -119,7 +119,10 @@ class Step(NamedTuple):
 
 @kernel
 def command(car, wanted, learners, actions):
-    """Write the learners' commands to ``wanted``, from actions: -1 full braking, 0 coasting, 1 full driving."""
+    """Write one world's commands (m/s2) to ``wanted`` [N + 1], from the ``actions`` [L] of the bodies ``learners`` [L].
+
+    Action -1: full braking; 0: coasting; 1: full driving.
+    """
     for j in range(learners.shape[0]):
         i, action = learners[j], min(max(actions[j], -1.0), 1.0)
         wanted[i] = action * car[BRAKING, i] if action < 0.0 else action * car[DRIVING, i]
@@ -127,7 +130,7 @@ def command(car, wanted, learners, actions):
 
 @kernel
 def stands(line, wanted):
-    """Whether every vehicle is at rest and no command or force would move it."""
+    """Whether every vehicle of one world is at rest, and no command (``wanted``) or force would move it."""
     at_rest = True
     for i in range(1, line.shape[1]):
         at_rest = at_rest and line[SPEED, i] == 0.0 and wanted[i] <= 0.0 and line[FORCE, i] <= 0.0
@@ -136,7 +139,7 @@ def stands(line, wanted):
 
 @kernel
 def note_motion(line):
-    """Store the squared speed of each vehicle at the horizon in the row MOVING."""
+    """Store each vehicle's squared speed at the horizon in the row MOVING of one world's ``line``."""
     for i in range(1, line.shape[1]):
         line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
 
@@ -145,7 +148,8 @@ def note_motion(line):
 def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     """Advance one running world to its next decision, in place; return ``drive``'s result, and whether all is at rest.
 
-    Decision times are multiples of the time step after the first decision, so that they never differ by rounding.
+    Arguments as in ``step_worlds``, without the axis of worlds. Decision times are multiples of the time step after the
+    first decision, so that they never differ by rounding.
     """
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
@@ -161,7 +165,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
 
 @kernel
 def beside_harm(line: Floats, count: Floats) -> float:
-    """What a count adds to first-impact and total harm in one world so far (m2/s2).
+    """Part of the honest cost beside the harm of impacts, in one world so far (m2/s2); ``count`` [6] from ``COUNTS``.
 
     ``amount_so_far`` sums in another order; the last bits of rewards depend on this one.
     """
@@ -178,7 +182,9 @@ def step_worlds(
 ):
     """Advance every running episode by one step, in place; return the row of an invalid action and of a failed world.
 
-    -1 stands for none. An action is invalid if it is not a number in [-1, 1]; then nothing has moved.
+    -1 stands for none. An action is invalid if it is not a number in [-1, 1]; then nothing has moved. ``line`` to
+    ``wanted`` are arrays of a ``State``, ``out`` and ``reward`` of a ``Step``; ``scratch`` is the physics' working
+    memory. ``harm`` and ``terminal`` are weights of the reward, ``count`` [6] those of the harm in it (``COUNTS``).
     """
     n, bodies = wanted.shape
     for k in range(n):
@@ -226,7 +232,10 @@ def drive_worlds(line, car, time, until, wanted, scratch):
 
 
 def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wanted: Floats, scratch: Floats) -> int:
-    """Advance every world from ``time`` to ``until`` [n] (s), ``line`` in place; return a failed row, or -1."""
+    """Advance every world from ``time`` to ``until`` [n] (s), ``line`` in place; return a failed row, or -1.
+
+    The other arrays are described in ``motion.layout``; all vehicles hold the commands ``wanted`` [n, N + 1] (m/s2).
+    """
     moved = line.copy()  # arrays of any layout become alike, because a kernel is compiled for each layout
     failed: int = drive_worlds(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
     line[:] = moved
@@ -247,7 +256,10 @@ def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[in
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:
-    """State of worlds at the alert, when Vehicle 1 begins to brake and nobody has decided yet."""
+    """State of worlds at the alert, when Vehicle 1 begins to brake and nobody has decided yet.
+
+    The arrays are those of ``State``; ``numbers`` [n] are the worlds' numbers.
+    """
     clock = np.zeros((len(line), CLOCK_COLUMNS))
     clock[:, NUMBER] = numbers
     return State(line, car, clock, know, wanted, {})
@@ -313,7 +325,7 @@ def scripted(scripts: Mapping[int, Any], state: State) -> State:
 
 
 def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None) -> State:
-    """State with the commands of scripts and learners, as at the beginning of a step."""
+    """State with the commands of scripts and learners, as at the beginning of a step; arguments of ``step``."""
     given = proposals(rules, numbers_of(rules, actions, state.n), state.n)
     if np.isnan(given).any():
         _check_actions(rules, given[np.isnan(given).any(axis=1).argmax()])
@@ -325,7 +337,7 @@ def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Flo
 
 
 def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
-    """Actions as float64 [n, L]. Raises ``InvalidInput`` for another type or shape."""
+    """Actions of the L learners as float64 [n, L]. Raises ``InvalidInput`` for another type or shape."""
     shape = n, len(rules.learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
         raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")

@@ -48,7 +48,7 @@ BRAKING_SHARES = np.linspace(0.0, 1.0, 9)
 
 
 class Term(NamedTuple):
-    """A registered term."""
+    """A registered term of rewards (``register_term``)."""
 
     name: str
     function: TermFunction
@@ -101,7 +101,7 @@ BUILT_IN = {  # name -> (unit, meaning)
 
 
 def collision(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Term collision with exact impacts, [n]; ``params`` are ``RewardParams``."""
+    """Term collision (formula: module docstring) with exact impacts, [n]; ``params`` are ``RewardParams``."""
     check_exact(before, "the sum of the term collision")
     if isinstance(params.k_energy, float):
         return -params.k_energy * step.total_harm
@@ -109,7 +109,7 @@ def collision(params: Any, before: State, step: Step, after: State) -> Floats:
 
 
 def pair_energies(params: Any, vehicles: int) -> Floats:
-    """``k_energy`` of every pair, [N + 1]; the obstacle's is that of the first pair of vehicles."""
+    """``k_energy`` of every pair, [N + 1], from ``RewardParams``; the obstacle's is that of the first two vehicles."""
     each = params.k_energy if isinstance(params.k_energy, tuple) else (params.k_energy,) * (vehicles - 1)
     return np.array([each[0], *each, 0.0])
 
@@ -120,7 +120,7 @@ def jerk(before: State, step: Step, after: State) -> Floats:
 
 
 def risk(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Term risk, [n, N]; ``params`` are ``RewardParams``."""
+    """Term risk (formula: module docstring), [n, N]; ``params`` are ``RewardParams``."""
     closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
     room = np.maximum(after.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0
@@ -167,12 +167,12 @@ class Shaping(NamedTuple):
 
 
 def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
-    """Term harm for vehicles with objectives, [n, N]."""
+    """Term harm for vehicles with ``objectives``, one each, [n, N]; ``count`` says which harm (``episode.counts``)."""
     return -amounts(objectives, before, after, count)
 
 
 def component(name: str, count: str) -> TermFunction:
-    """Function of the component ``harm_K``, ``pair_J_K`` or ``obstacle``, which returns [n]."""
+    """Function of the component ``harm_K``, ``pair_J_K`` or ``obstacle`` in a count of harm; it returns [n]."""
     if name == "obstacle":
         return partial(_of_pair, 0, count)
     last_vehicle = int(name.rpartition("_")[2])

@@ -29,7 +29,7 @@ SAME = {  # what two results must have in common -> what differs otherwise
 
 @dataclass(frozen=True)
 class Comparison:
-    """Second result minus first, for every team in both."""
+    """Mean harm of the second result minus that of the first, for every team in both."""
 
     differences: Mapping[str, Mapping[str, Estimate]]  # team -> count of harm -> difference of the means (m2/s2)
     unpaired_because: str  # why worlds cannot be paired; "": intervals are paired

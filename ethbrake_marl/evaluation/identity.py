@@ -21,7 +21,7 @@ WORDS = ("name", "title", "description", "source")  # keys of a scenario that do
 
 
 def worlds_sha256(worlds: State) -> str:
-    """Return the SHA-256 of worlds at the alert, from all arrays, little-endian, without ``line`` from PUSHED on."""
+    """Return the SHA-256 of worlds at the alert, from all arrays, little-endian; of ``line`` the rows before PUSHED."""
     digest = hashlib.sha256()
     for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
         digest.update(f"{array.shape}".encode())
@@ -47,6 +47,6 @@ def versions() -> dict[str, str]:
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Return vehicle -> SHA-256 of its policy's manifest, for policies of this package."""
+    """Return vehicle -> SHA-256 of its policy's manifest, for policies of this package; ``drivers``: body -> agent."""
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
     return {f"vehicle_{body}": each.manifest_sha256 for body, each in manifests.items() if each is not None}

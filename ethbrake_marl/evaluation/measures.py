@@ -85,7 +85,10 @@ class Measure(NamedTuple):
 
 
 def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
-    """Return the columns of a measure's value: name -> [n]. Raises ``InvalidInput`` for a wrong shape or type."""
+    """Return the columns of a measure, name -> [n], from its value ``given``.
+
+    Raises ``InvalidInput`` for a wrong shape or type.
+    """
     if given is None:
         return {}
     parts: Mapping[str, Any] = given if isinstance(given, Mapping) else {"": given}
@@ -110,12 +113,15 @@ def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
 
 
 def collided(game: Game, alert: State, last: State) -> Given:
-    """Whether there was an impact. The interval of the rate is Wilson's."""
+    """Whether each world had an impact. The interval of the rate is Wilson's."""
     return last.collided
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> Given:
-    """Return harm of the line, and of each vehicle; None for the honest cost if impacts are not exact."""
+    """Return the harm of the line (ending ``""``) and of each vehicle (``1`` to ``N``), [n] each, in a count of harm.
+
+    None for the honest cost if impacts are not exact.
+    """
     if count == "honest" and PHYSICS in last.memories:
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
@@ -123,34 +129,34 @@ def harm(count: str, game: Game, alert: State, last: State) -> Given:
 
 
 def impacts(game: Game, alert: State, last: State) -> Given:
-    """Number of impacts, those with an obstacle included."""
+    """Number of impacts in each world, those with an obstacle included."""
     return np.asarray(last.line[:, COUNT].sum(axis=1), np.int64)
 
 
 def hardest_impact_mps(game: Game, alert: State, last: State) -> Given:
-    """Largest closing speed of a pair's first impact."""
+    """Largest closing speed of a pair's first impact in each world."""
     return np.asarray(np.sqrt(last.line[:, FIRST].max(axis=1)))
 
 
 def end_s(game: Game, alert: State, last: State) -> Given:
-    """When the episode ended."""
+    """Time from the alert to the end of each episode."""
     return last.time_s
 
 
 def ended(game: Game, alert: State, last: State) -> Given:
-    """at_rest: all vehicles came to rest; horizon: the horizon came first."""
+    """How each episode ended. at_rest: all vehicles came to rest; horizon: the horizon came first."""
     return np.where(last.at_rest, AT_REST, HORIZON)
 
 
 def predicted_harm(game: Game, alert: State, last: State) -> Given:
-    """Harm that the agent predicted at the alert, in the count that it minimises."""
+    """Harm that the only predicting agent or shield predicted at the alert, in the count that it minimises."""
     memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.rules.learners.tolist())]
     predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
     return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
 
 
 def replaced(game: Game, alert: State, last: State) -> Given:
-    """Number of actions that the shield replaced; whether it replaced none, or let the policy drive (Algorithm 1)."""
+    """actions: number the shield replaced; none: whether it replaced none, or let the policy drive (Algorithm 1)."""
     memory: Any = last.memories.get("shield")
     if hasattr(memory, "chosen"):
         return {"none": memory.chosen}

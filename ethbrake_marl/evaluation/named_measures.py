@@ -176,7 +176,7 @@ def _summed(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """Term intervention, but 0 without a shield, so that a table can compare both."""
+    """Term intervention (``shields.decision``), but 0 without a shield, so that a table can compare both."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)
@@ -190,7 +190,7 @@ def _objective(name: str, game: Game, alert: State, last: State) -> Given:
 
 
 class SummedTerm:
-    """Sums a term of a reward over all steps."""
+    """A ``Watch`` that sums a term of a reward over all steps."""
 
     def __init__(self, term: TermFunction, game: Game, alert: State) -> None:
         self.term, self.sum = term, np.zeros(alert.n)

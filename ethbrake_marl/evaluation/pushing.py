@@ -28,14 +28,17 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 def with_post(state: State) -> Floats:
-    """Return a copy of the lines. Without an obstacle it has a far post, whose gap shows how far Vehicle 1 moves."""
+    """Return a copy of ``state.line`` in which Vehicle 1 has something ahead: without an obstacle, a far post.
+
+    Its gap to Vehicle 1 shows how far Vehicle 1 moves.
+    """
     line = state.line.copy()
     line[:, GAP, 0] = np.where(line[:, GAP, 0] < FAR_M, line[:, GAP, 0], POST_M)
     return line
 
 
 class PushedAway:
-    """Distance that a vehicle travels, minus the distance until the horizon if nobody touched it.
+    """A ``Watch`` of the distance that vehicles travel, minus the distance until the horizon if nobody touched them.
 
     It is negative if the vehicle ends nearer, for instance because an obstacle threw it back.
     """
@@ -45,7 +48,7 @@ class PushedAway:
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        """Add the distance of Vehicle 1. Without an obstacle, the step is simulated again with a post."""
+        """Add the distance of Vehicle 1. Without an obstacle, the step is simulated again ``with_post``."""
         line = with_post(before)
         from_m = line[:, GAP, 0].copy()
         times = np.ascontiguousarray(before.time_s), np.ascontiguousarray(after.time_s)
@@ -72,8 +75,8 @@ def pushed_m(game: Game, alert: State) -> PushedAway | None:
 
 def pushed_mps(game: Game, alert: State, last: State) -> Given:
     """Push: closing speed that vehicles build up and contacts take up, as long as a contact lasts and in the impacts
-    after a pair's first. Of the line; with the number of a vehicle: by the vehicle behind it; obstacle: by Vehicle 1
-    against it.
+    after a pair's first. Of the whole line; with the number of a vehicle: by the vehicle behind it; obstacle: by
+    Vehicle 1 against the obstacle.
     """
     check_exact(last, "pushed_mps")
     of_pair = last.line[:, PUSHED]
@@ -82,7 +85,7 @@ def pushed_mps(game: Game, alert: State, last: State) -> Given:
 
 
 class DroveTowards:
-    """Watches the time until each line's first impact, and the time with a positive command."""
+    """Watches the time before each line's first impact, and the part of it with a positive command."""
 
     def __init__(self, game: Game, alert: State) -> None:
         self.learners, self.time_s = game.rules.learners, np.zeros(alert.n)
@@ -110,7 +113,7 @@ def drove_towards(game: Game, alert: State) -> DroveTowards:
 
 
 def still_moving(game: Game, alert: State, last: State) -> Given:
-    """Whether a vehicle still moves at the end, which is then at the horizon."""
+    """Whether a vehicle of each world still moves at the end, which is then at the horizon."""
     return ~last.at_rest
 
 

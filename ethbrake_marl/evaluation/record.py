@@ -136,9 +136,10 @@ def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> E
 
 
 def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
-    """Return k pieces of the motion: times [k, 2], lines [k, 2, ...] at both ends, commands [k, N + 1].
+    """Return k pieces of the motion between two decisions of one world, each at most ``sample_s`` long.
 
-    Without an obstacle, a post far ahead shows how far Vehicle 1 has moved.
+    They are times [k, 2], lines [k, 2, ...] at both ends, and commands [k, N + 1]. Without an obstacle, a post far
+    ahead shows how far Vehicle 1 has moved.
     """
     start, end = float(before.time_s[0]), float(after.time_s[0])
     count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
@@ -152,7 +153,10 @@ def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floa
 
 
 def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
-    """Return the impacts. Pieces with impacts are simulated again, for the time of the first one."""
+    """Return the impacts in pieces of the motion (``_between``).
+
+    Pieces with impacts are simulated again, for the time of the first one.
+    """
     rows = [FIRST, TOTAL, COUNT]
     made = lines[:, 1, rows] - lines[:, 0, rows]
     piece, pair = np.nonzero(made[:, 2])

@@ -146,13 +146,16 @@ def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters
 
 
 def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Return the sums over each cluster, [G]."""
+    """Return the sums of ``residuals`` and of ``weights`` over each cluster, [G] each."""
     which = np.unique(clusters, return_inverse=True)[1]
     return np.bincount(which, residuals).astype(np.float64), np.bincount(which, weights).astype(np.float64)
 
 
 def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, float, float] | tuple[None, None, None]:
-    """Return standard error, degrees of freedom and skewness of a ratio from sums [G]; None for a dominant cluster."""
+    """Return standard error, degrees of freedom and skewness of a ratio, from each recording's sums [G].
+
+    ``whole`` is the sum of all weights. None: one recording has nearly all of it.
+    """
     groups, share = len(residuals), weights / whole
     rest = 1.0 - share
     if groups < 2 or not (rest > LEAST_REST).all():

@@ -240,8 +240,8 @@ def _estimate(
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
     """Return one table for each group of worlds, in alphabetical order.
 
-    ``by`` is ``scenario`` (in a mixture), ``recording``, or a vehicle's type such as ``vehicle_2_type``. Raises
-    ``InvalidInput`` if the worlds have no groups, ``UnknownName`` for another name.
+    ``by`` is ``scenario`` (in a mixture), ``recording``, or a vehicle's type such as ``vehicle_2_type``; ``baseline``
+    as in ``summarise``. Raises ``InvalidInput`` if the worlds have no groups, ``UnknownName`` for another name.
     """
     kinds = {name: each for name, each in result.worlds.items() if each.dtype.kind == "U"}
     if not kinds:

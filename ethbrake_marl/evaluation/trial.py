@@ -19,7 +19,7 @@ COMPARED = {"full braking": "full_brake", "best constant deceleration": "e_v2x_b
 
 
 class Trial(NamedTuple):
-    """What happens in the first worlds of the evaluation list, where learners brake fully."""
+    """What happens in the first worlds of the evaluation list if all learners brake fully."""
 
     drawn: Drawn
     early: int  # worlds with an impact before a learner can act

@@ -159,7 +159,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return self._observe(state), reward.astype(np.float32), over.repeat(len(self.bodies)), infos
 
     def _renew(self, state: State, step: Step, ended: Any, infos: list[dict[str, Any]]) -> State:
-        """Add final infos of ended episodes to ``infos``, and start the next episodes in their rows."""
+        """Add final infos of the worlds ``ended`` to ``infos``, and start the next episodes in their rows."""
         L, last = len(self.bodies), state.take(ended)
         rows = (ended[:, np.newaxis] * L + np.arange(L)).reshape(-1)
         terms = {name: term[ended] for name, term in step.terms.items()}
@@ -223,7 +223,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
-        """Call a method once; return its result once per row."""
+        """Call a method once; return its result once per row. Raises ``InvalidInput`` if ``indices`` lack a row."""
         self._refuse_some_rows("env_method", indices)
         return [getattr(self, method_name)(*args, **kwargs)] * self.num_envs
 

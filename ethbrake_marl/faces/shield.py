@@ -85,7 +85,10 @@ def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, o
 
 
 def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
-    """Return a shielded copy of an environment. If ``policy`` is a name, its agent minimises ``harm_count``."""
+    """Return a shielded copy of an environment. If ``policy`` is a name, its agent minimises ``harm_count``.
+
+    ``base`` is ``env`` without wrappers; ``around`` puts the shield around a team.
+    """
     if isinstance(env, type) or not isinstance(base, Face):
         raise InvalidInput(
             f"shield: {env!r:.80}: must be a team, an agent, or an environment made by eb.parallel_env, eb.env,"
@@ -108,7 +111,7 @@ def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Tea
 
 
 def playing(env: Any, game: Game) -> Any:
-    """Return a copy of an environment and its wrappers that plays ``game``, without a running episode."""
+    """Return a copy of an environment and its wrappers with another ``game``, without a running episode."""
     base = env.unwrapped
     instead = {id(base.game): game, id(base.scenario): base.scenario, id(base.episode): None, id(base.renderer): None}
     other = copy.deepcopy(env, instead)

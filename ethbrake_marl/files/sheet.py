@@ -33,7 +33,7 @@ class Estimate:
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Return value and interval as text, such as ``24.19 [23.85, 24.53]``."""
+        """Return value and interval, times ``scale``, as text, such as ``24.19 [23.85, 24.53]``."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:

@@ -53,11 +53,14 @@ class Actor:
         return y
 
     def expert(self, x: Float32s) -> NDArray[np.int64]:
-        """Return the number (from 0) of the expert that acts on each column of ``x``, [rows]."""
+        """Return the number (from 0) of the expert that acts on each column of ``x`` [F, rows]."""
         return np.asarray(self.forward(self.gate, x).argmax(axis=0))
 
     def chosen(self, choice: NDArray[np.int64], x: Float32s) -> Float32s:
-        """Return the actions [1, rows] for ``choice`` [rows]: numbers of member policies first, then of actions."""
+        """Return the actions [1, rows] for the highest score ``choice`` [rows] of each column of ``x`` [F, rows].
+
+        Scores are numbered from 0: those of member policies, which then choose the action, before those of actions.
+        """
         y = self.actions[np.newaxis, np.maximum(choice - len(self.members), 0)]
         for m, member in enumerate(self.members):
             rows = np.flatnonzero(choice == m)

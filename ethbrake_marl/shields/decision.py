@@ -58,14 +58,14 @@ def check_harm_count(count: str) -> None:
 
 
 def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
-    """Return values of vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
+    """Return values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
     wide = np.full((state.n, state.vehicles), other, columns.dtype)
     wide[:, game.rules.learners - 1] = columns
     return wide
 
 
 def intervention(before: State, step: Step, after: State) -> Floats:
-    """Return minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
+    """Minus 1 for each vehicle whose proposed action a shield has replaced, otherwise 0."""
     memory = after.memories.get("shield")
     if memory is None:
         raise InvalidInput(

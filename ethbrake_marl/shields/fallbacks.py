@@ -54,9 +54,9 @@ def held(game: Game, actions: Floats) -> Floats:
 def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
     """Return the constant actions that do the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
-    It tries the plan's next actions, all of them harder or softer by the same ``CHANGES``, and, with several learners,
-    one learner's other actions while the rest follow the plan. ``states`` may have several possible states of each
-    world, one after the other: then the largest harm counts.
+    It tries the next actions of ``plans`` [n, T, L], all of them harder or softer by the same ``CHANGES``, and, with
+    several learners, one learner's other actions while the rest follow the plan. ``states`` may have several possible
+    states of each world, one after the other: then the largest harm counts.
     """
     learners, rows, each = game.rules.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]

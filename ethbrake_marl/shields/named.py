@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 
 
 class NamedShield(NamedTuple):
-    """Makes a shield of one class for a team."""
+    """Makes a shield of one class for a team. Text after the colon of its name sets the option ``argument``."""
 
     shield: Callable[..., Shield]  # (drivers, harm_count=..., **options); one called ``scenario`` is the worlds'
     argument: str | None = None  # the option that is the text after the colon

@@ -147,7 +147,10 @@ class StepShield:
         return first_plans(game, alert, state, self.count)
 
     def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
-        """Return the memory at the first decision; its plan is the best constant actions or the agents' rollout."""
+        """Return the memory at the first decision; its plan is the best constant actions or the agents' rollout.
+
+        ``states`` are the possible states (``seen``), ``agents`` body -> memory at the alert.
+        """
         rows, plans = np.arange(state.n), self.plans(game, alert, state, states)
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         plan, harm = np.stack(plans)[prices.argmin(axis=0), rows], prices.min(axis=0)
@@ -225,8 +228,9 @@ class StepShield:
     ) -> tuple[Ints, Floats]:
         """Store, in each world of ``rows``, a plan that begins with ``actions`` and keeps the bound, if one is found.
 
-        It tries the rest of the present plan first, then the fallbacks ``rests``. Returns the reasons, and the smallest
-        price or estimate among the plans tried, [len(rows)] each.
+        ``actions`` [len(rows), L] belong to decision ``now`` [len(rows)] of the plan. It tries the rest of the present
+        plan first, then the fallbacks ``rests``. Returns the reasons, and the smallest price or estimate among the
+        plans tried, [len(rows)] each.
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
@@ -292,13 +296,19 @@ def trials(learners: int) -> Bools:
 
 
 def constant(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback: the best constant actions. If scripts look at the state, the estimate is 0 (unknown)."""
+    """Fallback of ``accept``: return plans that go on with the best constant actions, and an estimate of their harm.
+
+    It is 0 (unknown) if scripts look at the state.
+    """
     plans, estimate = best_constant(game, after, plans, shield.count)
     return plans, np.zeros(len(plans)) if game.scripts else estimate
 
 
 def agents_drive(shield: StepShield, game: Game, after: State, plans: Floats, most: Floats) -> tuple[Floats, Floats]:
-    """Fallback: the shield's own agents drive on from the nominal state. The estimate is 0 (unknown)."""
+    """Fallback of ``accept``: return plans in which the shield's agents drive on from ``after``.
+
+    The other result, an estimate of their harm, is 0 (unknown).
+    """
     nominal = after if after.n == len(plans) else after.take(np.arange(0, after.n, after.n // len(plans)))
     return shield.rolled_out(game, nominal, plans, most), np.zeros(len(plans))
 

@@ -55,7 +55,7 @@ class Report(Protocol):
     measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Return the tables to print, and a text that says where the report is."""
+        """Return the tables to print, and a text that says where the report is; ``tell`` is called with progress."""
 
 
 class Tables:
@@ -125,7 +125,10 @@ def run_experiment(
 
 
 def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: OnProgress) -> list[str]:
-    """Return the names for which ``use`` works, and report why others fail. Raises the error if full braking fails."""
+    """Return the names for which ``use`` works, and report to ``tell`` why others fail; ``what`` is the kind of names.
+
+    Raises the error if full braking fails.
+    """
     found = []
     for number, name in enumerate(names):
         try:

@@ -213,7 +213,7 @@ def make_environment(training: Training) -> EthBrakeVecEnv:
 
 
 def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainResult:
-    """Train until the end or a stop; save the policies, also after an error."""
+    """Train until the end or a stop, from the checkpoint ``saved`` on; save the policies, also after an error."""
     model, training, folder = updates.model, updates.training, updates.folder
     if saved is not None:
         updates.restore(saved)

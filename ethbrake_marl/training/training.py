@@ -75,7 +75,7 @@ class Training(NamedTuple):
 
     @property
     def columns(self) -> list[list[int]]:
-        """For each learner, the columns of a row that it observes."""
+        """For each learner, the columns of ``row`` that it observes."""
         place = {name: column for column, name in enumerate(self.row.names)}
         return [[place[name] for name in view.names] for view in self.views]
 

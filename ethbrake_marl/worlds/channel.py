@@ -92,16 +92,19 @@ class Extension(Protocol):
         """Value of a key as plain data. Refuses a bad value (``files.model.refuse``)."""
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Keys about messages that this extension uses. Keys that nobody uses are refused."""
+        """Keys about messages that have an effect with this extension. Keys without any effect are refused."""
 
     def is_random(self, v2x: V2X) -> bool:
-        """Whether it draws random numbers of its own."""
+        """Whether the extension draws random numbers of its own."""
 
     def check(self, scenario: Scenario) -> None:
         """Refuse a scenario that cannot have these keys."""
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
-        """Memory of this extension for n worlds at the alert."""
+        """Memory of this extension for n worlds at the alert.
+
+        ``numbers`` draws random numbers (``counters.numbers_of``); ``unheard``: as in ``V2X.heard_and_seen``.
+        """
 
     def game(self, game: Game) -> Game:
         """The game, changed by this extension."""
@@ -192,7 +195,7 @@ class V2X(Part):
         }
 
     def _check(self) -> None:
-        """Refuse keys without effect, and a channel that may never tell a vehicle anything."""
+        """Refuse keys without effect, and a channel by which a vehicle may never learn anything."""
         used = [key for extension in self.extensions for key in extension.uses(self)]
         unused = [key for key in OF_MESSAGES if key not in used]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)
@@ -270,7 +273,11 @@ class V2X(Part):
         return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
 
     def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
-        """Times from which each vehicle can react, [n, N] s, and from which i reacts to j, [n, N, N] s."""
+        """Times from which each vehicle can react, [n, N] s, and from which i reacts to j, [n, N, N] s.
+
+        ``own_latency`` [n, N] (s): latencies without the wait for messages. ``u``, ``unheard``: as in
+        ``heard_and_seen``.
+        """
         N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, unheard)
         latency = own_latency.copy()
         for i in range(1, N if self.timing != "latency" else 0):
@@ -281,7 +288,7 @@ class V2X(Part):
         return latency, known
 
     def latest_reaction_s(self, own_latency: Floats, unheard: Bools) -> Floats:
-        """Upper bounds of the times from which vehicles can react, [n, N] s."""
+        """Upper bounds of the times from which vehicles can react, [n, N] s; arguments as in ``news``."""
         n, N = own_latency.shape
         slowest = np.tile([1.0, 0.0, 0.0, 1.0], (n, N * N))  # numbers of links
         return self.news(own_latency, slowest, unheard)[0]

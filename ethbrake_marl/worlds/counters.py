@@ -22,7 +22,7 @@ _PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 
 def world_numbers(n: int, seed: int, first: int, channel: str) -> Ints:
-    """Checked numbers of worlds, ``first`` to ``first + n - 1``, [n]."""
+    """Numbers ``first`` to ``first + n - 1`` of worlds, [n]. Raises ``InvalidInput`` for any bad argument."""
     check_whole_number("number of worlds", n, 1, MOST_AT_ONCE)
     check_whole_number("seed of the list", seed, 0)
     check_whole_number("first world", first, 0, _MOST_WORLDS)
@@ -32,10 +32,11 @@ def world_numbers(n: int, seed: int, first: int, channel: str) -> Ints:
 
 
 def numbers_of(seed: int, channel: str, attempt: int, index: Ints) -> Numbers:
-    """Function for the random numbers of the worlds ``index`` [n], ascending, in one attempt (from 0) to draw them.
+    """Function ``(width, stream)`` -> uniform numbers in [0, 1) of the worlds ``index`` [n], ascending, [n, width].
 
-    A number is the upper 53 bits of an integer from Philox, divided by 2^53. The key of Philox comes from seed,
-    channel, attempt and stream; world k has the counters from ``k width / 4`` on. A width is a multiple of 4.
+    ``stream`` names an independent sequence of random numbers; ``attempt`` counts from 0 if worlds are drawn again. A
+    number is the upper 53 bits of an integer from Philox, divided by 2^53. The key of Philox comes from seed, channel,
+    attempt and stream; world k has the counters from ``k width / 4`` on. A width is a multiple of 4.
     """
     first, count = int(index[0]), int(index[-1]) - int(index[0]) + 1
 

@@ -28,9 +28,10 @@ def world_values(
 ) -> Values:
     """All quantities of k worlds except the distance of the obstacle, from the declared ones.
 
-    ``speed = line speed + own deviation``, ``gap = time gap x speed of the rear vehicle``, ``latency = own latency +
-    time of the alert``. These increase with the declared quantities, so bounds give bounds. Friction limits capacities
-    to friction x gravity. ``settle(key, values)`` may replace values before others are computed from them.
+    ``declared(key)`` returns the drawn values of a declared quantity, [k, entries]; ``settle(key, values)`` may replace
+    values before others are computed from them. ``speed = line speed + own deviation``, ``gap = time gap x speed of the
+    rear vehicle``, ``latency = own latency + time of the alert``. These increase with the declared quantities, so
+    bounds give bounds. Friction limits capacities to friction x gravity.
     """
     keys = [key for key in (*USUAL, *OPTIONAL) if key != "obstacle_gap_m" and key in scenario.sources]
     values = {key: declared(key) for key in keys}

@@ -107,9 +107,10 @@ def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entr
 def _worlds(
     scenario: Scenario, given: Mapping[Entry, Floats], where: str, row_text: Callable[[int], str] | None = None
 ) -> State:
-    """Checked worlds from the columns ``given``, [n] each, and the scenario's fixed values.
+    """Checked worlds from the columns ``given``, (key, index) -> [n], and the scenario's fixed values.
 
-    ``row_text`` names a row in error messages; None: there is one world, whose values are named by their keys.
+    Messages begin with ``where``. ``row_text`` names a row in them; None: there is one world, whose values are named by
+    their keys.
     """
     if scenario.members:
         raise InvalidInput(

@@ -72,15 +72,18 @@ class Rule(NamedTuple):
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Stream and column of the random number that draws the value of vehicle or pair ``index``."""
+        """Stream (``counters.numbers_of``) and column of the random number that draws the value of entry ``index``.
+
+        ``index`` (from 0) is that of a vehicle or pair.
+        """
         return self.stream, BLOCK * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
-        """Name of the column of vehicle or pair ``index``, such as ``gap_1_m``."""
+        """Name of the column of vehicle or pair ``index`` (from 0), such as ``gap_1_m``."""
         return self.column.format(index + 1)
 
     def owner(self, index: int) -> str:
-        """``vehicle_1``, or ``vehicle_1 to vehicle_2`` for a pair, or "" for a world."""
+        """``vehicle_1`` for ``index`` 0, or ``vehicle_1 to vehicle_2`` for a pair, or "" for a world."""
         front = f"vehicle_{index + 1}"
         return {"vehicle": front, "pair": f"{front} to vehicle_{index + 2}", "world": ""}[self.per]
 
@@ -193,7 +196,7 @@ CAR_ROWS = {
 
 
 def width_of(stream: tuple[int, ...], vehicles: int) -> int:
-    """Number of uniform random numbers that one world takes from a stream of random numbers (``MAIN``, ...)."""
+    """Number of random numbers that one world takes from a ``stream`` (``counters.numbers_of``), such as ``MAIN``."""
     return BLOCK * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 

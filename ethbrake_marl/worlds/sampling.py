@@ -81,7 +81,7 @@ def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel 
 
 
 def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
-    """Worlds from these random numbers, which may have early impacts; the scenario is not a mixture."""
+    """Worlds ``index`` from these random numbers, not drawn again if they have an early impact. Not for mixtures."""
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
     if line is not None:
@@ -122,7 +122,11 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
 
 
 def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools, index: Ints) -> State:
-    """State at the alert from all quantities of the worlds, and the random numbers of their V2X links."""
+    """State at the alert of the worlds ``index`` [n], from ``whole``: all their quantities.
+
+    ``numbers`` draws the delays of V2X links (``counters.numbers_of``); links in ``unheard`` (``Scenario.unheard``)
+    never deliver.
+    """
     n, N = whole["speeds_mps"].shape
     line, car = np.zeros((n, layout.LINE_ROWS, N + 1)), np.zeros((n, layout.CAR_ROWS, N + 1))
     know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))

@@ -262,7 +262,7 @@ class Scenario(Part):
     def unheard(self, types: Ints | None = None) -> Bools:
         """Whether i cannot get messages of j because of the equipment of their vehicle types, [n, N, N].
 
-        ``types`` [n, N] are the types. None: [1, N, N], whether this is possible.
+        ``types`` [n, N] are the types. None: whether some possible types exclude it, [1, N, N].
         """
         if self.types_of_line is None:
             return np.zeros((1, self.vehicles, self.vehicles), np.bool_)
