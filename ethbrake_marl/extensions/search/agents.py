@@ -76,9 +76,7 @@ class BestHarm(Planner):
         self.budget = budget
 
     def check(self, game: Game, body: int) -> None:
-        """Warn (``Unfamiliar``) if the scenario's table was made with other physics, so that every world must be
-        searched.
-        """
+        """Warn (``Unfamiliar``) if the scenario's table is of other physics, so that every world must be searched."""
         outdated = outdated_tables()
         if game.name in outdated:
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)

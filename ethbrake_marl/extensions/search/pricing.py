@@ -103,9 +103,7 @@ class Profiles(NamedTuple):
 
 
 def best_of(found: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
-    """Return, from several pairs (harm [n], profiles [n]), the least harm of each world and its profile; of equal ones,
-    the first.
-    """
+    """Return the least of several harms [n] in each world, and its profile. ``found``: pairs; ties: the first."""
     harms = np.stack([harm for harm, _ in found])
     pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
     every = Profiles.padded([profiles for _, profiles in found])
@@ -193,8 +191,7 @@ class Problem(NamedTuple):
         return State(line, car, clock, know, wanted, memories)
 
     def value(self, last: State, count: str | None = None) -> Floats:
-        """Return what the search minimises in episodes that end in ``last``, [n] m2/s2. ``count``: replaces
-        ``harm_count``.
+        """Return what the search minimises in episodes that end in ``last``, [n] m2/s2, or the same in another count.
         """
         value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
         worths(last.line, self.shares, weights, self.aim, value)

@@ -121,8 +121,7 @@ def compact(ends: Ints, commands: Floats) -> Profiles:
 
 
 def divide(field: Field, attention: int) -> None:
-    """Halve phases of a field's best profile until it has as many as fit; always the longest within the first
-    ``attention`` steps.
+    """Halve phases of a field's best profile until it is full; always the longest within the first ``attention`` steps.
     """
     used, K = field.phases[0], field.ends.shape[1]
     if used > 0 and field.values[0] > 0.0:
@@ -136,9 +135,7 @@ def divide(field: Field, attention: int) -> None:
 
 
 def select(world: World, room: Room, given: Profiles, field: Field) -> None:
-    """Put the best profile of ``field`` and ``given`` first in ``field``; from now on ``world`` is simulated step by
-    step.
-    """
+    """Put the best profile of ``field`` and ``given`` first in ``field``; from now on simulate step by step."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
