@@ -144,11 +144,10 @@ class Lines(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the estimated lines at the alert, M rows for each world, from what ``state`` shows at the first
-        decision.
+        """Return the estimated lines at the alert, M rows for each world.
 
-        Vehicles of which everything is known by then start as in the true world ``alert``, and so does the gap between
-        two of them.
+        They use what ``state`` shows at the first decision. Vehicles of which everything is known by then start as in
+        the true world ``alert``, and so does the gap between two of them.
         """
         M, (pieces, news) = self.alert.n, self.received(state)
         lines, true = self.alert.take(np.tile(np.arange(M), alert.n)), alert.take(np.arange(alert.n).repeat(M))
@@ -182,8 +181,7 @@ class Lines(NamedTuple):
         return pieces, news
 
     def heard(self, state: State, lines: State) -> tuple[State, Bools, Bools]:
-        """Return the estimated lines after what was received, and in which worlds any, and not all, agreed with it, [n]
-        each.
+        """Return the estimated lines after news, and in which worlds any, and not all, agreed with it, [n] each.
 
         ``state``: the truth now. ``lines``: the lines now, M rows for each world. A contradicted line becomes a copy of
         one that agrees; if none agrees, ``overwritten`` corrects all of them.
@@ -225,8 +223,7 @@ class Lines(NamedTuple):
         return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, lines: State) -> State:
-        """Return the estimated lines ``lines`` [n], with received values in place of assumed ones; ``state``: the
-        truth.
+        """Return ``lines`` [n] with received values in place of assumed ones; ``state`` [n] is the truth now.
 
         A received place and speed are moved on to the present by the sender's script, without contact. A sender that
         was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to

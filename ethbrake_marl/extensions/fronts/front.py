@@ -196,9 +196,7 @@ class Pool:
         return {count: each[-1] for count, each in self.borne.items()}
 
     def choice(self, weights: Floats) -> Ints:
-        """Return the number of the profile with the least weighted harm in each world, [n]; ties: the least sum of
-        harm.
-        """
+        """Return the number of the profile with the least weighted harm in each world, [n]; ties: the least harm."""
         borne = np.stack(self.borne[self.count])
         amounts = weighted(borne, weights)
         least = amounts.min(axis=0)

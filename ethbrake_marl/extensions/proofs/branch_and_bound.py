@@ -62,7 +62,7 @@ def lacking(kind, at, early, late, softest, hard, begin):
     Braking makes a contact with the front vehicle gentle, but driving softens the impact from behind that follows; at
     the rear it is the other way round. The command is the same in the whole decision step, which starts at ``begin``
     (s), so it cannot be the best one both before and after the contact. ``softest`` is the smallest closing speed (m/s)
-    of a first contact between ``early`` and ``late`` under any command. Other arguments: see the package ``proofs``.
+    of a first contact between ``early`` and ``late`` under any command. Others: ``proofs``.
     """
     whole = at[U_F] + at[A_F]
     turn = gentlest(kind, at, early)[1]
@@ -119,7 +119,7 @@ def divide(kind, at, floor, count, row, cells):
     """Split the cell in ``row`` of ``cells``, of which ``count`` are in use, into two halves.
 
     Return the new number of cells, and the bound (m2/s2) for one first contact in the cell; the smallest bound of all
-    first contacts is at most this. Other arguments: see the package ``proofs``.
+    first contacts is at most this. Others: ``proofs``.
     """
     cell = cells[row]
     harm, early, late, soft, hard = cell[HARM], cell[EARLY], cell[LATE], cell[SOFT], cell[HARD]
@@ -147,7 +147,7 @@ def divide(kind, at, floor, count, row, cells):
 def least_harm(kind, at, first, last, floor, best, enough, cells):
     """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s).
 
-    Arguments: see the package ``proofs``.
+    Arguments: ``proofs``.
     """
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)

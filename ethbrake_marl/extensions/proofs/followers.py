@@ -53,9 +53,7 @@ def value_of(line, time):
 
 @kernel
 def least_of_line(line, since, until):
-    """Return the smallest value of the piecewise linear function ``line`` (see ``value_of``) from ``since`` to
-    ``until``.
-    """
+    """Return the smallest value of a piecewise linear function (see ``value_of``) from ``since`` to ``until``."""
     first, second = min(max(line[2], since), until), min(max(line[4], since), until)
     return min(value_of(line, since), value_of(line, until), value_of(line, first), value_of(line, second))
 
@@ -84,7 +82,7 @@ def least_closing(line, pair, opening, lost, late, end, until):
 def rear_after(at, early):
     """Return the rear vehicle's distance to the leader (m) and speed (m/s) at ``early``, and its onset (s after it).
 
-    The *onset* is the time at which it begins to brake. Arguments: see the package ``proofs``.
+    The *onset* is the time at which it begins to brake. Arguments: ``proofs``.
     """
     speed, way = follower(at, early)
     return max(at[GAP_L] + at[GAP_R] + leader(at, early)[1] - way, 0.0), speed, max(at[ONSET_R] - early, 0.0)
@@ -96,7 +94,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 
     It follows from the motion of the centre of mass of leader and controlled vehicle; 0: none proven. If the leader is
     at rest at ``early``, a later first contact leads to the same motion at a later time, so ``late``, ``end`` and
-    ``lack`` do not matter. Arguments: see the package ``proofs``.
+    ``lack`` do not matter. Arguments: ``proofs``.
     """
     share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -161,7 +159,7 @@ def held_by_leader(at, early, late, closing):
 def after_front(at, early, late, closing, end, lack):
     """Return a lower bound (m2/s2) on the rear pair's squared closing speed after a first contact with the leader.
 
-    It is the largest of several lower bounds. Arguments: see the package ``proofs``.
+    It is the largest of several lower bounds. Arguments: ``proofs``.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     behind, v_r, onset = rear_after(at, early)
@@ -221,7 +219,7 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
 def after_rear(at, early, late, closing, end, lack):
     """Return a lower bound (m2/s2) on the front pair's squared closing speed after the rear vehicle's first contact.
 
-    Arguments: see the package ``proofs``.
+    Arguments: ``proofs``.
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l, way_l = leader(at, early)
@@ -243,7 +241,7 @@ def after_rear(at, early, late, closing, end, lack):
 def after(kind, at, early, late, closing, end, lack):
     """Return a lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact.
 
-    Arguments: see the package ``proofs``.
+    Arguments: ``proofs``.
     """
     if kind == FRONT_FIRST:
         return after_front(at, early, late, closing, end, lack)

@@ -152,7 +152,7 @@ def last_meeting(at, first):
 def soft_harm(kind, at, early, late, floor, best):
     """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late``.
 
-    The closing speed of these contacts may have any value. Arguments: see the package ``proofs``.
+    The closing speed of these contacts may have any value. Arguments: ``proofs``.
     """
     soft = 0.0
     while soft * soft < best:
@@ -206,7 +206,7 @@ def front_first(at, floor, best, enough, cells):
 def rear_first(at, floor, best, enough, cells):
     """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle.
 
-    Arguments: see the package ``proofs``.
+    Arguments: ``proofs``.
     """
     high = max(at[V_F] / at[A_F], rest_of_rear(at))
     first = meet_rear(at, high)

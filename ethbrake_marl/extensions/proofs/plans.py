@@ -21,8 +21,9 @@ def braking(onset, deceleration):
 
 @kernel
 def with_window(u, late, end, change, turn, step):
-    """Return the plan (see the module) of a vehicle whose acceleration is ``u``, plus ``step`` after the time ``turn``
-    (s), plus ``change`` from ``late`` to ``end`` (s); all in m/s2.
+    """Return a plan (see the module): accelerate with ``u``, plus ``step`` after ``turn``, plus ``change`` in a window.
+
+    The window is from ``late`` to ``end``. Accelerations in m/s2, times in s.
     """
     second = u + step if turn < late else u + change
     third = u + step + change if turn < end else u
@@ -31,9 +32,7 @@ def with_window(u, late, end, change, turn, step):
 
 @kernel
 def time_to_limit(v, u, limit):
-    """Return the time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 if ``v`` is there or ``u``
-    <= 0.
-    """
+    """Return the time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 without need or drive."""
     return (limit - v) / u if u > 0.0 and v < limit else 0.0
 
 

@@ -191,8 +191,7 @@ class Problem(NamedTuple):
         return State(line, car, clock, know, wanted, memories)
 
     def value(self, last: State, count: str | None = None) -> Floats:
-        """Return what the search minimises in episodes that end in ``last``, [n] m2/s2, or the same in another count.
-        """
+        """Return what the search minimises if episodes end in ``last``, [n] m2/s2; if given, in another ``count``."""
         value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
         worths(last.line, self.shares, weights, self.aim, value)
         return value

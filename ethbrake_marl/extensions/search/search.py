@@ -121,8 +121,7 @@ def compact(ends: Ints, commands: Floats) -> Profiles:
 
 
 def divide(field: Field, attention: int) -> None:
-    """Halve phases of a field's best profile until it is full; always the longest within the first ``attention`` steps.
-    """
+    """Halve phases of a field's best profile until it has K; always the longest in the first ``attention`` steps."""
     used, K = field.phases[0], field.ends.shape[1]
     if used > 0 and field.values[0] > 0.0:
         (ends,), (commands,) = compact(field.ends[0, :used], field.commands[0, :used])
