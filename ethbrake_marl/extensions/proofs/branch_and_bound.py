@@ -31,8 +31,7 @@ def gentlest_between(kind, at, early, late):
     """Return a lower bound (m/s) on the closing speed of first contacts between ``early`` and ``late``.
 
     The smallest closing speed falls with the time, with one exception: if the leader brakes harder than the controlled
-    vehicle, it rises by at most the difference of the braking capacities in each second. Arguments: see the package
-    ``proofs``.
+    vehicle, it rises by at most the difference of the braking capacities in each second. Arguments: see ``proofs``.
     """
     least = gentlest(kind, at, late)[0]
     if kind == FRONT_FIRST and at[A_L] > at[A_F] and early * at[A_L] < at[V_L]:
@@ -62,7 +61,7 @@ def lacking(kind, at, early, late, softest, hard, begin):
     Braking makes a contact with the front vehicle gentle, but driving softens the impact from behind that follows; at
     the rear it is the other way round. The command is the same in the whole decision step, which starts at ``begin``
     (s), so it cannot be the best one both before and after the contact. ``softest`` is the smallest closing speed (m/s)
-    of a first contact between ``early`` and ``late`` under any command. Others: ``proofs``.
+    of a first contact between ``early`` and ``late`` under any command. Other arguments: see ``proofs``.
     """
     whole = at[U_F] + at[A_F]
     turn = gentlest(kind, at, early)[1]
@@ -82,8 +81,8 @@ def lacking(kind, at, early, late, softest, hard, begin):
 def harm_of(kind, at, early, late, soft, hard, floor):
     """Return a lower bound (m2/s2) on the harm of the first contacts in a cell.
 
-    The cell contains the times ``early`` to ``late`` and the closing speeds ``soft`` to ``hard``. Arguments: see the
-    package ``proofs``.
+    The cell contains the times ``early`` to ``late`` and the closing speeds ``soft`` to ``hard``. Arguments: see
+    ``proofs``.
     """
     begin, end = decision_around(at, early, late)
     lack = 0.0
@@ -119,7 +118,7 @@ def divide(kind, at, floor, count, row, cells):
     """Split the cell in ``row`` of ``cells``, of which ``count`` are in use, into two halves.
 
     Return the new number of cells, and the bound (m2/s2) for one first contact in the cell; the smallest bound of all
-    first contacts is at most this. Others: ``proofs``.
+    first contacts is at most this. Other arguments: see ``proofs``.
     """
     cell = cells[row]
     harm, early, late, soft, hard = cell[HARM], cell[EARLY], cell[LATE], cell[SOFT], cell[HARD]
@@ -147,7 +146,7 @@ def divide(kind, at, floor, count, row, cells):
 def least_harm(kind, at, first, last, floor, best, enough, cells):
     """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s).
 
-    Arguments: ``proofs``.
+    Arguments: see ``proofs``.
     """
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)

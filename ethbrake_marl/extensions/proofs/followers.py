@@ -82,7 +82,7 @@ def least_closing(line, pair, opening, lost, late, end, until):
 def rear_after(at, early):
     """Return the rear vehicle's distance to the leader (m) and speed (m/s) at ``early``, and its onset (s after it).
 
-    The *onset* is the time at which it begins to brake. Arguments: ``proofs``.
+    The *onset* is the time at which it begins to brake. Arguments: see ``proofs``.
     """
     speed, way = follower(at, early)
     return max(at[GAP_L] + at[GAP_R] + leader(at, early)[1] - way, 0.0), speed, max(at[ONSET_R] - early, 0.0)
@@ -94,7 +94,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 
     It follows from the motion of the centre of mass of leader and controlled vehicle; 0: none proven. If the leader is
     at rest at ``early``, a later first contact leads to the same motion at a later time, so ``late``, ``end`` and
-    ``lack`` do not matter. Arguments: ``proofs``.
+    ``lack`` do not matter. Arguments: see ``proofs``.
     """
     share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -122,8 +122,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 def held_by_leader(at, early, late, closing):
     """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with a harder braking leader.
 
-    It holds because the controlled vehicle then stays near the leader. 0: none proven. Arguments: see the package
-    ``proofs``.
+    It holds because the controlled vehicle then stays near the leader. 0: none proven. Arguments: see ``proofs``.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -159,7 +158,7 @@ def held_by_leader(at, early, late, closing):
 def after_front(at, early, late, closing, end, lack):
     """Return a lower bound (m2/s2) on the rear pair's squared closing speed after a first contact with the leader.
 
-    It is the largest of several lower bounds. Arguments: ``proofs``.
+    It is the largest of several lower bounds. Arguments: see ``proofs``.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     behind, v_r, onset = rear_after(at, early)
@@ -196,8 +195,8 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
     """Return a lower bound (m/s) on the front pair's closing speed after the rear vehicle's first contact.
 
     It follows from the motion of the centre of mass of rear and controlled vehicle. The controlled vehicle must brake
-    at least as hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m). Other arguments: see the
-    package ``proofs``.
+    at least as hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m). Other arguments: see
+    ``proofs``.
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -219,7 +218,7 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
 def after_rear(at, early, late, closing, end, lack):
     """Return a lower bound (m2/s2) on the front pair's squared closing speed after the rear vehicle's first contact.
 
-    Arguments: ``proofs``.
+    Arguments: see ``proofs``.
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l, way_l = leader(at, early)
@@ -241,7 +240,7 @@ def after_rear(at, early, late, closing, end, lack):
 def after(kind, at, early, late, closing, end, lack):
     """Return a lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact.
 
-    Arguments: ``proofs``.
+    Arguments: see ``proofs``.
     """
     if kind == FRONT_FIRST:
         return after_front(at, early, late, closing, end, lack)

@@ -115,7 +115,7 @@ def last_first(kind, at, first, last):
 
     By bisection, from ``first`` (s), at which it is possible. The later the contact in front, the shorter the vehicle
     drives, so the rear vehicle comes nearer; the later the contact behind, the shorter it brakes, so it comes nearer to
-    the front vehicle. ``kind``, ``at``: see the package ``proofs``.
+    the front vehicle. ``kind``, ``at``: see ``proofs``.
     """
     time = last
     for _ in range(HALVINGS + 1):
@@ -152,7 +152,7 @@ def last_meeting(at, first):
 def soft_harm(kind, at, early, late, floor, best):
     """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late``.
 
-    The closing speed of these contacts may have any value. Arguments: ``proofs``.
+    The closing speed of these contacts may have any value. Arguments: see ``proofs``.
     """
     soft = 0.0
     while soft * soft < best:
@@ -178,8 +178,8 @@ def front_first(at, floor, best, enough, cells):
 
     In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
     vehicle relative to the front vehicle, and the front pair's is at least the smallest possible one at this time. Such
-    a contact is covered only at times at which a first contact with the front vehicle is possible. Arguments: see the
-    package ``proofs``.
+    a contact is covered only at times at which a first contact with the front vehicle is possible. Arguments: see
+    ``proofs``.
     """
     first = meet_front(at, math.inf)
     if first == math.inf and at[GAP_L] <= TOUCHING_M:
@@ -206,7 +206,7 @@ def front_first(at, floor, best, enough, cells):
 def rear_first(at, floor, best, enough, cells):
     """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle.
 
-    Arguments: ``proofs``.
+    Arguments: see ``proofs``.
     """
     high = max(at[V_F] / at[A_F], rest_of_rear(at))
     first = meet_rear(at, high)
@@ -249,7 +249,7 @@ def combined_bound(at, until, front, rear, cells):
     """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact, first in front or behind.
 
     0 if some of the counted harm may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds on
-    the harm of each pair alone (m2/s2). ``at``, ``cells``: see the package ``proofs``.
+    the harm of each pair alone (m2/s2). ``at``, ``cells``: see ``proofs``.
     """
     if not last_rest(at) < until:
         return 0.0

@@ -96,7 +96,7 @@ def gentlest(kind, at, time):
     """Return the smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake`` (s).
 
     To be at a place at a time with the largest speed, brake first and then drive. ``brake`` is infinite if the vehicle
-    reaches its speed limit by then. ``kind``, ``at``: see the package ``proofs``.
+    reaches its speed limit by then. ``kind``, ``at``: see ``proofs``.
     """
     if kind == FRONT_FIRST:
         return gentlest_front(at, time)

@@ -90,10 +90,10 @@ def move_line(line, into):
 def follow(world, lines, ends, commands, phase, most):
     """Simulate a profile from ``phase`` on; return its value (m2/s2), and the number of phases until the end.
 
-    ``world`` is a ``World``. Starts from ``lines[phase]`` and writes the state after phase p to ``lines[p + 1]``. Ends
-    when all vehicles are at rest, or the value reaches ``most`` (m2/s2). The number of phases is -1 if a check of the
-    physics fails. Step by step (``STEPWISE``) the result has the bits of the episode; phase by phase it is several
-    times faster and rounds differently.
+    ``world`` is a ``World``. ``ends`` [K], ``commands`` [K, B]: the profile. Starts from ``lines[phase]`` and writes
+    the state after phase p to ``lines[p + 1]``. Ends when all vehicles are at rest, or the value reaches ``most``
+    (m2/s2). The number of phases is -1 if a check of the physics fails. Step by step (``STEPWISE``) the result has the
+    bits of the episode; phase by phase it is several times faster and rounds differently.
     """
     numbers, clock = world.numbers, world.clock
     value = value_of(world, lines[phase])
@@ -306,9 +306,10 @@ def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
 def improve(world, room, ends, commands, budget, drawing, least):
     """Improve a profile in place by at most ``budget`` random changes, until its value is at most ``least``.
 
-    Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its episode ends. A
-    change that helps is tried again with twice the amount. A change without effect costs no budget, except in plans.
-    ``world``, ``room``: a ``World``, ``Room``. ``drawing``: as for ``draw_profile``.
+    ``world``, ``room``: a ``World``, ``Room``. ``ends`` [K], ``commands`` [K, B]: the profile. ``drawing``: as for
+    ``draw_profile``. Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its
+    episode ends. A change that helps is tried again with twice the amount. A change without effect costs no budget,
+    except in plans.
     """
     change, lines, tried = room.change, room.lines, room.tried
     value, active, spent, phase, again = math.inf, 0, -1, 0, False
