@@ -93,9 +93,9 @@ class Lines(NamedTuple):
         """Return the median line of a scenario and, with ``corners``, lines with unknown quantities at the ends of
         their ranges.
 
-        Unknown are the gaps and, of each other vehicle, speed, braking capacity, mass, latency, and when it receives
-        the alert. Raises ``InvalidInput`` for a mixture of scenarios, for other vehicles with unknown commands, and for
-        too many corners.
+        Unknown to the vehicle ``body`` are the gaps and, of each other vehicle, speed, braking capacity, mass, latency,
+        and when it receives the alert. Raises ``InvalidInput`` for a mixture of scenarios, for other vehicles with
+        unknown commands, and for too many corners.
         """
         where = f"scenario {scenario.name!r}: estimated agents and shields need"
         if scenario.members:
@@ -132,9 +132,10 @@ class Lines(NamedTuple):
         return cls(body, alert, news, tuple(scenario.roles.values()))
 
     def commands(self, car: Floats, wanted: Floats) -> Floats:
-        """Return the commands of all vehicles, [n, N + 1] m/s2.
+        """Return the commands of all bodies, [n, N + 1] m/s2 (body 0: the obstacle).
 
-        Scripts follow their rules, other learners brake fully, and the vehicle itself keeps ``wanted``.
+        Scripts follow their rules, other learners brake fully, and the vehicle itself keeps ``wanted`` [n, N + 1].
+        ``car``: as in ``State``.
         """
         wanted = wanted.copy()
         for other, role in enumerate(self.roles, 1):
@@ -143,11 +144,10 @@ class Lines(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the estimated lines at the alert, M rows for each world, from what ``state`` shows at the first
-        decision.
+        """Return the estimated lines at the alert, M rows for each world.
 
-        Vehicles of which everything is known by then start as in the true world ``alert``, and so does the gap between
-        two of them.
+        They use what ``state`` shows at the first decision. Vehicles of which everything is known by then start as in
+        the true world ``alert``, and so does the gap between two of them.
         """
         M, (pieces, news) = self.alert.n, self.received(state)
         lines, true = self.alert.take(np.tile(np.arange(M), alert.n)), alert.take(np.arange(alert.n).repeat(M))
@@ -167,8 +167,8 @@ class Lines(NamedTuple):
     def received(self, state: State) -> tuple[Bools, Floats]:
         """Return which quantities of each body the vehicle has received, [n, N + 1, PIECES], and the newest values.
 
-        The values are [n, SAMPLE_ROWS, N + 1] (``messages.links``). The obstacle's place is known to all who know the
-        place of Vehicle 1.
+        The values are [n, SAMPLE_ROWS, N + 1] (``messages.links``, as are PIECES). Body 0 is the obstacle, whose place
+        is known to all who know the place of Vehicle 1.
         """
         if NAME in state.memories:
             pieces, news = known_pieces(state, self.body), newest(state, self.body)
@@ -181,10 +181,10 @@ class Lines(NamedTuple):
         return pieces, news
 
     def heard(self, state: State, lines: State) -> tuple[State, Bools, Bools]:
-        """Return the estimated lines after what was received, and in which worlds any, and not all, agreed with it, [n]
-        each.
+        """Return the estimated lines after news, and in which worlds any, and not all, agreed with it, [n] each.
 
-        A contradicted line becomes a copy of one that agrees; if none agrees, ``overwritten`` corrects all of them.
+        ``state``: the truth now. ``lines``: the lines now, M rows for each world. A contradicted line becomes a copy of
+        one that agrees; if none agrees, ``overwritten`` corrects all of them.
         """
         n, M = state.n, lines.n // state.n
         possible = self.agrees(state, lines)
@@ -199,7 +199,10 @@ class Lines(NamedTuple):
         return lines, some, changed
 
     def agrees(self, state: State, lines: State) -> Bools:
-        """Return in which estimated lines the vehicle would have received and measured the same, [n, M]."""
+        """Return in which estimated lines the vehicle would have received and measured the same, [n, M].
+
+        ``state``: the truth now. ``lines``: the lines now, M rows for each world.
+        """
         pieces, news = self.received(state)
         mine, theirs = self.told(state, news), self.told(lines, self.received(lines)[1])
         far = np.abs(theirs.reshape(state.n, -1, *mine.shape[1:]) - mine[:, np.newaxis]) > SURPRISE
@@ -209,7 +212,7 @@ class Lines(NamedTuple):
         return np.asarray(~wrong)
 
     def told(self, state: State, news: Floats) -> Floats:
-        """Return what a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all pieces but the intent.
+        """Return what a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
 
         ``news``: as ``received`` returns it. A place is the distance (m) from this vehicle.
         """
@@ -220,7 +223,7 @@ class Lines(NamedTuple):
         return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, lines: State) -> State:
-        """Return one estimated line for each world, in which received values replace assumed ones.
+        """Return ``lines`` [n] with received values in place of assumed ones; ``state`` [n] is the truth now.
 
         A received place and speed are moved on to the present by the sender's script, without contact. A sender that
         was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to
@@ -271,7 +274,7 @@ def without_channel(game: Game, lines: State) -> tuple[Game, State]:
 
 
 def in_order(place: Floats, known: Bools) -> Floats:
-    """Return places (m), raised where they would decrease from one vehicle to the next.
+    """Return places (m), [n, vehicles], raised where they would decrease from one vehicle to the next.
 
     An unknown place is first lowered to the next ``known`` one, if it is beyond it.
     """

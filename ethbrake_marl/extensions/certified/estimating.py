@@ -82,7 +82,10 @@ class EstimatedShield(MembersShield):
         return super().rolled_out(*without_channel(game, state), plans, most)
 
     def planned_again(self, game: Game, memory: Memory, lines: State, rows: Ints) -> Memory:
-        """In the worlds ``rows``, replace the plan by the cheapest of itself and newly made plans."""
+        """In the worlds ``rows``, replace the plan in ``memory`` by the cheapest of itself and newly made plans.
+
+        ``lines``: the estimated lines, M rows for each world.
+        """
         here = part(lines, rows, self.lines.alert.n)
         median = here.take(np.arange(0, here.n, self.lines.alert.n))
         plan, price = memory.plan.copy(), memory.price.copy()
@@ -95,7 +98,8 @@ class EstimatedShield(MembersShield):
 class EstimatedEpisodeShield(EpisodeShield):
     """Algorithm 1 (*hybrid*) in the median line: the first decision chooses the policy or E-V2X-BM for the episode.
 
-    ``harm_count`` is compared; ``bound`` is how H* is computed: ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
+    ``drivers``: body -> agent, as for ``StepShield``. ``harm_count``: the harm that is compared. ``bound``: how H* is
+    computed, ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
     """
 
     knows = ESTIMATED
@@ -157,9 +161,9 @@ class EstimatedEV2XBM:
 
 
 def differ(one: State, other: State) -> Bools:
-    """Return in which worlds two lines differ in speeds, gaps or other quantities, [n].
+    """Return in which worlds two lines differ in speeds, gaps or parameters of vehicles, [n].
 
-    Reaction times that are over are ignored.
+    Latencies that are over are ignored.
     """
     parts = []
     for line in (one, other):

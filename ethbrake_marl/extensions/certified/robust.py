@@ -38,20 +38,26 @@ class MembersShield(StepShield):
     """Step shield for worlds whose true state may be any of M states, the *members*."""
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the members with the agents' memories, M rows for each world."""
+        """Return the stored members, M rows for each world, with the present memories of the agents in ``state``."""
         states = joined(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)
         own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
         return states._replace(memories={**states.memories, **own})
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2; or more than ``most``."""
+        """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2; or more than ``most``.
+
+        ``plans``: one for each world. ``caps`` is unused.
+        """
         M = states.n // len(plans)
         each = np.broadcast_to(most, len(plans)).repeat(M)
         return np.asarray(super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1))
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Return the step shield's plans, and the constant plan that is best in the worst member."""
+        """Return the step shield's plans, and the constant plan that is best in the worst member.
+
+        ``states``: the members, M rows for each world of ``state``.
+        """
         learners, n, plans = game.rules.learners, state.n, super().plans(game, alert, state, states)
         if states.n == n:
             return plans
@@ -99,7 +105,10 @@ class RobustShield(MembersShield):
         self.uncertainty = parse_uncertainty(uncertainty)
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision. Raises ``InvalidInput`` if the intervals do not fit the worlds."""
+        """Return the memory at the first decision, with the members of the worlds ``alert``.
+
+        Raises ``InvalidInput`` if the intervals do not fit the worlds.
+        """
         states = opened(game, self.uncertainty.members(alert))
         if (states.time_s >= game.rules.horizon_s).any():
             raise InvalidInput(
@@ -121,20 +130,20 @@ def opened(game: Game, alerts: State) -> State:
 
 
 def apart(states: State, n: int) -> State:
-    """Reshape arrays from M rows for each of n worlds to [n, M, ...]."""
+    """Reshape arrays of states from M rows for each of n worlds, [n M, ...], to [n, M, ...]."""
     return mapped(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
 
 
 def joined(states: State) -> State:
-    """Reshape arrays from [n, M, ...] to M rows for each world."""
+    """Reshape arrays of states from [n, M, ...] to M rows for each world, [n M, ...]."""
     return mapped(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
 
 
 def may_be_in(state: State, members: State) -> Bools:
-    """Return in which worlds all gaps and speeds are in the range of the members, [n]; True after any impact.
+    """Return in which worlds all gaps and speeds are in the range of the ``members`` [n, M, ...], [n].
 
-    Before any impact, gaps and speeds are monotone in each quantity, so every world within the intervals lies in this
-    range.
+    True after any impact. Before it, gaps and speeds are monotone in each quantity, so every world within the intervals
+    lies in this range.
     """
     struck = state.line[:, COUNT].any(axis=1) | members.line[:, :, COUNT].any(axis=(1, 2))
     inside = np.ones(state.n, np.bool_)

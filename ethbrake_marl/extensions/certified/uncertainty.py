@@ -73,13 +73,19 @@ class Uncertainty(NamedTuple):
         return whole.take(np.arange(whole.n).reshape(-1, alert.n).T.ravel())
 
     def draw(self, alert: State, rng: np.random.Generator, *, corners: bool = False) -> State:
-        """Return one random world from each box: uniform in the whole box, or one of its corners."""
+        """Return one random world from each world's box: uniform in the whole box, or one of its ``corners``.
+
+        The *box* contains all worlds whose quantities are in the intervals.
+        """
         sides = self.sides(alert)
         shares = rng.random((alert.n, len(sides)))
         return placed(alert, sides, np.round(shares) if corners else shares)
 
     def sides(self, alert: State) -> list[Side]:
-        """Return the numbers that are uncertain; an interval of width 0 makes none."""
+        """Return the uncertain numbers of the worlds, one for each vehicle or pair; an interval of width 0 makes none.
+
+        Raises ``InvalidInput`` if an interval does not fit the worlds.
+        """
         sides = []
         for interval in self.intervals:
             key, rule, bodies = interval.quantity, RULES[interval.quantity], alert.vehicles
@@ -108,12 +114,15 @@ class Uncertainty(NamedTuple):
 
 
 def values_of(alert: State, key: str) -> Floats:
-    """Return a quantity's nominal values, one column per body. Column 0 and the last gap have no meaning."""
+    """Return the nominal values of a quantity such as ``gaps_m``, [n, N + 1]: one column per body (0: the obstacle).
+
+    Column 0 and the last gap have no meaning.
+    """
     return alert.line[:, OF_LINE[key]] if key in OF_LINE else alert.car[:, OF_CAR[key]]
 
 
 def placed(alert: State, sides: list[Side], shares: Floats) -> State:
-    """Return worlds whose uncertain numbers are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
+    """Return worlds whose uncertain numbers ``sides`` are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
 
     A vehicle that brakes fully does so with the new capacity. Without a V2X channel, a vehicle that reacts later also
     learns everything later. Raises ``InvalidInput`` if a script's command exceeds a capacity.

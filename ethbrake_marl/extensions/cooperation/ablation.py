@@ -163,6 +163,9 @@ def driven(level: Level, drawn: Drawn, algorithm: str | None, jobs: Any) -> Meas
 
 
 def minimised(declared: Declared, count: str, game: Game, alert: State, last: State) -> Given:
-    """Return what the training minimises, as a mean over the learners, [n]."""
+    """Return what the training minimises, as a mean over the learners, [n]: the objective ``declared`` in ``count``.
+
+    A measure, once the first two arguments are given; ``alert`` is unused.
+    """
     each = amounts(objectives_of(declared, last.vehicles), None, last, count)
     return np.asarray(each[:, game.rules.learners - 1].mean(axis=1))

@@ -111,7 +111,10 @@ def turn_of(game: Game, worlds: State, body: int, declared: Declared, count: str
 
 
 def _settle(turns: list[Problem], plans: Floats, budget: int, rounds: int, seed: int) -> tuple[Bools, Ints]:
-    """Improve ``plans`` [n, T, L] in place; return whether the learners converged, [n], and the rounds used, [n]."""
+    """Improve ``plans`` [n, T, L] in place; return whether the learners converged, [n], and the rounds used, [n].
+
+    ``turns``: for each learner, the problem with its objective and this learner first.
+    """
     active, taken = np.arange(len(plans)), np.zeros(len(plans), np.int64)
     for turn in range(rounds):
         moved = np.zeros(len(active), np.bool_)
@@ -166,7 +169,8 @@ def other_plans(plan: Floats, bounds: Floats, number: int) -> Floats:
     """Return the plan [T, B], and copies with other commands of its first vehicle, [Q, T, B].
 
     These commands are two values of a grid, or up to four random values; full braking, full driving and short phases
-    are likely.
+    are likely. ``bounds``: its smallest and largest command (m/s2). ``number``: how many copies, at least the whole
+    grid.
     """
     low, high = bounds
     steps, rng = np.arange(len(plan)), np.random.default_rng(number)

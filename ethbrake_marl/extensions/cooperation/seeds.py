@@ -23,7 +23,7 @@ CONFIDENCE = 0.95
 
 
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
-    """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``.
+    """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, [seeds, worlds] each.
 
     There is no interval for only one world or recording, or if all values are 0 without a baseline. A share (truth
     values without a baseline) always has one that contains Wilson's interval, because bootstrap intervals of nearly
@@ -49,7 +49,8 @@ def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None
 def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clusters = None) -> Estimate | None:
     """Return the share of the possible reduction ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``.
 
-    None if ``mean(best) >= mean(worst)``, or if at least 5 % of the resamples leave almost nothing to reduce.
+    All are [seeds, worlds]. None if ``mean(best) >= mean(worst)``, or if at least 5 % of the resamples leave almost
+    nothing to reduce.
     """
     sides = [np.atleast_2d(each) for each in (values, worst, best)]
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
@@ -73,7 +74,7 @@ def _interval(
 ) -> tuple[float, float] | None:
     """Return the confidence interval of a statistic ``of`` the arguments' means, [resamples, arguments].
 
-    None for only one world or recording.
+    ``sides``: the arguments, [seeds, worlds] each. None for only one world or recording.
     """
     cluster = np.arange(sides[0].shape[1]) if clusters is None else np.unique(clusters, return_inverse=True)[1]
     if cluster.max() == 0:

@@ -47,7 +47,7 @@ class Kernel(NamedTuple):
 
 
 def device_named(name: str) -> torch.device:
-    """Return a device: ``cpu``, ``cuda`` or ``cuda:1``. Raises ``InvalidInput`` if it cannot run the kernels."""
+    """Return a torch device: ``cpu``, ``cuda`` or ``cuda:1``. Raises ``InvalidInput`` if it cannot run the kernels."""
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError):
@@ -108,7 +108,7 @@ def as_arrays(given: Any) -> Any:
 
 
 def like(given: Any) -> Any:
-    """Return a kernel's arguments on the processor, with empty arrays in place of tensors, for compiling the kernel."""
+    """Return a kernel's arguments with empty arrays on the processor in place of tensors, to compile the kernel."""
     return _with(given, lambda tensor: torch.empty((0,) * tensor.dim(), dtype=tensor.dtype).numpy())
 
 

@@ -124,8 +124,10 @@ def save(t, stored, mine, is_new):
 def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
     """Advance world t by one step, or begin or only observe its episode, as ``mode`` says; then observe it.
 
-    ``actions`` [n, L] float32 are clipped to [-1, 1]. If one of them is NaN, nothing moves and ``status`` says so.
-    ``following`` [n] is the world of the pool in which the next episode begins.
+    ``mine`` is the memory of this thread. ``stored`` has the running episodes, ``pool`` the worlds from which they
+    begin; ``following`` [n] is the world of the pool in which each next episode begins. ``actions`` [n, L] float32 are
+    clipped to [-1, 1]. If one of them is NaN, nothing moves and ``results.status`` says so. ``rules``: a ``Ruling``.
+    ``view``: a ``Looking``.
     """
     load(t, stored, mine)
     is_new = mode == BEGIN

@@ -25,8 +25,9 @@ def ptx_of(
 ) -> str:
     """Return the PTX of a kernel, with the entry ``kernel``, for arguments of the types of ``given``.
 
-    ``name``: all that decides the code, except the sources. ``capability``: the GPU's compute capability. Raises
-    ``MissingExtra`` if the code must be compiled and numba-cuda is not installed.
+    ``name``: all that decides the code, except the sources. ``kernel``: makes the kernel, if its code is not stored
+    yet. ``capability``: the GPU's compute capability. Raises ``MissingExtra`` if the code must be compiled and
+    numba-cuda is not installed.
     """
     capability = min(capability, NEWEST)
     file = folder_of(str(Path(__file__).with_name("threads.py"))) / f"{name}-{capability[0]}{capability[1]}.ptx"

@@ -101,7 +101,10 @@ def search(
 
 
 def best_alone(problem: Problem, search: Callable[..., Any]) -> Profiles:
-    """Search the best profile of each controlled vehicle while the others brake fully; return the best one, [n]."""
+    """Search the best profile of each controlled vehicle while the others brake fully; return the best one, [n].
+
+    ``search``: searches a problem with one vehicle and returns profiles first.
+    """
     results, braking = [], -problem.state.car[:, BRAKING][:, problem.bodies]
     for c, body in enumerate(problem.bodies.tolist()):
         wanted = problem.state.wanted.copy()
@@ -139,7 +142,10 @@ def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kerne
 
 
 def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, on: torch.device) -> Plans:
-    """Return the profiles of all threads before the first round: those in ``given``, or none."""
+    """Return the profiles of all ``restarts`` n threads before the first round: those in ``given``, or none.
+
+    ``on``: device of the tensors. Raises ``InvalidInput`` if ``given`` does not fit.
+    """
     n, C = problem.n, len(problem.bodies)
     ends = np.repeat(problem.last_step[:, np.newaxis], MOST_PHASES, axis=1)[np.newaxis].repeat(restarts, axis=0)
     commands, phases = np.zeros((restarts, n, MOST_PHASES, C)), np.zeros((restarts, n), np.int64)
@@ -171,7 +177,8 @@ def started(problem: Problem, given: Profiles | None, restarts: int, seed: int, 
 def met(plans: Plans, n: int, restarts: int, number: int) -> Plans:
     """Return the profiles after threads of the same world have met in pairs: both have the better one.
 
-    From round to round a thread meets a nearer one, so after log2(``restarts``) rounds the best can have reached all.
+    ``number``: round, from 0. From round to round a thread meets a nearer one, so after log2(``restarts``) rounds the
+    best can have reached all.
     """
     if restarts == 1:
         return plans

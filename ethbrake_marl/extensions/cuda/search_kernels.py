@@ -124,10 +124,11 @@ def load(k, searched, own):
 
 @large
 def begin_with(t, own, plans, world, room, drawing, drawn):
-    """Put the best of a thread's first profiles into its memory; return its number of phases, 0: none.
+    """Put the best of a thread's first profiles into its memory ``own``; return its number of phases, 0: none.
 
-    These are its profile so far, extreme profiles of one kind and ``drawn`` random ones. Extreme ones are tried as in
-    ``extreme_profiles``, but at random times, so that no two threads try the same.
+    These are its profile so far (column t of ``plans``), extreme profiles of one kind and ``drawn`` random ones.
+    Extreme ones are tried as in ``extreme_profiles``, but at random times, so that no two threads try the same.
+    ``world``, ``room``, ``drawing``: as for the extension ``search``.
     """
     n, best_used, least, low, high, kind = world.wanted.shape[0], 0, np.inf, 0.0, LATEST_S, own.kind[0]
     in_round, best_change, change, meeting, of_round = TIMES * len(WAYS), 0.0, 0.0, 0.0, np.inf
@@ -173,6 +174,7 @@ def begin_with(t, own, plans, world, room, drawing, drawn):
 def search(t, own, searched, plans, drawing, drawn, budget):
     """Improve the profile of thread t by ``budget`` changes; if ``drawn`` is above 0, first choose it among new ones.
 
+    ``own``: memory of this thread. ``searched``: the worlds. ``plans``: the profiles of all threads, changed in place.
     ``drawing``: how random profiles and changes are drawn.
     """
     n = searched.wanted.shape[1]

@@ -16,7 +16,7 @@ from ethbrake_marl.extensions.cuda.search_kernels import Own, search
 
 
 def play_thread(shapes: Mine) -> Callable[..., None]:
-    """Return the GPU kernel that runs ``play`` in n threads. ``shapes`` are constants of its code."""
+    """Return the GPU kernel that runs ``play`` in n threads. ``shapes`` of their memory are constants of its code."""
     line, car, clock, know, wanted, proposed, scratch, out, rewards, value, seen = shapes
 
     def play_worlds(
@@ -43,7 +43,7 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
 
 
 def search_thread(shapes: Own) -> Callable[..., None]:
-    """Return the GPU kernel that runs ``search`` in n threads. ``shapes`` are constants of its code."""
+    """Return the GPU kernel that runs ``search`` in n threads. ``shapes`` of their memory are constants of its code."""
     car, clock, wanted, bounds, shares, at, scratch, lines, tried = shapes[:9]
     commands, best_commands, change, ends, best_ends, kind, random = shapes[9:]
 

@@ -123,12 +123,15 @@ class CudaVineModel(VineModel):
         return self.seen.flatten(0, 1), self.visited
 
     def improve(self, seen: Any, states: Any) -> None:
-        """Measure gradients at some of the visited decisions, and update the actor with them."""
+        """Measure gradients at some of the decisions that ``collect`` visited, and update the actor with them."""
         self.train_actor(self.policy, self.measure(seen))
 
     @torch.no_grad()
     def measure(self, seen: Tensor) -> Tried:
-        """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's."""
+        """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's.
+
+        ``seen`` [D L, F]: observations at all visited decisions.
+        """
         place = self.worlds.device
         branches = self.draw_branches(np.arange(len(seen)))
         own = seen[torch.from_numpy(branches.decisions(self.learners)).to(place)]
@@ -137,7 +140,10 @@ class CudaVineModel(VineModel):
         return Tried(own, self.policy.learning(own)[:, 0], self.measured_gradient(gained, moved))
 
     def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
-        """Simulate branches; return what learners gained and how far their actions were moved, [2, 2B]."""
+        """Simulate branches; return what learners gained and how far their actions were moved, [2, 2B].
+
+        Arguments [2B]: visited decision, learner, distance of the action, and number of steps for which it is moved.
+        """
         worlds, result = self.branches, torch.zeros(2, len(world), dtype=size.dtype, device=size.device)
         seen, its, discount = worlds.put(self.visited, world), learner[:, None] == self.each_learner, 1.0
         for number in range(self.worlds.longest):

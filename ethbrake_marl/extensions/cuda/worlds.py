@@ -208,7 +208,7 @@ class Worlds:
 
 
 def check_runs(game: Game) -> None:
-    """Raise ``InvalidInput`` for what GPU kernels do not compute."""
+    """Raise ``InvalidInput`` if a game has something that GPU kernels do not compute."""
     what = f"scenario {game.name!r} in kernels for a GPU"
     for body, script in game.scripts.items():
         name = getattr(script, "name", type(script).__name__)
@@ -245,7 +245,7 @@ def check_runs(game: Game) -> None:
 
 
 def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Looking, Kernel]:
-    """Return the kernel ``play`` and its constant arguments."""
+    """Return the kernel ``play`` and its constant arguments. ``bodies``: number of bodies, vehicles and obstacle."""
     on = partial(torch.tensor, device=device)
     rules, plan = game.rules, game.views[int(game.rules.learners[0])].plan
     ruling = Ruling(

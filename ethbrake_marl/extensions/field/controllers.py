@@ -50,7 +50,7 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, state: State, body: int, step_s: float) -> Seen:
-        """Return what vehicle ``body`` knows; ``state`` is the world as it believes it to be."""
+        """Return what vehicle ``body`` knows. ``state``: the worlds as the vehicle estimates them."""
         line, ahead = state.line, body - 1
         known = state.know[:, body, ahead] <= state.time_s if ahead else line[:, GAP, 0] < FAR_M
         front, force = np.where(known, line[:, [SPEED, FORCE], ahead].T, 0.0)
@@ -129,8 +129,7 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
 
 
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
-    """Return the proactive and the critical criterion of UN R157's fuzzy safety model, [n] each: 0 no danger, 1 full
-    danger.
+    """Return the proactive and the critical criterion of UN R157's fuzzy safety model, [n] each: danger from 0 to 1.
 
     ``p``: parameters of the law ``r157_fsm``.
     """

@@ -81,9 +81,10 @@ CONTACT_FAR = tuple(feature for command, held in COMMANDS.items() for feature in
 
 @kernel
 def known_line(line, car, know, time, i, known, parameters, commands):
-    """Copy a world as body i knows it, with assumed commands of the others; return the first and last known body.
+    """Copy a world at ``time`` (s) as body i knows it, with assumed commands of the others.
 
-    Unknown bodies are at rest and out of reach.
+    Return the first and last known body. ``line``, ``car`` and ``know`` of the world, as in ``State``, are copied to
+    ``known`` and ``parameters``; the ``commands`` [N + 1] are in m/s2. Unknown bodies are at rest and out of reach.
     """
     first, last = i, i
     while first > 1 and time >= know[i, first - 1]:
@@ -113,7 +114,8 @@ def known_line(line, car, know, time, i, known, parameters, commands):
 def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out):
     """Write the unscaled features ``contact`` and ``contact_far`` to ``out`` [n, observers, F].
 
-    Returns the row of a world whose simulation failed, or -1.
+    Returns the row of a world whose simulation failed, or -1. ``line``, ``car``, ``clock``, ``know``: as in ``State``.
+    ``observers``: their bodies. ``memory``: arrays that are overwritten.
     """
     scratch, here, known, parameters, commands = memory
     near, failed = 3 * PER_COMMAND, -1
@@ -139,9 +141,10 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
 
 @kernel
 def write_features(scratch, met, i, first, last, time_step_s, value):
-    """Write the features of one forecast to ``value``; they are 0 for a pair that is not known.
+    """Write the features of one forecast for body i to ``value``; they are 0 for a pair that is not known.
 
-    An impact exactly at the end of a time step belongs to this step, as in the episode.
+    ``scratch``: results of the simulation. ``met``: whether it had an impact. ``first``, ``last``: known bodies. An
+    impact exactly at the end of a time step belongs to this step, as in the episode.
     """
     for side in range(2):
         p, at = i - 1 + side, 4 * side

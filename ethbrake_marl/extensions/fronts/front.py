@@ -164,7 +164,7 @@ def _tried(
 
 
 def observes_weights(team: Team) -> bool:
-    """Return whether a team's commands may depend on the weights of harm: not if its policies do not observe them."""
+    """Return whether commands may depend on the weights of harm: no if there are only policies without this feature."""
     policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
     seen = [() if policy is None else policy.observation.names for policy in policies]
     return team.shield is not None or any(not names or any("harm_weight" in name for name in names) for names in seen)
@@ -210,15 +210,16 @@ class Pool:
         return Profiles(np.stack(ends)[place, rows], np.stack(commands)[place, rows])
 
     def least(self, weights: Floats) -> Borne:
-        """Return the harm of each vehicle under the best profiles for each choice of weights, [W, n, N] by count."""
+        """Return each vehicle's harm under the best profiles for all ``weights`` [W, N]: count -> [W, n, N]."""
         chosen, rows = [self.choice(row) for row in weights], np.arange(self.problem.n)
         return {count: np.stack([np.stack(each)[k, rows] for k in chosen]) for count, each in self.borne.items()}
 
 
 def least_largest(scenario: Scenario, worlds: State, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
-    """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm, [n, N] by count.
+    """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm.
 
-    The largest harm is at most that under any profile of ``front``, which was searched in the same worlds.
+    It is count -> [n, N] m2/s2. The largest harm is at most that under any profile of ``front``, which was searched in
+    the same worlds.
     """
     game, parts = open_game(scenario)[1], []
     for first in range(0, worlds.n, CHUNK):

@@ -44,8 +44,8 @@ Decide = Callable[[Moment], Floats]  # returns the learners' actions, [m, L]
 def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least: int = 0) -> tuple[Floats, State]:
     """Simulate episodes to the end; return each learner's discounted return, [n, L], and the last states.
 
-    If harm is the reward's only term, an episode also ends, after ``at_least`` steps, when no vehicle will ever move
-    again.
+    ``decide``: returns the learners' actions at a ``Moment``. ``gamma``: discount per step. If harm is the reward's
+    only term, an episode also ends, after ``at_least`` steps, when no vehicle will ever move again.
     """
     learners, only_harm = game.rules.learners, set(game.rewarding.counted) <= {"harm"}
     gained, over = np.zeros((state.n, len(learners))), state.ended

@@ -55,8 +55,9 @@ LOOK_AHEAD = ("place", "speed", "braking_capacity", "latency", "mass")  # pieces
 def known_pieces(state: State, observer: int) -> Bools:
     """Return whether the body ``observer`` knows each quantity in ``PIECES`` of each body, [n, N + 1, PIECES].
 
-    It knows what the messages of a vehicle contain, its intent only after the first message; and place, speed and
-    acceleration of a neighbour in sight. Of itself and of the obstacle it knows everything.
+    *Pieces* are the quantities that a message can contain, such as speed and intent (the newest command). Body 0 is the
+    obstacle. The observer knows what the messages of a vehicle contain, its intent only after the first message; and
+    place, speed and acceleration of a neighbour in sight. Of itself and of the obstacle it knows everything.
     """
     memory: Memory = state.memories[NAME]
     time = state.time_s[:, np.newaxis]
@@ -72,10 +73,11 @@ def known_pieces(state: State, observer: int) -> Bools:
 
 
 def believed(state: State, observer: int) -> State:
-    """Return the state as the body ``observer`` believes it. What it does not know is NaN, except gaps.
+    """Return the state as the body ``observer`` estimates it. What it does not know is NaN, except gaps.
 
     Old samples are moved on to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which it
-    knows nothing. ``wanted`` has the newest intents. Gaps add up to the distances of bodies with a known place.
+    knows nothing. ``wanted`` has the newest intents (commands received). Gaps add up to the distances of bodies with a
+    known place.
     """
     known = known_pieces(state, observer)
     news = newest(state, observer)
@@ -91,9 +93,9 @@ def believed(state: State, observer: int) -> State:
 
 
 def believed_whole(state: State, observer: int) -> State:
-    """Return the state as the body ``observer`` believes it, without the vehicles that it cannot predict.
+    """Return the state as the body ``observer`` estimates it, without the vehicles that it cannot predict.
 
-    It can predict a vehicle of which it knows all quantities but the intent.
+    It can predict a vehicle of which it knows all quantities but the intent. For the others ``know`` is infinite.
     """
     known = known_pieces(state, observer)
     line, whole = estimated(state, observer, known, newest(state, observer)), known[:, :, :P_INTENT].all(axis=2)
@@ -107,9 +109,10 @@ def _known_if(state: State, observer: int, holds: Bools) -> Floats:
 
 
 def ages_s(state: State) -> Floats:
-    """Return the age of the newest sample that i has of j, [n, N + 1, N + 1] s; infinite if it has none.
+    """Return the age of the newest sample that body i has of body j, [n, N + 1, N + 1] s; infinite if it has none.
 
-    It is 0 without periodic messages, because then i knows the present state, from ``state.know`` on.
+    Body 0 is the obstacle. Without periodic messages it is 0, because then i knows the present state, from
+    ``state.know`` on.
     """
     memory: Memory = state.memories[NAME]
     if not memory.is_periodic:
@@ -127,10 +130,10 @@ def require_pieces(
     needs: Sequence[str] = LOOK_AHEAD,
     senders: Sequence[int] | None = None,
 ) -> None:
-    """Raise ``InvalidInput`` if messages lack a quantity that ``who``, the agent of ``observers``, needs.
+    """Raise ``InvalidInput`` if messages lack a quantity that ``who``, the agent of the vehicles ``observers``, needs.
 
-    ``needs``: the quantities. ``senders``: vehicles whose messages are needed; None: all. An agent of several vehicles
-    needs their messages, too.
+    ``needs``: names in ``PIECES``. ``senders``: vehicles whose messages are needed; None: all. An agent of several
+    vehicles needs their messages, too.
     """
     senders = range(1, state.vehicles + 1) if senders is None else senders
     for sender in senders if NAME in state.memories else ():

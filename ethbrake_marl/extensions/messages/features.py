@@ -15,7 +15,7 @@ from ethbrake_marl.registry import Part
 
 
 def age(state: State, body: int, other: int) -> Floats:
-    """Age of the newest sample received from the neighbour; 0 if its present state is known."""
+    """Age of the newest sample received from the neighbour; 0 if its present state, or nothing, is known."""
     if NAME not in state.memories:
         return np.zeros(state.n)
     ages = ages_s(state)[:, body, other]
@@ -23,7 +23,7 @@ def age(state: State, body: int, other: int) -> Floats:
 
 
 def intent(state: State, body: int, other: int) -> Floats:
-    """Command that the neighbour chose at its last decision, if its messages contain it."""
+    """Command that the neighbour chose at its last decision, if its messages contain it; else 0."""
     return state.wanted[:, other] if NAME in state.memories else np.zeros(state.n)
 
 

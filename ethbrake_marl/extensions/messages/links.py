@@ -66,7 +66,7 @@ ON_GRID = 1e-9  # two moments that are closer are the same (s)
 
 
 class Memory(NamedTuple):
-    """What the vehicles of n worlds have sent and received. In arrays of links, [.., i, j] is what i has of j."""
+    """What the vehicles of n worlds have sent and received. In arrays of links, [.., i, j] is what i has of body j."""
 
     contents: Bools  # [n, N + 1, PIECES] whether messages of a body contain the piece
     heard_s: Floats  # [n, N + 1, N + 1] when the first message can be used (s); infinite: never
@@ -83,12 +83,17 @@ class Memory(NamedTuple):
 
 
 def samples_kept(delay_s: float, time_step_s: float) -> int:
-    """Return how many samples to store so that every message finds its own: those of one delay, and three more."""
+    """Return how many samples to store so that a delayed message finds its own: those of one delay, and three more."""
     return math.ceil(delay_s / time_step_s - ON_GRID) + 3
 
 
 def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, kept: int) -> Memory:
-    """Return the memory at the alert, before any message. ``contents`` is [N, PIECES], times are [n, N, N]."""
+    """Return the memory at the alert, before any message.
+
+    ``contents`` [N, PIECES]: what messages of each vehicle contain. ``heard_s`` and ``seen_s`` [n, N, N]: when vehicle
+    i can use the first message of j, and when it begins to measure j (s). ``channel``: as in ``Memory``. ``kept``:
+    number of samples to store.
+    """
     n, N = heard_s.shape[:2]
     whole = np.ones((n, N + 1, len(PIECES)), np.bool_)
     whole[:, 1:] = contents
@@ -102,9 +107,9 @@ def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, ke
 
 
 def present(state: State) -> Floats:
-    """Return the sample that each body would send now, [n, SAMPLE_ROWS, N + 1]; places are relative to Vehicle 1.
+    """Return the sample that each body would send now, [n, SAMPLE_ROWS, N + 1] (body 0: the obstacle).
 
-    The intent of a vehicle is its last command; 0 before it knows of the alert.
+    Places are relative to Vehicle 1. The intent of a vehicle is its last command; 0 before it knows of the alert.
     """
     sample = np.zeros((state.n, SAMPLE_ROWS, state.vehicles + 1))
     latency, time = state.car[:, LATENCY], state.time_s[:, np.newaxis]
@@ -155,7 +160,10 @@ def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
 
 
 def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:
-    """Add a sample of the worlds ``rows`` and receive what arrives, in place. ``way_m``: way since the last sample."""
+    """Add a sample in the worlds ``rows`` (a mask [n]) to ``memory`` and receive what arrives, in place.
+
+    ``way_m`` [n]: way of Vehicle 1 since the last sample.
+    """
     sample, samples = present(state), memory.samples
     sample[:, PLACE, 1:] += (samples[:, 0, PLACE, 1] + way_m)[:, np.newaxis]
     sample[:, PLACE, 0] = samples[:, 0, PLACE, 0]
@@ -165,7 +173,7 @@ def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:
 
 
 def newest(state: State, observer: int) -> Floats:
-    """Return the newest sample of each body that the observer has, [n, SAMPLE_ROWS, N + 1]."""
+    """Return the newest sample of each body that the body ``observer`` has, [n, SAMPLE_ROWS, N + 1]."""
     memory: Memory = state.memories[NAME]
     if not memory.is_periodic:
         return present(state)
@@ -183,7 +191,10 @@ def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats
 
 @large
 def receive_worlds(rows, time, channel, seen, samples, links, news):
-    """Receive all messages that can be used by ``time``, and measure vehicles in sight, in the worlds ``rows``."""
+    """Receive all messages that can be used by ``time`` [n] (s), and measure vehicles in sight, in the worlds ``rows``.
+
+    ``rows`` is a mask [n]; the other arguments are arrays of ``Memory``, of which ``links`` and ``news`` are changed.
+    """
     bodies = news.shape[3]
     for k in range(len(rows)):
         for link in range(bodies * bodies if rows[k] else 0):
@@ -204,7 +215,10 @@ def receive_worlds(rows, time, channel, seen, samples, links, news):
 
 @kernel
 def take_sample(samples, news, i, j, sent, rows):
-    """Copy to i's news the newest sample of j from ``sent`` (s) or before: the first ``rows`` rows of it."""
+    """Copy the newest sample of body j from ``sent`` (s) or before to i's ``news``: its first ``rows`` rows.
+
+    One world: ``samples`` [L, SAMPLE_ROWS, N + 1], newest first; ``news`` [SAMPLE_ROWS, N + 1, N + 1].
+    """
     for s in range(samples.shape[0]):
         if samples[s, AT, j] <= sent + ON_GRID:
             for row in range(rows):
@@ -214,7 +228,10 @@ def take_sample(samples, news, i, j, sent, rows):
 
 @kernel
 def chance(key, link, number):
-    """Return the random number in [0, 1) that decides whether a message is lost: a SplitMix64 hash."""
+    """Return the random number in [0, 1) that decides whether message ``number`` of a link is lost: a SplitMix64 hash.
+
+    ``key``: of the world, as in ``Memory.channel``. ``link``: number of the link.
+    """
     z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
     z ^= np.uint64(number + 1.0) * np.uint64(0xD1342543DE82EF95)
     for _ in range(2):
@@ -228,7 +245,8 @@ def chance(key, link, number):
 def moved_on(speed, force, limit, duration):
     """Return a vehicle's speed (m/s) and way (m) after ``duration`` (s) under a constant force, without contact.
 
-    A vehicle that moves backward brakes to rest, whatever the sign of its force.
+    ``force``: acceleration (m/s2). ``limit``: speed up to which it drives (m/s). A vehicle that moves backward brakes
+    to rest, whatever the sign of its force.
     """
     if speed >= 0.0:
         after, way, _ = solo(speed, force, 0.0, limit, duration)
@@ -240,12 +258,13 @@ def moved_on(speed, force, limit, duration):
 
 @large
 def estimate_worlds(observer, time, limit, known, news, aged, line, place, fresh):
-    """Overwrite ``line``, the true one, by the line as the body ``observer`` estimates it.
+    """Overwrite ``line``, the true one (``State.line``), by the line as the body ``observer`` estimates it.
 
-    From the newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], it continues with the same force and without
-    contact. Between two samples of the present the gap is the true one. A place that is not ``known`` [n, N + 1,
-    PIECES] is the place of the next body towards the observer; an unknown speed or force is 0. If news may be old
-    (``aged``), the observer knows of no impact between others.
+    From the newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], it continues to ``time`` [n] (s) with the
+    same force, up to the speed ``limit`` [n, N + 1] (m/s), and without contact. Between two samples of the present the
+    gap is the true one. A place that is not ``known`` [n, N + 1, PIECES] is the place of the next body towards the
+    observer; an unknown speed or force is 0. If news may be old (``aged``), the observer knows of no impact between
+    others. ``place`` and ``fresh`` [N + 1]: memory, overwritten.
     """
     bodies = line.shape[2]
     for k in range(len(time)):

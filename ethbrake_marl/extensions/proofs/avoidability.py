@@ -81,7 +81,8 @@ def spare_gap(gap, v_l, a_l, v_f, a_f):
     """Return the smallest gap (m) if follower and leader brake fully from now on; negative: they make contact.
 
     If the follower comes to rest last, it is the gap at rest. Otherwise the gap is smallest when both speeds are equal,
-    or now if the leader is at least as fast.
+    or now if the leader is at least as fast. ``gap``: now (m). v (m/s), a (m/s2): speed and braking capacity of leader
+    (l) and follower (f).
     """
     if v_f * a_l >= v_l * a_f:
         return gap - max(0.0, v_f * v_f / (2.0 * a_f) - v_l * v_l / (2.0 * a_l))
@@ -92,11 +93,11 @@ def spare_gap(gap, v_l, a_l, v_f, a_f):
 
 @kernel
 def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
-    """Return how long (s) a vehicle can drive with ``u`` before it must brake fully to stay behind the braking leader.
+    """Return how long (s) a vehicle can drive with ``u`` (m/s2) before it must brake fully to stay behind the leader.
 
     Also return when the gap becomes 0 (s), and whether both vehicles still move then: if so, ``a_f > a_l`` and they are
     equally fast; otherwise the follower comes to rest behind the standing leader. Both times are infinite if the
-    follower never moves. Requires ``spare_gap >= 0``.
+    follower never moves. Other arguments: as for ``spare_gap``, whose result must be at least 0.
     """
     w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
     if relief > 0.0 and v_l > 0.0:
@@ -137,8 +138,8 @@ def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
 def lowest_while_coasting(at):
     """Return the smallest gap (m) to the rear vehicle until the controlled vehicle, which coasts, may act.
 
-    ``at``: the three vehicles at the alert, by the rows of ``line`` (``GAP_R``, ``V_F``, ...). The gap is a convex
-    function of time: it is smallest when both are equally fast, or at the start or end.
+    ``at``: the world at the alert (``line``). The gap is a convex function of time: it is smallest when both are
+    equally fast, or at the start or end.
     """
     w = at[V_R] - at[V_F]
     if w <= 0.0:
@@ -156,10 +157,10 @@ def met(gap, closing):
 
 @kernel
 def plan_behind(at, ahead, v_l, out):
-    """Return the plan (``plans``) of the largest trajectory, and write the columns DRIVE, TOUCH and FOLLOW of ``out``.
+    """Return the plan (``plans``) of the largest trajectory of the world ``at`` (``line``).
 
-    The vehicle drives as hard as it can, then brakes fully, then follows the front vehicle, which is ``ahead`` (m) at
-    the start and has the speed ``v_l`` (m/s).
+    Also write the columns DRIVE, TOUCH and FOLLOW of ``out`` (``decide``). The vehicle drives as hard as it can, then
+    brakes fully, then follows the front vehicle, which is ``ahead`` (m) at the start and has the speed ``v_l`` (m/s).
     """
     if at[GAP_L] < FAR_M:
         out[DRIVE], out[TOUCH], moving = largest_behind(ahead, v_l, at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])
@@ -170,7 +171,7 @@ def plan_behind(at, ahead, v_l, out):
 
 @large
 def decide(at, out):
-    """Write whether one world's contact is avoidable to ``out`` [VERDICT].
+    """Write whether contact is avoidable in the world ``at`` (``line``) to ``out`` [VERDICT].
 
     Its columns: REASON; MARGIN (m); SPARE, the gap ahead that full braking leaves (m); DRIVE and TOUCH, end of the
     drive and of the full braking after it (s after the *start*, from which the vehicle may act); FOLLOW, the command
@@ -239,7 +240,7 @@ def avoidability(state: State, body: int = 2) -> Avoidability:
 
 
 def _check_covered(state: State, body: int) -> None:
-    """Raise ``InvalidInput`` unless the proof covers these worlds.
+    """Raise ``InvalidInput`` unless the proof covers these worlds; ``body``: the controlled vehicle.
 
     An obstacle that Vehicle 1 does not reach under full braking is allowed: only a push could bring it there, and a
     push begins with an impact.

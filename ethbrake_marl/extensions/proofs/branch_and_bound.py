@@ -31,7 +31,7 @@ def gentlest_between(kind, at, early, late):
     """Return a lower bound (m/s) on the closing speed of first contacts between ``early`` and ``late``.
 
     The smallest closing speed falls with the time, with one exception: if the leader brakes harder than the controlled
-    vehicle, it rises by at most the difference of the braking capacities in each second.
+    vehicle, it rises by at most the difference of the braking capacities in each second. Arguments: see ``proofs``.
     """
     least = gentlest(kind, at, late)[0]
     if kind == FRONT_FIRST and at[A_L] > at[A_F] and early * at[A_L] < at[V_L]:
@@ -43,7 +43,7 @@ def gentlest_between(kind, at, early, late):
 def decision_around(at, early, late):
     """Return start and end (s) of the decision step that contains both times, ``early`` and ``late`` (s).
 
-    If there is none, or if commands may change at any time, return ``late`` twice.
+    If there is none, or if commands may change at any time, return ``late`` twice. ``at``: one world (``line``).
     """
     step = at[TIME_STEP]
     if step <= 0.0:
@@ -61,7 +61,7 @@ def lacking(kind, at, early, late, softest, hard, begin):
     Braking makes a contact with the front vehicle gentle, but driving softens the impact from behind that follows; at
     the rear it is the other way round. The command is the same in the whole decision step, which starts at ``begin``
     (s), so it cannot be the best one both before and after the contact. ``softest`` is the smallest closing speed (m/s)
-    of a first contact between ``early`` and ``late`` under any command.
+    of a first contact between ``early`` and ``late`` under any command. Other arguments: see ``proofs``.
     """
     whole = at[U_F] + at[A_F]
     turn = gentlest(kind, at, early)[1]
@@ -79,7 +79,11 @@ def lacking(kind, at, early, late, softest, hard, begin):
 
 @large
 def harm_of(kind, at, early, late, soft, hard, floor):
-    """Return a lower bound (m2/s2) on the harm of the first contacts in a cell."""
+    """Return a lower bound (m2/s2) on the harm of the first contacts in a cell.
+
+    The cell contains the times ``early`` to ``late`` and the closing speeds ``soft`` to ``hard``. Arguments: see
+    ``proofs``.
+    """
     begin, end = decision_around(at, early, late)
     lack = 0.0
     if end > late:
@@ -90,7 +94,10 @@ def harm_of(kind, at, early, late, soft, hard, floor):
 
 @large
 def put(kind, at, floor, cells, count, least, early, late, soft, hard):
-    """Add a cell, whose bound is at least ``least`` (m2/s2), and return the new number of cells."""
+    """Add a cell to ``cells``, after the first ``count``, and return the new number of cells.
+
+    Its bound is at least ``least`` (m2/s2). Other arguments: as for ``harm_of``.
+    """
     cell = cells[count]
     cell[HARM] = max(harm_of(kind, at, early, late, soft, hard, floor), least)
     cell[EARLY], cell[LATE], cell[SOFT], cell[HARD] = early, late, soft, hard
@@ -108,10 +115,10 @@ def lowest(cells, count):
 
 @large
 def divide(kind, at, floor, count, row, cells):
-    """Split the cell in ``row`` into two halves.
+    """Split the cell in ``row`` of ``cells``, of which ``count`` are in use, into two halves.
 
     Return the new number of cells, and the bound (m2/s2) for one first contact in the cell; the smallest bound of all
-    first contacts is at most this.
+    first contacts is at most this. Other arguments: see ``proofs``.
     """
     cell = cells[row]
     harm, early, late, soft, hard = cell[HARM], cell[EARLY], cell[LATE], cell[SOFT], cell[HARD]
@@ -137,7 +144,10 @@ def divide(kind, at, floor, count, row, cells):
 
 @large
 def least_harm(kind, at, first, last, floor, best, enough, cells):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s)."""
+    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s).
+
+    Arguments: see ``proofs``.
+    """
     for k in range(_TRIED):
         time = first + (last - first) * k / (_TRIED - 1)
         closing = gentlest(kind, at, time)[0]
@@ -163,7 +173,10 @@ def least_harm(kind, at, first, last, floor, best, enough, cells):
 
 @kernel
 def next_split(kind, at, time, last):
-    """Return the next time (s) of a decision or of the front vehicle's standstill after ``time``; at most ``last``."""
+    """Return the next time (s) of a decision or of the front vehicle's standstill after ``time``; at most ``last``.
+
+    The standstill counts only if the first contact is in front (``kind``). ``at``: one world (``line``).
+    """
     until = last
     if at[TIME_STEP] > 0.0:
         until = min(until, (math.floor(time / at[TIME_STEP] + 1e-6) + 1.0) * at[TIME_STEP])

@@ -25,7 +25,8 @@ def flight_lead(pair, opening, flight):
     The gain is its speed minus the speed of the centre of mass. For a flight of L seconds (``flight``) with the opening
     speed o, the lead is ``share (press L - o) - G``. G is the speed (m/s) that the vehicle must give up so that the two
     stay apart for the time L: the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``, because in each
-    second it can give up at most ``reach``. The result is -inf if no command keeps the two apart for so long.
+    second it can give up at most ``reach``. The result is -inf if no command keeps the two apart for so long. ``pair``:
+    see the module.
     """
     share, press, reach, _ = pair
     relative = share * (press * flight - opening)
@@ -41,7 +42,7 @@ def flight_lead(pair, opening, flight):
 def best_flight(pair, opening):
     """Return the duration (s) of the flight with the largest lead among those that begin with ``opening`` (m/s).
 
-    Infinite if a longer flight always has a larger lead.
+    Infinite if a longer flight always has a larger lead. ``pair``: see the module.
     """
     share, press, reach, _ = pair
     if press <= 0.0:
@@ -63,6 +64,7 @@ def lead(pair, opening, shortest, longest, lost):
     """Return the largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
     It is the maximum over all opening speeds up to ``opening``: with a limited time, a smaller one may lead to more.
+    ``pair``, ``lost``: see the module.
     """
     share, press, reach, _ = pair
     if press <= 0.0:
@@ -83,7 +85,8 @@ def lead(pair, opening, shortest, longest, lost):
 def decays(pair):
     """Return whether ``reach`` limits the speed that the vehicle can gain in any flight.
 
-    False if the vehicle may gain speed by accelerating less now and bouncing more strongly later.
+    False if the vehicle may gain speed by accelerating less now and bouncing more strongly later. ``pair``, with
+    ``reach``: see the module.
     """
     share, press, reach, bounce = pair
     if share <= 0.5:
@@ -105,7 +108,7 @@ def largest_lead(pair, opening, lost, late, end, since, until):
 
     The bound is the maximum over three cases: the last flight before the contact with the neighbour outside the pair
     begins with the first impact, within the window, or after it. That contact comes between ``since`` and ``until``.
-    Times are in s after the first contact.
+    Times are in s after the first contact. ``pair``, ``opening``: see the module.
     """
     share, press, reach, bounce = pair
     if since < end:
@@ -133,7 +136,7 @@ def widest_flight(share, slack, press, drive, bounce, closing, back, time):
     p is the speed (m/s) at which vehicle and partner separate, s the gap (m) between them. Holds for ``time`` seconds;
     infinite if no bound is known. ``slack``: braking capacity of the partner minus the vehicle's (m/s2). ``drive``: the
     vehicle's largest acceleration (m/s2). ``closing``: closing speed of the first impact (m/s). ``back``: backward
-    speed of the vehicle after it (m/s).
+    speed of the vehicle after it (m/s). Other arguments: see the module.
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:
         return math.inf

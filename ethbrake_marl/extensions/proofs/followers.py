@@ -53,7 +53,7 @@ def value_of(line, time):
 
 @kernel
 def least_of_line(line, since, until):
-    """Return the smallest value of a piecewise linear function (``value_of``) from ``since`` to ``until``."""
+    """Return the smallest value of a piecewise linear function (see ``value_of``) from ``since`` to ``until``."""
     first, second = min(max(line[2], since), until), min(max(line[4], since), until)
     return min(value_of(line, since), value_of(line, until), value_of(line, first), value_of(line, second))
 
@@ -65,7 +65,7 @@ def least_closing(line, pair, opening, lost, late, end, until):
     It is a difference v - d: v is the closing speed of the second neighbour relative to the centre of mass of the pair,
     which ``line`` describes as a function of time (``value_of``; a bend may be negative); d, from ``largest_lead``, is
     the largest difference between the controlled vehicle and this centre. ``until`` is the latest time of the contact.
-    Times are in s after the first contact.
+    Times are in s after the first contact. Other arguments: see ``flights``.
     """
     best = least_of_line(line, 0.0, until) - largest_lead(pair, opening, lost, late, end, 0.0, until)
     for k in range(len(LEADS)):
@@ -80,7 +80,10 @@ def least_closing(line, pair, opening, lost, late, end, until):
 
 @kernel
 def rear_after(at, early):
-    """Return the rear vehicle's distance to the leader (m) and speed (m/s) at ``early``, and its onset (s after it)."""
+    """Return the rear vehicle's distance to the leader (m) and speed (m/s) at ``early``, and its onset (s after it).
+
+    The *onset* is the time at which it begins to brake. Arguments: see ``proofs``.
+    """
     speed, way = follower(at, early)
     return max(at[GAP_L] + at[GAP_R] + leader(at, early)[1] - way, 0.0), speed, max(at[ONSET_R] - early, 0.0)
 
@@ -91,7 +94,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 
     It follows from the motion of the centre of mass of leader and controlled vehicle; 0: none proven. If the leader is
     at rest at ``early``, a later first contact leads to the same motion at a later time, so ``late``, ``end`` and
-    ``lack`` do not matter.
+    ``lack`` do not matter. Arguments: see ``proofs``.
     """
     share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -119,7 +122,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 def held_by_leader(at, early, late, closing):
     """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with a harder braking leader.
 
-    It holds because the controlled vehicle then stays near the leader. 0: none proven.
+    It holds because the controlled vehicle then stays near the leader. 0: none proven. Arguments: see ``proofs``.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -155,7 +158,7 @@ def held_by_leader(at, early, late, closing):
 def after_front(at, early, late, closing, end, lack):
     """Return a lower bound (m2/s2) on the rear pair's squared closing speed after a first contact with the leader.
 
-    It is the largest of several lower bounds.
+    It is the largest of several lower bounds. Arguments: see ``proofs``.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     behind, v_r, onset = rear_after(at, early)
@@ -176,8 +179,9 @@ def after_front(at, early, late, closing, end, lack):
 def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
     """Return the smallest squared closing speed (m2/s2) at which a braking vehicle (f) reaches the braking leader (l).
 
-    f brakes with at most ``a_f``. ``gap`` and ``least_gap`` are the largest and smallest possible gap (m);
-    ``least_gap`` is used only if the leader brakes harder. The result is 0 if contact is not certain.
+    v is a speed (m/s), a a braking capacity (m/s2). f brakes with at most ``a_f``. ``gap`` and ``least_gap`` are the
+    largest and smallest possible gap (m); ``least_gap`` is used only if the leader brakes harder. The result is 0 if
+    contact is not certain.
     """
     squared = walk(gap, v_l, braking(0.0, a_l), v_f, braking(0.0, a_f), v_f / a_f)[2]
     if a_f < a_l:
@@ -191,7 +195,8 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
     """Return a lower bound (m/s) on the front pair's closing speed after the rear vehicle's first contact.
 
     It follows from the motion of the centre of mass of rear and controlled vehicle. The controlled vehicle must brake
-    at least as hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m).
+    at least as hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m). Other arguments: see
+    ``proofs``.
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -211,7 +216,10 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
 
 @large
 def after_rear(at, early, late, closing, end, lack):
-    """Return a lower bound (m2/s2) on the front pair's squared closing speed after the rear vehicle's first contact."""
+    """Return a lower bound (m2/s2) on the front pair's squared closing speed after the rear vehicle's first contact.
+
+    Arguments: see ``proofs``.
+    """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l, way_l = leader(at, early)
     v_r, way_r = follower(at, early)
@@ -230,7 +238,10 @@ def after_rear(at, early, late, closing, end, lack):
 
 @large
 def after(kind, at, early, late, closing, end, lack):
-    """Return a lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact."""
+    """Return a lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact.
+
+    Arguments: see ``proofs``.
+    """
     if kind == FRONT_FIRST:
         return after_front(at, early, late, closing, end, lack)
     return after_rear(at, early, late, closing, end, lack)

@@ -37,20 +37,29 @@ HALVINGS = 60
 
 @kernel
 def leader(at, time):
-    """Return speed (m/s) and way (m) of the front vehicle at ``time`` if it brakes from now on without being pushed."""
+    """Return speed (m/s) and way (m) of the front vehicle at ``time`` if it brakes from now on without being pushed.
+
+    ``time`` (s) counts from now. ``at``: one world (see the module).
+    """
     speed, way, _ = solo(at[V_L], -at[A_L], 0.0, math.inf, time)
     return speed, way
 
 
 @kernel
 def follower(at, time):
-    """Return speed (m/s) and way (m) of the rear vehicle at ``time`` if it is not pushed."""
+    """Return speed (m/s) and way (m) of the rear vehicle at ``time`` (s from now) if it is not pushed.
+
+    It coasts until its latency has elapsed, then brakes fully. ``at``: one world (see the module).
+    """
     speed, way, _ = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, time)
     return speed, way
 
 
 def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
-    """Return one row of numbers for each world, [n, COLUMNS]; the controlled vehicle is ``body`` (1: Vehicle 1)."""
+    """Return one row ``at`` of numbers for each world, [n, COLUMNS]; the controlled vehicle is ``body`` (1: Vehicle 1).
+
+    ``time_step_s``: time between decisions; 0: commands may change at any time.
+    """
     line, car, at = state.line, state.car, np.zeros((state.n, COLUMNS))
     onset = np.maximum(car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0)
     at[:, [GAP_L, GAP_R]] = FAR_M

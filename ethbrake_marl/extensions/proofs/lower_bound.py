@@ -73,7 +73,7 @@ FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 
 
 class LowerBound(NamedTuple):
-    """Lower bounds on the harm of each world, [n] m2/s2."""
+    """Lower bounds on the harm of each world, [n] m2/s2: ``harm``, and its terms (``lower_bound``)."""
 
     harm: Floats  # no command does less
     early: Floats  # harm before the controlled vehicle may act
@@ -89,7 +89,10 @@ class LowerBound(NamedTuple):
 
 @kernel
 def front_bound(at):
-    """Return the smallest squared closing speed (m2/s2) and the latest time (s) of the front pair's first contact."""
+    """Return the smallest squared closing speed (m2/s2) and the latest time (s) of the front pair's first contact.
+
+    The time is infinite if full braking avoids the contact. ``at``: one world (``line``).
+    """
     _, time, squared = behind_leader(at, braking(0.0, at[A_F]), at[V_F] / at[A_F])
     if at[A_F] < at[A_L] and at[V_F] < at[V_L]:
         squared = min(squared, 2.0 * (at[A_L] - at[A_F]) * at[GAP_L])
@@ -100,7 +103,7 @@ def front_bound(at):
 def rear_bound(at):
     """Return the smallest squared closing speed (m2/s2) and the latest time (s) of the rear pair's first contact.
 
-    Full drive attains both; the time is infinite if it avoids the contact.
+    Full drive attains both; the time is infinite if it avoids the contact. ``at``: one world (``line``).
     """
     _, time, squared = before_rear(at, driving_first(at, math.inf), rest_of_rear(at))
     return squared, time
@@ -112,7 +115,7 @@ def last_first(kind, at, first, last):
 
     By bisection, from ``first`` (s), at which it is possible. The later the contact in front, the shorter the vehicle
     drives, so the rear vehicle comes nearer; the later the contact behind, the shorter it brakes, so it comes nearer to
-    the front vehicle.
+    the front vehicle. ``kind``, ``at``: see ``proofs``.
     """
     time = last
     for _ in range(HALVINGS + 1):
@@ -135,7 +138,7 @@ def last_meeting(at, first):
     """Return the latest time (s) of a contact with the front vehicle, and the latest before any with the rear vehicle.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
-    speed. ``first`` is the earliest time (s) of a contact with the front vehicle.
+    speed. ``first`` is the earliest time (s) of a contact with the front vehicle. ``at``: one world (``line``).
     """
     touches = spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0
     last = meet_front(at, 0.0)
@@ -149,7 +152,7 @@ def last_meeting(at, first):
 def soft_harm(kind, at, early, late, floor, best):
     """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late``.
 
-    The closing speed of these contacts may have any value.
+    The closing speed of these contacts may have any value. Arguments: see ``proofs``.
     """
     soft = 0.0
     while soft * soft < best:
@@ -161,7 +164,10 @@ def soft_harm(kind, at, early, late, floor, best):
 
 @kernel
 def outer_contact(at):
-    """Return time (s) and squared closing speed (m2/s2) at which the rear vehicle would reach the front vehicle."""
+    """Return time (s) and squared closing speed (m2/s2) at which the rear vehicle would reach the front vehicle.
+
+    As if the controlled vehicle were not there; infinite and 0 if never. ``at``: one world (``line``).
+    """
     rear = braking(at[ONSET_R], at[A_R])
     return walk(at[GAP_L] + at[GAP_R], at[V_L], braking(0.0, at[A_L]), at[V_R], rear, math.inf)[1:]
 
@@ -172,7 +178,8 @@ def front_first(at, floor, best, enough, cells):
 
     In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
     vehicle relative to the front vehicle, and the front pair's is at least the smallest possible one at this time. Such
-    a contact is covered only at times at which a first contact with the front vehicle is possible.
+    a contact is covered only at times at which a first contact with the front vehicle is possible. Arguments: see
+    ``proofs``.
     """
     first = meet_front(at, math.inf)
     if first == math.inf and at[GAP_L] <= TOUCHING_M:
@@ -197,7 +204,10 @@ def front_first(at, floor, best, enough, cells):
 
 @large
 def rear_first(at, floor, best, enough, cells):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle."""
+    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle.
+
+    Arguments: see ``proofs``.
+    """
     high = max(at[V_F] / at[A_F], rest_of_rear(at))
     first = meet_rear(at, high)
     if first == math.inf or not stays_behind(at, first, first):
@@ -226,7 +236,7 @@ def rear_first(at, floor, best, enough, cells):
 
 @kernel
 def last_rest(at):
-    """Return the time (s) after which no more harm happens that the combined bound counts."""
+    """Return the time (s) after which no more harm happens that the combined bound of the world ``at`` counts."""
     stand = rest_of_rear(at)
     way = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
     room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
@@ -239,7 +249,7 @@ def combined_bound(at, until, front, rear, cells):
     """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact, first in front or behind.
 
     0 if some of the counted harm may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds on
-    the harm of each pair alone (m2/s2).
+    the harm of each pair alone (m2/s2). ``at``, ``cells``: see ``proofs``.
     """
     if not last_rest(at) < until:
         return 0.0
@@ -258,8 +268,9 @@ def combined_bound(at, until, front, rear, cells):
 def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
     """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2).
 
-    ``rows`` [n, COLUMNS]; harm after ``until`` [n] (s) does not count. ``has_front`` and ``has_rear`` [n]: the
-    neighbour exists, and the pair's next impact counts. ``unavoidable`` [n]: contact cannot be avoided.
+    ``rows`` [n, COLUMNS]: the worlds (``line``); harm after ``until`` [n] (s) does not count. ``has_front`` and
+    ``has_rear`` [n]: the neighbour exists, and the pair's next impact counts. ``unavoidable`` [n]: contact cannot be
+    avoided. ``cells``: memory, overwritten.
     """
     for k in range(len(out)):
         for column in range(BOUNDS):

@@ -18,7 +18,7 @@ def avoidable(game: Game, alert: State, last: State) -> Given:
     """Whether some commands avoid all contact (proven), [n], and if not, why: ``early``, ``front`` or ``rear``.
 
     The commands are those of Vehicle 2 of three (or of Vehicles 2 and 3 together) or of either of two vehicles; all
-    others brake fully.
+    others brake fully. The result is the same for every agent.
     """
     verdict = avoidability(alert, _controlled(game, alert, together=True))
     return {"": verdict.avoidable, "reason": verdict.reason_name}
@@ -30,7 +30,7 @@ _known: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: 
 def proven_harm(game: Game, alert: State, last: State) -> Given:
     """Lower bound on the harm or honest cost of all commands that change at decisions, [n] m2/s2.
 
-    ``impact``: whether the bound is above 0.
+    ``impact``: whether the bound is above 0. The result is the same for every agent.
     """
     body, rules = _controlled(game, alert), game.rules
     asked = np.array([body, rules.horizon_s, rules.time_step_s]).tobytes() + alert.line.tobytes() + alert.car.tobytes()

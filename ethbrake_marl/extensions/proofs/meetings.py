@@ -37,7 +37,8 @@ _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speed
 def gentlest_front(at, time):
     """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and its ``drive``.
 
-    To be at a place at a time with the smallest speed, drive first and then brake.
+    To be at a place at a time with the smallest speed, drive first (for ``drive`` s) and then brake. ``at``: one world
+    (``line``).
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[GAP_L] + way, at[V_F], at[U_F], at[A_F]
@@ -58,7 +59,10 @@ def gentlest_front(at, time):
 
 @kernel
 def braked_then_driven(at, brake, time):
-    """Return way (m) and speed (m/s) at ``time`` if the vehicle brakes first, at most to rest, and then drives."""
+    """Return way (m) and speed (m/s) at ``time`` if the vehicle brakes first, at most to rest, and then drives.
+
+    ``brake``: how long it brakes (s). ``at``: one world (``line``).
+    """
     v, u, a = at[V_F], at[U_F], at[A_F]
     braked = min(brake, v / a)
     slow = max(v - a * brake, 0.0)
@@ -72,7 +76,10 @@ def braked_then_driven(at, brake, time):
 
 @large
 def braking_to_rear(at, time):
-    """Return how long (s) the vehicle must brake first to be in contact with the rear vehicle at ``time``."""
+    """Return how long (s) the vehicle must brake first to be in contact with the rear vehicle at ``time`` (s).
+
+    Then it drives. ``at``: one world (``line``).
+    """
     place = follower(at, time)[1] - at[GAP_R]
     low, high = 0.0, time
     for _ in range(HALVINGS):
@@ -89,7 +96,7 @@ def gentlest(kind, at, time):
     """Return the smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake`` (s).
 
     To be at a place at a time with the largest speed, brake first and then drive. ``brake`` is infinite if the vehicle
-    reaches its speed limit by then.
+    reaches its speed limit by then. ``kind``, ``at``: see ``proofs``.
     """
     if kind == FRONT_FIRST:
         return gentlest_front(at, time)
@@ -120,29 +127,41 @@ def braking_first(at, brake):
 
 @kernel
 def rest_of_rear(at):
-    """Return the time (s) at which the rear vehicle comes to rest if nothing pushes it."""
+    """Return the time (s) at which the rear vehicle of the world ``at`` comes to rest if nothing pushes it."""
     return at[ONSET_R] + at[V_R] / at[A_R]
 
 
 @large
 def meet_front(at, drive):
-    """Return when (s) a vehicle that drives first, for ``drive`` s, meets the front vehicle; infinite: never."""
+    """Return when (s) a vehicle that drives first, for ``drive`` s, meets the front vehicle; infinite: never.
+
+    Then it brakes. ``at``: one world (``line``).
+    """
     return behind_leader(at, driving_first(at, drive), math.inf)[1]
 
 
 @large
 def meet_rear(at, brake):
-    """Return when (s) a vehicle that brakes first, for ``brake`` s, meets the rear vehicle; infinite: never."""
+    """Return when (s) a vehicle that brakes first, for ``brake`` s, meets the rear vehicle; infinite: never.
+
+    Then it drives. ``at``: one world (``line``).
+    """
     return before_rear(at, braking_first(at, brake), rest_of_rear(at))[1]
 
 
 @large
 def stays_ahead(at, drive, until):
-    """Return whether a vehicle that drives for ``drive`` s, then brakes, avoids the rear one until ``until`` (s)."""
+    """Return whether a vehicle that drives for ``drive`` s, then brakes, avoids the rear one until ``until`` (s).
+
+    ``at``: one world (``line``).
+    """
     return before_rear(at, driving_first(at, drive), until)[0] >= -AHEAD_M
 
 
 @large
 def stays_behind(at, brake, until):
-    """Return whether a vehicle that brakes for ``brake`` s, then drives, avoids the front one until ``until`` (s)."""
+    """Return whether a vehicle that brakes for ``brake`` s, then drives, avoids the front one until ``until`` (s).
+
+    ``at``: one world (``line``).
+    """
     return behind_leader(at, braking_first(at, brake), until)[0] >= -AHEAD_M

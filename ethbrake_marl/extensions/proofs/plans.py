@@ -15,13 +15,16 @@ from ethbrake_marl.motion.contact import contact
 
 @kernel
 def braking(onset, deceleration):
-    """Return the plan: coast until ``onset`` (s), then brake to rest."""
+    """Return the plan (see the module): coast until ``onset`` (s), then brake to rest with ``deceleration`` (m/s2)."""
     return 0.0, onset, 0.0, onset, 0.0, onset, -deceleration, math.inf
 
 
 @kernel
 def with_window(u, late, end, change, turn, step):
-    """Return the plan: accelerate with ``u``, ``step`` more after ``turn``, ``change`` more ``late`` to ``end``."""
+    """Return a plan (see the module): accelerate with ``u``, plus ``step`` after ``turn``, plus ``change`` in a window.
+
+    The window is from ``late`` to ``end``. Accelerations in m/s2, times in s.
+    """
     second = u + step if turn < late else u + change
     third = u + step + change if turn < end else u
     return u, min(turn, late), second, min(max(turn, late), end), third, max(turn, end), u + step, math.inf
@@ -29,26 +32,36 @@ def with_window(u, late, end, change, turn, step):
 
 @kernel
 def time_to_limit(v, u, limit):
-    """Return the time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 if it never does."""
+    """Return the time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 without need or drive."""
     return (limit - v) / u if u > 0.0 and v < limit else 0.0
 
 
 @kernel
 def drive_then_brake(v, u, limit, drive, deceleration):
-    """Return the plan: drive with ``u`` (m/s2) up to the speed limit for ``drive`` seconds, then brake to rest."""
+    """Return the plan (see the module): drive for ``drive`` seconds, then brake to rest.
+
+    It drives with ``u`` (m/s2) from the speed ``v`` up to ``limit`` (m/s), and brakes with ``deceleration`` (m/s2).
+    """
     return u, min(time_to_limit(v, u, limit), drive), 0.0, drive, 0.0, drive, -deceleration, math.inf
 
 
 @kernel
 def brake_then_drive(v, u, limit, brake, deceleration):
-    """Return the plan: brake for ``brake`` seconds, at most to rest, then drive up to the speed limit."""
+    """Return the plan (see the module): brake for ``brake`` seconds, at most to rest, then drive.
+
+    It brakes with ``deceleration`` (m/s2) from the speed ``v`` (m/s), and drives with ``u`` (m/s2) up to ``limit``
+    (m/s).
+    """
     cap = brake + time_to_limit(max(v - deceleration * brake, 0.0), u, limit)
     return -deceleration, brake, u, cap, 0.0, cap, 0.0, math.inf
 
 
 @kernel
 def piece_at(plan, now, v):
-    """Return a plan's acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops then."""
+    """Return a plan's acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops then.
+
+    ``plan``: see the module. ``v``: the vehicle's present speed (m/s).
+    """
     k = 0
     while now >= plan[k + 1]:
         k += 2

@@ -26,7 +26,7 @@ class Chains(NamedTuple):
 
 
 def cut_chains(recording: Recording, vehicles: int) -> Chains:
-    """Return the chains of a recording, ordered by time and by the front vehicle of the queue.
+    """Return the chains of ``vehicles`` vehicles in a recording, ordered by time and by the queue's front vehicle.
 
     The first chain of a queue begins with its front vehicle, the next one directly behind it, and so on. Raises
     ``InvalidInput`` if too many vehicles have faulty data.

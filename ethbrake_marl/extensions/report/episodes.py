@@ -24,7 +24,7 @@ TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
 
 
 def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
-    """Choose at most ``MOST_WORLDS`` worlds to show; return row -> why it is shown."""
+    """Choose at most ``MOST_WORLDS`` worlds in which to show the agent ``focus``; return row -> why it is shown."""
     result, column = compared.result, COLUMN[compared.harm_count]
     cost, known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
 
@@ -47,7 +47,7 @@ def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
 
 
 def worst_rows(compared: Compared, focus: str) -> Ints:
-    """Return at most ten rows in which an agent did worst, by what agents minimise, minus the best known if any."""
+    """Return at most ten rows in which ``focus`` did worst, by what agents minimise, minus the best known if any."""
     result, count, known = compared.result, compared.harm_count, BestKnown.of(compared.result)
     best = 0.0 if known is None else known.harm.get(count, 0.0)
     value = result[focus][COLUMN[count]] - best
@@ -62,7 +62,8 @@ def largest(value: Floats, among: Bools) -> Ints:
 def episodes_section(compared: Compared, focus: str, kinds: dict[int, str]) -> Section:
     """Let every team drive the worlds ``kinds`` (row -> why it is shown) again, and return a player of these episodes.
 
-    A note names each agent that drove differently in these episodes than in the evaluation.
+    ``focus``: the agent that the page is about. A note names each agent that drove differently in these episodes than
+    in the evaluation.
     """
     rows, worlds, (_, game) = [*kinds], compared.worlds(kinds), open_game(compared.scenario)
     records = {agent: record_episodes(worlds, team, game, SAMPLE_S) for agent, team in compared.teams.items()}

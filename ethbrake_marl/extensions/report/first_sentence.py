@@ -21,7 +21,7 @@ WORDS = {  # count -> verb, noun, and what is counted
 
 
 def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
-    """Return the page's first sentence: an agent's harm compared with full braking.
+    """Return the page's first sentence: the harm of the agent ``focus`` compared with full braking.
 
     It names the tests in which the agent does about as much harm as full braking, or more. ``tests``: title -> results
     of the same agents in another test.

@@ -27,7 +27,7 @@ MOST_SHOWN = 3  # agents that are shown at the start
 def player(
     compared: Compared, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
 ) -> Markup:
-    """Return the player of some worlds. It shows ``focus`` and the last agent first.
+    """Return the player of some worlds. It shows ``focus``, the agent that the page is about, and the last agent first.
 
     ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, with
     samples ``SAMPLE_S`` apart.
@@ -77,9 +77,10 @@ def episode_data(record: EpisodeRecord) -> dict[str, Any]:
 def pieces_of(record: EpisodeRecord) -> Floats:
     """Return the motion as pieces of constant acceleration, [k, 1 + 3 N].
 
-    A piece: the time at which it begins (s), place of Vehicle 1 (m), gaps (m), speeds (m/s), accelerations (m/s2). An
-    impact between two samples ends a piece; the next one leads from there to the second sample. If something else
-    happens there as well, such as another impact, places are wrong by millimetres until the second sample.
+    The columns of a piece: the time at which it begins (s), place of Vehicle 1 (m), N - 1 gaps (m), N speeds (m/s), N
+    accelerations (m/s2). An impact between two samples ends a piece; the next one leads from there to the second
+    sample. If something else happens there as well, such as another impact, places are wrong by millimetres until the
+    second sample.
     """
     time_s, speeds, N = record.time_s, record.speeds_mps, record.speeds_mps.shape[1]
     rates = np.zeros_like(speeds)
@@ -97,7 +98,7 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 
 
 def moved(pieces: Floats, t: Floats, N: int) -> Floats:
-    """Return pieces of motion (``pieces_of``, without their times) ``t`` seconds after their beginning."""
+    """Return pieces of motion of N vehicles (``pieces_of``), without times, ``t`` [k] seconds after they begin."""
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
     gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]

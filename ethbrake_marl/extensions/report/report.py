@@ -99,7 +99,7 @@ def measured(agents: SummaryTable) -> list[Markup]:
 
 
 def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
-    """Return the ten worlds in which an agent did worst. Those that the player shows have a button."""
+    """Return the worlds in which ``focus`` did worst, at most ten. Those that the player shows have a button."""
     result, known, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}

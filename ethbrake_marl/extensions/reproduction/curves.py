@@ -39,7 +39,10 @@ EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "PPO, not
 
 
 def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy under a reading of the paper's text, [n]."""
+    """Return the first-impact harm of each strategy under a reading of the paper's text: strategy -> [n] m2/s2.
+
+    ``policies``: name -> agent name. What E-V2X-BM predicts and, for exact impacts, the proven bound are included.
+    """
     found = strategies(reading, episodes, policies)
     lines = {name: each["first"] for name, each in found.items()} | {EXPECTED: found[E_V2X_BM][PREDICTED]}
     return lines | ({PROVEN: least_harm(reading, episodes)} if reading.step_s is None else {})
@@ -48,7 +51,7 @@ def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> di
 def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[str, Floats]:
     """Return the harm in the paper's fixed-step map, with policies trained as in the paper: strategy -> [seeds, n].
 
-    Empty without such trainings.
+    In m2/s2. Strategies without a policy have [n]. Empty without such trainings.
     """
     found = of_the_process(reading, episodes, settings)
     trained = {name: np.stack([seed[name]["first"] for seed in seeds]) for name, seeds in found.items()}
@@ -56,7 +59,7 @@ def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[s
 
 
 def estimate(line: Floats, rows: Floats) -> Estimate:
-    """Return the mean harm in some worlds, with a 95 % interval.
+    """Return the mean of the harm ``line``, [n] or [seeds, n], in the worlds ``rows``, with a 95 % interval.
 
     The interval is over the worlds or, if there are several seeds, over the seeds.
     """
@@ -78,7 +81,8 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequence[str], x_label: str) -> Made:
     """Return a figure of mean harm, with a panel for each reading of the paper, and a table for each.
 
-    ``shown``: strategies that the figure shows.
+    ``readings``: name of the reading -> ``Groups`` of worlds. ``shown``: strategies that the figure shows. ``stem``: of
+    its file's name.
     """
     estimates = {
         reading: {
@@ -155,7 +159,7 @@ ONE = (("gaps_m", (7.0, 7.0)), ("speeds_mps", (20.0, 18.0, 20.0)))  # the world 
 
 
 def reproduce_delays(settings: Settings) -> Made:
-    """Reproduce the harm at three delays, of our choice, in the single world of the paper's figure."""
+    """Reproduce the harm at three delays, which we chose, in the single world of the paper's figure."""
     groups, trained, one = {}, {}, np.array([True])
     for delay in DELAYS:
         reading = STATED._replace(base=f"paper-delay-{delay}", others=ONE)

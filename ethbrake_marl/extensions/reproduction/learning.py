@@ -59,7 +59,7 @@ def is_finished(run: Path) -> bool:
 
 
 def trained(folder: Path, group: str) -> dict[str, list[Path]]:
-    """Return the finished trainings of a group: recipe -> folder for each seed.
+    """Return the finished trainings of a group of trainings (such as ``RANDOM``): recipe -> folder for each seed.
 
     Recipes with an unfinished training are left out.
     """
@@ -106,7 +106,10 @@ def unconverged(folder: Path) -> str:
 
 
 def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
-    """Return the policies trained as in the paper: name -> one agent name per seed. Empty without ``settings.full``."""
+    """Return the policies trained as in the paper, of one ``group`` of trainings: name -> one agent name per seed.
+
+    Empty without ``settings.full``.
+    """
     runs = trained(settings.folder, group) if settings.full else {}
     return {
         name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
@@ -129,7 +132,7 @@ class Course(NamedTuple):
 
     @property
     def values(self) -> Floats:
-        """Returns of the training episodes, [seeds, k]."""
+        """Returns of the training episodes, [seeds, k], at k values of the progress."""
         return np.array([[*each.values()] for each in self.returns])
 
     @property
@@ -242,7 +245,11 @@ def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Clai
 
 
 def faster(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
-    """Return the claim that SAC converges faster. The paper's axis is the progress of trainings of unknown length."""
+    """Return the claim that SAC converges faster, as undecided.
+
+    The paper's axis is the progress of trainings of unknown length. ``courses``: name -> learning curves.
+    ``by_decisions``: the claim, judged by the number of decisions.
+    """
     ends = {name: (course.converged.mean(), course.decisions) for name, course in courses.items()}
     text = ", ".join(f"{name} after {at:,.0f} of {whole:,.0f} decisions" for name, (at, whole) in ends.items())
     why = f"in decisions or in % of the training? The lengths are ours: {text} is at nine tenths of its rise"

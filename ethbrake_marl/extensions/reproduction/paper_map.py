@@ -105,8 +105,8 @@ def sample(state: State, step_s: float) -> State:
 def collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
     """Return the paper's r_collision: minus ``k_energy w^2`` of every pair that overlaps at the sample, [n].
 
-    w is the closing speed before the impacts of the sample. A pair counts at each sample of its overlap, also while it
-    separates: the paper's Gamma asks for the gap alone.
+    w is the closing speed before the impacts of the sample, the state ``before``; ``step`` and ``after`` are unused. A
+    pair counts at each sample of its overlap, also while it separates: the paper's Gamma asks for the gap alone.
     """
     speed, gap = before.line[:, SPEED], before.line[:, GAP]
     closing = np.diff(speed[:, 1:], axis=1)

@@ -69,7 +69,7 @@ def estimate(row: str, reading: Reading, episodes: int, spec: str) -> tuple[Esti
 def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
     """Return collisions and harm (m2/s2) of each world, [n] each, as a reading of the paper reports them.
 
-    ``row``: strategy; ``spec``: agent name of the policy in a hybrid.
+    ``row``: strategy (a row of the table). ``spec``: agent name of the policy in a hybrid.
     """
     worlds, counted = reading.only(*WORLDS), reading.counted
     if row == NON_E:
@@ -90,13 +90,19 @@ def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple
 
 
 def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str = "first") -> Outcome:
-    """Return the outcome of the policy where its harm is at most ``bound`` (H*, [n] m2/s2), else that of E-V2X-BM."""
+    """Return the outcome of the policy where its harm is at most ``bound`` (H*, [n] m2/s2), else that of E-V2X-BM.
+
+    ``baseline``: outcome of E-V2X-BM. ``counted``: ``first`` or ``total``, the harm that is compared.
+    """
     follows = policy[counted] <= bound
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
 
 
 def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
-    """Return collisions and harm, [n] each: as they happened, or as they were predicted at the alert."""
+    """Return collisions and harm, [n] each: as they happened, or as they were predicted at the alert.
+
+    ``numbers`` says which: ``realised``, ``predicted``, or ``predicted harm, realised collisions``.
+    """
     if numbers == "predicted":
         return predicted > 0.0, predicted
     return collided, predicted if numbers == "predicted harm, realised collisions" else harm
@@ -112,7 +118,8 @@ def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
 def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> Outcome:
     """Simulate full braking of all vehicles or, with ``plans``, Vehicle 2 with the deceleration of E-V2X-BM.
 
-    After an impact vehicles brake on, or coast from the next decision on, or the episode ends.
+    ``worlds`` and ``plans`` are readings: of the simulated worlds, and of those for which E-V2X-BM plans. After an
+    impact, by ``after_impact``, vehicles brake on, or coast from the next decision on, or the episode ends.
     """
     if after_impact != "brakes on" and worlds.step_s is None:
         worlds = worlds._replace(others=(*worlds.others, ("time_step_s", SHORT_STEP_S)))
@@ -134,9 +141,10 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
 
 @cache
 def plan(plans: Reading, episodes: int) -> Choice:
-    """Return the deceleration that E-V2X-BM chooses by the paper's closed form, without restitution and time steps.
+    """Return the deceleration that E-V2X-BM chooses under the reading ``plans``, [n], and the harm that it predicts.
 
-    If several decelerations do the same least harm, the reading says which is taken: the smallest, middle or largest.
+    It uses the paper's closed form, without restitution and time steps. If several decelerations do the same least
+    harm, the reading says which is taken: the smallest, middle or largest.
     """
     latencies = () if plans.plans_as_stated else ("acts_s", "rear_s")
     _, _, alert = opened(plans.only("base", "others", "seed", *latencies), episodes)
@@ -156,7 +164,10 @@ def plan(plans: Reading, episodes: int) -> Choice:
 
 @cache
 def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> Outcome:
-    """Simulate an agent as Vehicle 2, without warning if it is a policy trained for other worlds."""
+    """Simulate the agent ``spec`` as Vehicle 2 under the reading ``worlds``; return the outcome.
+
+    ``counted``: harm that the agent minimises. There is no warning if it is a policy trained for other worlds.
+    """
     scenario, game, alert = opened(worlds, episodes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Unfamiliar)

@@ -66,7 +66,7 @@ NEAREST = STATED._replace(
 
 
 def readings_of(grid: Grid) -> Iterator[Reading]:
-    """Yield all readings of the paper in a grid, except those with the coupled H* in the paper's map."""
+    """Yield all readings in a grid, field -> values, except those with the coupled H* in the paper's map."""
     for values in product(*grid.values()):
         reading = STATED._replace(**dict(zip(grid, values, strict=True)))
         if reading.step_s is None or reading.hybrid != "realised, by the coupled H*":

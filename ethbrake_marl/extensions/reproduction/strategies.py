@@ -55,7 +55,7 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
 def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[str, list[dict[str, Outcome]]]:
     """Return the outcomes of policies trained as in the paper, alone and in the hybrid, in the paper's fixed-step map.
 
-    Policy -> for each seed, outcomes of all strategies.
+    Policy -> for each seed, strategy -> outcome. Empty without such trainings.
     """
     mapped = reading._replace(step_s=MAP_STEP_S)
     return {

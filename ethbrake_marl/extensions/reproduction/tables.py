@@ -109,7 +109,10 @@ def number_claims(
 
 
 def outcomes_sheet(title: str, found: Mapping[str, Outcome], least: Floats) -> Sheet:
-    """Return a table of the strategies' collision rates and harm. ``least`` [n] m2/s2: proven lower bound."""
+    """Return a table of collision rates and harm. ``found``: strategy -> outcome.
+
+    ``least`` [n] m2/s2: proven lower bound.
+    """
     rows = [
         (
             *(name, rate(each["collided"]), mean(each["first"]), mean(each["total"])),
@@ -159,9 +162,10 @@ def fewer(found: Mapping[str, Outcome], smaller: str, *larger: str) -> list[Less
 
 
 def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: str, larger: str) -> list[Less]:
-    """Compare two strategies over the seeds of policies trained as in the paper.
+    """Compare the harm and collisions of two strategies over the seeds of policies trained as in the paper.
 
-    ``{}`` in the strategies' names stands for the policy's name.
+    ``process``: policy -> for each seed, strategy -> outcome. ``{}`` in the strategies' names ``smaller`` and
+    ``larger`` stands for the policy's name.
     """
     parts = []
     for name, seeds in process.items():
@@ -173,7 +177,10 @@ def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: 
 
 
 def conclusions(found: Mapping[str, Outcome], policies: Iterable[str]) -> dict[str, list[Less]]:
-    """Return the paper's conclusions from its table: statement -> the comparisons that must hold."""
+    """Return the paper's conclusions from its table: statement -> the comparisons that must hold.
+
+    ``found``: strategy -> outcome.
+    """
     hybrids = [f"Hybrid {name}" for name in policies]
     baselines = [name for name in (E_V2X_BM, COUPLED) if name in found]
     return {

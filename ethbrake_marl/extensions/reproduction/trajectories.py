@@ -42,7 +42,7 @@ def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Recor
 def road_figure(records: Records, caption: str) -> Figure:
     """Draw the vehicles along the road in four episodes, one row for each vehicle, with an arrow every second.
 
-    Dashed lines join equal times.
+    ``records``: (policy, scenario number) -> episode. Dashed lines join equal times.
     """
     figure, panels = new_panels((10.0, 4.8), 2, 2, sharex=True, sharey=True)
     for axes, ((name, number), record) in zip(panels, records.items(), strict=True):
@@ -76,7 +76,8 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 def all_records(settings: Settings) -> dict[str, Records]:
     """Return recorded episodes under the paper's parameters as stated, and in the reading nearest to its results.
 
-    After trainings by the paper's own recipes, also the episodes of their first seed.
+    Reading -> (policy, scenario number) -> episode. After trainings by the paper's own recipes, also the episodes of
+    their first seed.
     """
     policies = tuple(settings.policies.items())
     found = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
@@ -167,7 +168,8 @@ def reproduce_accelerations(settings: Settings) -> Made:
 def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
     """Return a recorded quantity under PPO, and under SAC at the same times; a finished episode keeps its last value.
 
-    ``what``: attribute of ``EpisodeRecord``; ``column``: vehicle or pair, from 0.
+    ``number``: the paper's Scenario 1 or 2. ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair, from
+    0.
     """
     pair = [records[name, number] for name in ("PPO", "SAC")]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
@@ -175,7 +177,10 @@ def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
 
 
 def apart(records: Records, number: int, what: str) -> float:
-    """Return the root mean square over time of the difference between PPO and SAC, for Vehicle 2."""
+    """Return the root mean square over time of the difference between PPO and SAC, for Vehicle 2.
+
+    ``number``: the paper's Scenario 1 or 2. ``what``: attribute of ``EpisodeRecord``.
+    """
     one, other = both(records, number, what, VEHICLE_2)
     return float(np.sqrt(np.mean((one - other) * (one - other))))
 

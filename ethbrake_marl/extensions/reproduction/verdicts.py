@@ -55,7 +55,10 @@ def chance(ours: Estimate) -> float:
 
 
 def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) -> Outcome:
-    """Compare a printed number (not 0) with ours. ``least``: proven lower bound for all strategies."""
+    """Compare a printed number (not 0) with ours; the outcomes are explained in the module.
+
+    ``least``: proven lower bound for all strategies.
+    """
     if least is not None and least.value - printed > chance(least):
         return "cannot be"
     if abs(ours.value - printed) <= TOLERANCE * abs(printed):
@@ -82,9 +85,10 @@ class Less(NamedTuple):
 
 
 def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, Outcome, str]:
-    """Judge a statement of the paper: in how many comparisons it holds, the outcome, and the comparisons that fail.
+    """Judge a statement of the paper, that some quantities are smaller than others.
 
-    If none fails, the closest comparison is returned instead.
+    Return in how many comparisons (``parts``) it holds, the outcome, and the comparisons that fail or, if none does,
+    the closest one. ``show``: how their numbers are written.
     """
     compared = [part for part in parts if not part.both_are_0]
     failing = [part for part in compared if not part.holds]
@@ -105,7 +109,7 @@ def judge(
 ) -> Claim:
     """Compare a statement of the paper with our results as stated and in the nearest reading.
 
-    ``why``: the reason to show if they differ.
+    ``where`` and ``paper``: place and words of the statement. ``why``: the reason to show if they differ.
     """
     ours, outcome, numbers = judge_statement(stated, show)
     other = judge_statement(nearest, show)[0] if nearest else ""

@@ -39,7 +39,7 @@ class Memory(NamedTuple):
 class Planner:
     """Agent that chooses all its commands at the alert and then gives them, assuming that other learners brake fully.
 
-    If they do, ``predicted_harm`` is the harm that happens, to the last bit.
+    If they do, its memory's ``predicted_harm`` is the harm that happens, to the last bit.
     """
 
     knows = MODEL
@@ -55,7 +55,7 @@ class Planner:
         return Memory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Return commands at every decision, [n, T] m/s2, and their cost, [n] m2/s2."""
+        """Return vehicle ``body``'s commands at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
         raise NotImplementedError
 
     def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
@@ -128,7 +128,7 @@ class Searched(Planner):
 
 
 def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
-    """Return a game in which only vehicle ``body`` learns while other learners brake fully, and its worlds.
+    """Return the game with ``body`` as its only learner, while other learners brake fully, and its worlds at the alert.
 
     Raises ``InvalidInput`` if an agent drives another vehicle, because its commands are not known at the alert.
     """

@@ -111,7 +111,7 @@ def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
 
 
 def joined(parts: Sequence[Profiles], n: int) -> Profiles:
-    """Join lists of profiles, each [n * q], into [n * Q]: first all profiles of world 0, and so on."""
+    """Join lists of profiles, each [n * q] (q may differ), into [n * Q]: first all Q profiles of world 0, and so on."""
     short = [part.shortened() for part in parts]
     ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in short], axis=1)
     B = parts[0].commands_mps2.shape[2]

@@ -26,10 +26,10 @@ WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # steps by which the second cha
 
 
 def extreme_profiles(problem: Problem) -> Profiles:
-    """Return the best extreme profiles of one controlled vehicle, [n * KEPT]: first those of world 0, and so on.
+    """Return the best profiles of full driving and full braking for one controlled vehicle, [n * KEPT], world by world.
 
-    The meetings are computed as if the neighbours braked fully. In worlds without neighbours, or with a vehicle that
-    moves backward, the profiles coast.
+    The meetings with its neighbours are computed as if these braked fully. In worlds without neighbours, or with a
+    vehicle that moves backward, the profiles coast.
     """
     (body,), n, last = problem.bodies.tolist(), problem.n, problem.last_step
     at, random = rows_of(problem.state, body), seeded(problem.identity, 0)
@@ -59,7 +59,11 @@ def extreme_profiles(problem: Problem) -> Profiles:
 
 @large
 def meeting_of(at, kind, change):
-    """Return when (s) a vehicle that changes its command at ``change`` (s) meets its neighbour; infinite: never."""
+    """Return when (s) a vehicle that changes its command at ``change`` (s) meets its neighbour; infinite: never.
+
+    ``kind`` 0 first drives, then meets the front vehicle; 1 first brakes, then meets the rear vehicle. ``at``: one
+    world (``proofs.line``).
+    """
     return meet_front(at, change) if kind == 0 else meet_rear(at, change)
 
 
@@ -67,8 +71,11 @@ def meeting_of(at, kind, change):
 def write_extreme(kind, change, meeting, early, share, step, last, low, high, ends, commands):
     """Write the extreme profile that changes its command at ``change`` (s) and at ``meeting`` (s).
 
-    ``kind`` 0 drives, brakes and drives; 1 brakes, drives and brakes. Commands can change only between steps: in the
-    step of a change the command is the mean of both, so that the speed after the step is exact.
+    It is written to ``ends`` [5] and ``commands`` [5, 1]. ``kind`` 0 drives, brakes and drives; 1 brakes, drives and
+    brakes. Commands can change only between steps of ``step`` s: in the step of the first change the command is the
+    mean of both, so that the speed after the step is exact. The second change is ``early`` steps earlier, with the
+    ``share`` of the last command in its step. ``last``: last step. ``low``, ``high``: full braking and full driving
+    (m/s2).
     """
     first, second = (high, low) if kind == 0 else (low, high)
     turn = int(min(change / step, float(last)))

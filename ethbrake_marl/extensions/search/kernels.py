@@ -71,7 +71,10 @@ class Field(NamedTuple):
 
 @kernel
 def value_of(world, line):
-    """Return what the search minimises (m2/s2), plus a little of the other count of harm, which decides ties."""
+    """Return what the search minimises (m2/s2), plus a little of the other count of harm, which decides ties.
+
+    ``world``: a ``World``. ``line`` [LINE_ROWS, N + 1]: the present state of its bodies.
+    """
     aim = world.numbers[AIM]
     return worth(line, world.shares, world.weights[0], aim) + OTHER_WEIGHT * amount_so_far(line, world.weights[1])
 
@@ -87,9 +90,10 @@ def move_line(line, into):
 def follow(world, lines, ends, commands, phase, most):
     """Simulate a profile from ``phase`` on; return its value (m2/s2), and the number of phases until the end.
 
-    Starts from ``lines[phase]`` and writes the state after phase p to ``lines[p + 1]``. Ends when all vehicles are at
-    rest, or the value reaches ``most`` (m2/s2). The number of phases is -1 if a check of the physics fails. Step by
-    step the result has the bits of the episode; phase by phase it is several times faster and rounds differently.
+    ``world`` is a ``World``. ``ends`` [K], ``commands`` [K, B]: the profile. Starts from ``lines[phase]`` and writes
+    the state after phase p to ``lines[p + 1]``. Ends when all vehicles are at rest, or the value reaches ``most``
+    (m2/s2). The number of phases is -1 if a check of the physics fails. Step by step (``STEPWISE``) the result has the
+    bits of the episode; phase by phase it is several times faster and rounds differently.
     """
     numbers, clock = world.numbers, world.clock
     value = value_of(world, lines[phase])
@@ -117,7 +121,7 @@ def follow(world, lines, ends, commands, phase, most):
 
 @large
 def draw(random):
-    """Return the next random number in [0, 1) of a splitmix64 generator."""
+    """Return the next random number in [0, 1) of a splitmix64 generator, whose state is ``random`` [1]."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -144,7 +148,10 @@ def allowed(command, low, high):
 
 @large
 def draw_command(world, b):
-    """Return a random command (m/s2) of vehicle b; likely are full braking, full driving, 0, and the command ahead."""
+    """Return a random command (m/s2) of the controlled vehicle number ``b`` of a ``World``.
+
+    Likely are full braking, full driving, 0, and the command of the vehicle ahead.
+    """
     random, body, low, high = world.random, world.bodies[b], world.bounds[b, 0], world.bounds[b, 1]
     u = draw(random)
     if u < 0.35:
@@ -160,10 +167,10 @@ def draw_command(world, b):
 
 @large
 def draw_profile(world, drawing, ends, commands):
-    """Draw a random profile; return its number of phases.
+    """Write a random profile to ``ends`` [K] and ``commands`` [K, B]; return its number of phases.
 
-    It has six phases of random commands, mostly short ones. A plan has three: often full braking, another command for a
-    while, and full braking.
+    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. A profile has six phases of random commands,
+    mostly short ones. A plan has three: often full braking, another command for a while, and full braking.
     """
     random, bounds, last = world.random, world.bounds, int(world.clock[LAST])
     if drawing[KIND] == PLAN:
@@ -188,7 +195,10 @@ def draw_profile(world, drawing, ends, commands):
 
 @large
 def draw_change(world, active, drawing, change):
-    """Draw a random change of one of the first ``active`` phases of a profile. Amounts are log-uniform."""
+    """Write a random change of one of the first ``active`` phases of a profile to ``change`` [CHANGE].
+
+    ``world`` is a ``World``, ``drawing`` [DRAWING] says how to draw. Amounts are log-uniform.
+    """
     random, bounds = world.random, world.bounds
     if drawing[KIND] == PLAN:
         low, high = bounds[0, 0], bounds[0, 1]
@@ -217,7 +227,7 @@ def draw_change(world, active, drawing, change):
 
 @large
 def apply_change(change, bounds, ends, commands):
-    """Change a profile in place; return whether it is now different."""
+    """Apply ``change`` [CHANGE] to a profile, within ``bounds`` [B, 2]; return whether the profile is now different."""
     what, b, p, amount = int(change[WHAT]), int(change[VEHICLE]), int(change[PHASE]), change[AMOUNT]
     low, high, phases = bounds[b, 0], bounds[b, 1], ends.shape[0]
     begin, changed = ends[p - 1] if p > 0 else 0, False
@@ -264,7 +274,9 @@ def largest(values):
 def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
     """Fill ``field`` with the best of the given profiles [Q, K] and of ``drawn`` random ones, in any order.
 
-    Of profiles whose values differ by less than ``same`` (m2/s2), only the first is kept.
+    ``phases`` [Q]: their numbers of phases. Of profiles whose values differ by less than ``same`` (m2/s2), only the
+    first is kept. ``world``, ``room``, ``field``: a ``World``, ``Room``, ``Field``. ``drawing``: as for
+    ``draw_profile``.
     """
     worst, number = 0, ends.shape[0]
     begin = min(worst, number)  # 0, but no literal: numba would compile the physics again for it
@@ -294,8 +306,10 @@ def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
 def improve(world, room, ends, commands, budget, drawing, least):
     """Improve a profile in place by at most ``budget`` random changes, until its value is at most ``least``.
 
-    Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its episode ends. A
-    change that helps is tried again with twice the amount. A change without effect costs no budget, except in plans.
+    ``world``, ``room``: a ``World``, ``Room``. ``ends`` [K], ``commands`` [K, B]: the profile. ``drawing``: as for
+    ``draw_profile``. Returns its value (m2/s2), infinite if it cannot be simulated, and the number of phases until its
+    episode ends. A change that helps is tried again with twice the amount. A change without effect costs no budget,
+    except in plans.
     """
     change, lines, tried = room.change, room.lines, room.tried
     value, active, spent, phase, again = math.inf, 0, -1, 0, False
@@ -329,7 +343,7 @@ def improve(world, room, ends, commands, budget, drawing, least):
 
 @large
 def try_all(world, room, ends, commands, values):
-    """Write the value of every profile [Q, K] to ``values`` [Q]; infinite if it cannot be simulated."""
+    """Write the value of every profile [Q, K] in a ``World`` to ``values`` [Q]; infinite if it cannot be simulated."""
     begin = min(0, ends.shape[0])  # no literal, as in `gather`
     for q in range(ends.shape[0]):
         value, reached = follow(world, room.lines, ends[q], commands[q], begin, math.inf)

@@ -43,7 +43,10 @@ def _why_unknown(scenario: str) -> str:
 
 
 def best_known(game: Game, alert: State, last: State) -> Given:
-    """Least harm (honest: least honest cost) of the world in a shipped table, found by a search or an agent."""
+    """Least harm (honest: least honest cost) of the world in a shipped table, found by a search or an agent.
+
+    The result is the same for every agent.
+    """
     return least(game, alert)
 
 

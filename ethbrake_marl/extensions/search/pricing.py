@@ -64,13 +64,13 @@ class Profiles(NamedTuple):
         return Profiles(self.ends[rows], self.commands_mps2[rows])
 
     def stepwise(self, decisions: int) -> Floats:
-        """Return the commands after each of the first decisions, [n, decisions, B] m/s2."""
+        """Return the commands at each of the first ``decisions`` decisions, [n, decisions, B] m/s2."""
         phase = (self.ends[:, np.newaxis] <= np.arange(decisions)[:, np.newaxis]).sum(axis=2)
         phase = np.minimum(phase, self.ends.shape[1] - 1)
         return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
 
     def shortened(self) -> Profiles:
-        """Return profiles with ``MOST_PHASES`` phases. A longer one is replaced by its first command, held."""
+        """Return profiles with ``MOST_PHASES`` phases. A longer one becomes its first command, held throughout."""
         ends, commands = Profiles.padded([self], MOST_PHASES)[0]
         fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
         ends = np.where(fits[:, np.newaxis], ends[:, :MOST_PHASES], ends[:, -1:])
@@ -78,7 +78,10 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def of_steps(commands_mps2: Floats, last_step: Ints) -> Profiles:
-        """Return profiles with one phase for each decision, from commands [n, T, B] and ``last_step`` [n]."""
+        """Return profiles with one phase for each decision, from commands [n, T, B].
+
+        ``last_step`` [n]: number of decisions before the horizon.
+        """
         ends = np.minimum(np.arange(1, commands_mps2.shape[1] + 1), last_step[:, np.newaxis])
         return Profiles(ends, np.ascontiguousarray(commands_mps2))
 
@@ -100,7 +103,7 @@ class Profiles(NamedTuple):
 
 
 def best_of(found: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
-    """Return the least of several harms [n] in each world, and its profile [n]; of equal ones, the first."""
+    """Return the least of several harms [n] in each world, and its profile. ``found``: pairs; ties: the first."""
     harms = np.stack([harm for harm, _ in found])
     pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
     every = Profiles.padded([profiles for _, profiles in found])
@@ -188,13 +191,13 @@ class Problem(NamedTuple):
         return State(line, car, clock, know, wanted, memories)
 
     def value(self, last: State, count: str | None = None) -> Floats:
-        """Return what the search minimises in episodes that end in ``last``, [n] m2/s2. ``count``: another count."""
+        """Return what the search minimises if episodes end in ``last``, [n] m2/s2; if given, in another ``count``."""
         value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
         worths(last.line, self.shares, weights, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:
-        """Return what the search minimises if the vehicles follow ``profiles``: count of harm -> [n] m2/s2."""
+        """Return the ``value`` in each count of harm if the vehicles follow ``profiles``: count -> [n] m2/s2."""
         last = self.follow(profiles)
         return {count: self.value(last, count) for count in COUNTS}
 
@@ -212,7 +215,7 @@ class Problem(NamedTuple):
         return self._replace(shares=shares, aim=LARGEST if largest else WEIGHTED)
 
     def check(self, profiles: Profiles) -> None:
-        """Raise ``InvalidInput`` for profiles that do not fit the worlds, or exceed a vehicle's capacity."""
+        """Raise ``InvalidInput`` for profiles of a wrong shape, wrong ends, or commands beyond a vehicle's capacity."""
         K, B = profiles.ends.shape[-1], len(self.bodies)
         if profiles.ends.shape != (self.n, K) or profiles.commands_mps2.shape != (self.n, K, B):
             raise InvalidInput(
@@ -278,8 +281,8 @@ def problem_of(
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
     """Return a hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
-    Hashed are the world, the commands of all other vehicles, which vehicles are controlled, and ``times`` [n, 4]: first
-    decision, time step, number of steps, horizon.
+    Hashed are the world, the commands of all other vehicles, which vehicles are controlled (``bodies``), and ``times``
+    [n, 4]: first decision, time step, number of steps, horizon.
     """
     line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)
     controlled = np.zeros(alert.wanted.shape)
@@ -300,9 +303,10 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
 
 
 def aimed(problem: Problem, objective: Declared) -> Problem:
-    """Return the problem with the objective of the controlled vehicles.
+    """Return the problem with ``objective``, as under a scenario's key, as what its search minimises.
 
-    Raises ``InvalidInput`` if the objective is neither a weighted sum of harm nor ``maximin``, or differs among them.
+    Raises ``InvalidInput`` if the controlled vehicles' objective is neither a weighted sum of harm nor ``maximin``, or
+    differs among them.
     """
     car, chosen = problem.state.car, [body - 1 for body in problem.bodies.tolist()]
     objectives = objectives_of(objective, problem.state.vehicles)
@@ -322,7 +326,11 @@ def aimed(problem: Problem, objective: Declared) -> Problem:
 
 @kernel
 def worth(line, shares, weights, aim):
-    """Return what a search minimises (m2/s2) in one world. It never decreases during an episode."""
+    """Return what a search minimises (m2/s2) in one world. It never decreases during an episode.
+
+    ``line`` [LINE_ROWS, N + 1]: the present state. ``shares`` [3, N + 1], ``aim``: as in ``Problem``. ``weights`` [6]:
+    of the count of harm.
+    """
     if aim == WHOLE:
         return amount_so_far(line, weights)
     value, from_ahead = 0.0, 0.0
@@ -345,7 +353,10 @@ def worths(line, shares, weights, aim, out):
 
 @large
 def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, horizon_s, scratch, failed):
-    """Simulate every profile in place, decision by decision. ``failed`` [n]: a check of the physics failed."""
+    """Simulate every profile in place, decision by decision. ``failed`` [n]: a check of the physics failed.
+
+    ``line``, ``car``, ``clock``, ``wanted``: as in ``State``. ``ends``, ``commands``: as in ``Profiles``.
+    """
     for k in range(len(failed)):
         phase = 0
         while clock[k, ENDED] == 0.0:

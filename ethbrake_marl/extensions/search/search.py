@@ -68,6 +68,8 @@ def search_profiles(
 def search_world(world: World, room: Room, given: Profiles, last: int, budget: int) -> Profiles | None:
     """Return the best profile of one world, [1]; None if no profile can be simulated.
 
+    ``given``: profiles that are tried first. ``last``: number of decisions. ``budget``: number of profiles to simulate.
+
     First many profiles are improved in rounds, each of which keeps the better half. Then the phases of the best are
     divided and it is improved again; at last with a step-by-step simulation: where harm jumps, rounding decides how
     large it is.
@@ -108,7 +110,10 @@ def sort(field: Field, left: int) -> None:
 
 
 def compact(ends: Ints, commands: Floats) -> Profiles:
-    """Return a profile [1] without empty phases, with neighbouring phases of equal commands joined."""
+    """Return a profile [1] without empty phases, with neighbouring phases of equal commands joined.
+
+    ``ends`` [K], ``commands`` [K, B] m/s2.
+    """
     there = np.diff(ends, prepend=0) > 0
     ends, commands = ends[there], commands[there]
     changes = (commands[1:] != commands[:-1]).any(axis=1)
@@ -116,7 +121,7 @@ def compact(ends: Ints, commands: Floats) -> Profiles:
 
 
 def divide(field: Field, attention: int) -> None:
-    """Halve phases of the best profile until it has K; always the longest within the first ``attention`` steps."""
+    """Halve phases of a field's best profile until it has K; always the longest in the first ``attention`` steps."""
     used, K = field.phases[0], field.ends.shape[1]
     if used > 0 and field.values[0] > 0.0:
         (ends,), (commands,) = compact(field.ends[0, :used], field.commands[0, :used])
@@ -129,7 +134,7 @@ def divide(field: Field, attention: int) -> None:
 
 
 def select(world: World, room: Room, given: Profiles, field: Field) -> None:
-    """Simulate step by step from now on. Put the best profile of ``field`` and ``given`` first in ``field``."""
+    """Put the best profile of ``field`` and ``given`` first in ``field``; from now on simulate step by step."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
@@ -177,7 +182,7 @@ def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 
 
 
 def seeded(identity: UInt64s, seed: int) -> UInt64s:
-    """Return the initial state of each world's random number generator, [n]."""
+    """Return the initial state of each world's random number generator, [n], from its ``identity`` [n] and the seed."""
     with np.errstate(over="ignore"):
         z = identity ^ np.uint64((int(seed) * 0xD1342543DE82EF95) % 2**64)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -78,9 +78,10 @@ class BestHarmTable:
         return np.where(self.identity[rows] == identity, rows, -1)
 
     def stored(self, problem: Problem, count: str) -> tuple[Floats, Profiles]:
-        """Return the least known harm of the problem's worlds, [n] m2/s2, and its profiles.
+        """Return the least known harm of the problem's worlds, [n] m2/s2, and its profiles, [n].
 
-        A world that is not in the table has infinite harm and the profile of coasting.
+        ``count``: which harm (``episode.counts``). A world that is not in the table has infinite harm and the profile
+        of coasting.
         """
         rows = self.rows(problem.identity)
         known = rows >= 0
@@ -125,7 +126,7 @@ def outdated_tables() -> dict[str, str]:
 def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
     """Return the least harm of each world in the shipped tables, [n] m2/s2, and the commands (profiles) that do it.
 
-    A world that is in no table has infinite harm and coasts.
+    ``count``: which harm (``episode.counts``). A world that is in no table has infinite harm and coasts.
     """
     found = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()
