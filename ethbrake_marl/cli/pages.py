@@ -19,7 +19,7 @@ def register_page(shows: str, write: Callable[..., None]) -> None:
             ``"run"`` (``ethbrake run``).
         write: for ``"evaluation"``, a function of the file's path, the results (``evaluation.compared``) and the
             command; for ``"worlds"``, of the file's path, the scenario, the number of worlds and the seed. For
-            ``"run"`` it returns a ``training.experiment.Report``.
+            ``"run"``, a function that returns a ``training.experiment.Report``; that class says what it does.
 
     """
     PAGES.add(shows, write, lambda other: other is write)

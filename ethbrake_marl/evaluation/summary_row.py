@@ -42,7 +42,7 @@ class SummaryRow:
 
     @property
     def sees_through(self) -> bool:
-        """Whether the team reads values that the V2X channel hides in these worlds."""
+        """Whether the team is omniscient: it reads values that the V2X channel hides in these worlds."""
         return self.hidden_share > 0.0 and any(word in self.knows for word in (STATE, MODEL))
 
     @property

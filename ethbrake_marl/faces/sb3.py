@@ -45,6 +45,7 @@ def make_sb3_vec_env(
 ) -> EthBrakeVecEnv:
     """Return an environment for Stable-Baselines3 with ``n_envs`` worlds, simulated together.
 
+    It has one row for each learner of each world, world by world: ``num_envs`` is ``n_envs`` times the learners.
     ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``.
 
     - ``seed``: seed of the training worlds; None: a random one.

@@ -30,7 +30,7 @@ class Override:
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """Return the setting without its first key, such as ``harm=0.5``."""
+        """Return the setting without its first key: for ``reward.harm=0.5``, ``harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod

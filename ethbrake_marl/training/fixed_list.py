@@ -64,5 +64,5 @@ def mean(values: Floats) -> float:
 
 
 def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
-    """Return the metric that the best policies minimise; NaN if it was not measured."""
+    """Return the value by which a training picks its best policy, less is better; NaN if it was not measured."""
     return metrics.get(OBJECTIVE, metrics.get(COLUMN[harm_count], np.nan))

@@ -36,7 +36,7 @@ class WithLoad(Part):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Values for a ``load`` in [0, 1]; ``u`` draws the spread."""
+        """Return the quantity, [n], for each ``load`` (0 empty, 1 full); ``u``, uniform in [0, 1), draws the spread."""
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
         return moved if self.spread == 0.0 else moved + values(self.spread, u)
@@ -54,7 +54,10 @@ def _own(key: str) -> Any:
 
 
 class VehicleType(Part):
-    """A vehicle type. What it does not declare, the scenario declares outside ``vehicle_types``."""
+    """Masses, capacities, latencies and more of one kind of vehicle.
+
+    What it does not declare, the scenario declares outside ``vehicle_types``.
+    """
 
     weight: Weight = Field(default=1.0, description="how likely this type is, relative to the other types")
     load: Quantity = Field(

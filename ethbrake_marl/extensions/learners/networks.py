@@ -89,7 +89,10 @@ class Averaged(nn.Module):
 
 
 class Memory(nn.Module):
-    """The latest decisions, in buffers, which checkpoints store. ``columns``: name -> zeros shaped like one entry."""
+    """Ring buffer of the latest ``size`` decisions of a training; checkpoints save it.
+
+    ``columns``: name -> a zero tensor with the shape and type of one entry.
+    """
 
     known: Tensor  # number of decisions stored so far; a new one replaces the oldest
 

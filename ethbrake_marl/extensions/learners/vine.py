@@ -38,7 +38,7 @@ class Actor(Averaged):
 
     @torch.no_grad()
     def means(self, observations: Float32s) -> Float32s:
-        """Return the outputs of the network in training, [rows], for observations [rows, F]."""
+        """Return the outputs of the network that is being trained (not of its average), [rows], for [rows, F]."""
         means: Float32s = self.learning(torch.from_numpy(observations))[:, 0].numpy()
         return means
 
@@ -144,9 +144,9 @@ class VineModel(BranchingModel):
 def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
     """Return targets of the actor's outputs, and the weights of the squared errors in the loss, [B] each.
 
-    Let m be the present output and g the gradient. Then ``weight = |g| / radius + anchor`` and ``target = m + g /
-    weight``: the target is less than ``radius`` away, and ``(weight / 2) (output - target)^2`` has the slope ``-g`` at
-    m. An output at or beyond 1 is not moved farther out, because actions are clipped to [-1, 1].
+    Let m be the present output and g the slope of the return at m. Then ``weight = |g| / radius + anchor`` and ``target
+    = m + g / weight``: the target is less than ``radius`` away, and ``(weight / 2) (output - target)^2`` has the slope
+    ``-g`` at m. An output at or beyond 1 is not moved farther out, because actions are clipped to [-1, 1].
     """
     outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))
     gradient = tried.gradient.masked_fill(outward, 0.0)

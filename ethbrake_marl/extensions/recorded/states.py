@@ -76,10 +76,10 @@ def read_recording(file: Path, entry: Format, every_s: float) -> Recording:
 
 
 def moments(times_s: Floats, every_s: float) -> Floats:
-    """Return the number of the moment to which each time belongs, from 0; -1 if to none.
+    """Thin recorded times out to one every ``every_s``: return k of each kept time, -1 of the others (as floats).
 
-    Moment k is the recorded time nearest to ``first + k every_s``, at most half the smallest step between recorded
-    times away. Raises ``InvalidInput`` if ``every_s`` is less than that step.
+    Kept as k is the recorded time nearest to ``min(times_s) + k every_s``, if it is at most half the smallest step
+    between recorded times away. Raises ``InvalidInput`` if ``every_s`` is less than that step.
     """
     recorded, back = np.unique(np.round(times_s - times_s.min(), 6), return_inverse=True)
     step = np.diff(recorded).min(initial=every_s if len(recorded) == 1 else np.inf)

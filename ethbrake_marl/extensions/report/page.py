@@ -51,7 +51,10 @@ def table(sheet: Sheet) -> Markup:
 
 
 def drawing(figure: Figure, title: str, description: str) -> Markup:
-    """Return a figure with a title and a description; its caption becomes text of the page, readable on a phone."""
+    """Return the HTML of a figure, with ``title`` and ``description`` for screen readers.
+
+    The caption moves from the picture to the page, so that a phone can show it.
+    """
     caption = " ".join(figure.get_supxlabel().split())
     figure.supxlabel("")
     svg = base64.b64encode(picture_bytes(figure, "figure.svg")).decode()

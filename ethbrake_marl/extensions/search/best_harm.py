@@ -41,7 +41,7 @@ def best_harm(
     given: Sequence[Profiles] = (),
     objective: Declared = "total",
 ) -> BestHarmTable:
-    """Search worlds at the alert for the profile of least harm; return a table.
+    """Search worlds at the alert for the profile (commands over time) of least harm; return a table.
 
     The harm is at most that of every profile in ``given``, and of one vehicle's best constant deceleration. With
     several vehicles it is at most what the same search reaches with one of them, while the others brake fully. A
@@ -57,9 +57,11 @@ def best_harm(
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
         given: profiles that are tried first, [n] each.
-        objective: what is minimised, as under a scenario's key ``objective``; the table then holds its values.
+        objective: whose harm is minimised, in each count, as under a scenario's key ``objective``; ``total``: the sum
+            over the line. The table holds its values.
 
-    Raises ``InvalidInput`` for other counts, and the errors of ``problem_of`` and ``search_profiles``.
+    Raises ``InvalidInput`` for other counts, bodies or objectives, for a budget below 1 and for physics without exact
+    impacts.
 
     """
     if not counts or not set(counts) <= set(COUNTS) or len(set(counts)) < len(counts):
