@@ -194,7 +194,7 @@ DEFAULT = (
     Measure(
         "honest_cost", partial(harm, "honest"),
         "Total harm, harm that contacts pass on, and a price for pushes, for driving before the first impact and for"
-        " motion at the horizon (``episode.counts``).", "m2/s2",
+        " motion at the horizon (docs/game.md).", "m2/s2",
         (
             Statistic("honest_cost", "mean", "Honest cost", "Honest\ncost"),
             Statistic("honest_cost_difference", "difference"),

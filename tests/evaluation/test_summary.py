@@ -129,7 +129,7 @@ def test_meanings__also_of_measures_without_a_column_and_without_marks() -> None
     told = summarise(eb.evaluate("paper-random", "full_brake", episodes=20, measures="jerk,own", harm_count="honest"))
     meanings = told.meanings()
     assert meanings["jerk"] == "Sum of the term jerk over all steps." and meanings["own"].startswith("What the vehicle")
-    assert "``" not in str(meanings) and "episode.counts" in meanings["Honest cost"]
+    assert "``" not in str(meanings) and "docs/game.md" in meanings["Honest cost"]
 
 
 def test_meanings__are_of_the_column_and_not_only_of_its_measure() -> None:

@@ -15,7 +15,7 @@ from ethbrake_marl.registry import Part
 
 
 def avoidable(game: Game, alert: State, last: State) -> Given:
-    """Whether some commands avoid all contact (proven), [n], and if not, why: ``early``, ``front`` or ``rear``.
+    """Whether some commands avoid all contact (proven), and if not, why: ``early``, ``front`` or ``rear``.
 
     The commands are those of Vehicle 2 of three (or of Vehicles 2 and 3 together) or of either of two vehicles; all
     others brake fully. The result is the same for every agent.
