@@ -104,7 +104,7 @@ _REWARDED: dict[str, TermFunction] = {
 
 def split_names(names: str) -> list[str]:
     """Split a list of names at its commas, but not within an objective such as ``weighted:1,4,1``."""
-    return re.split(r",(?!then:|[\d.][\d.e+-]*(?:,|$))", names)
+    return re.split(r",(?!then:|\s*[\d.][\d.e+-]*(?:,|$))", names)
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:

@@ -212,7 +212,7 @@ def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
         ending = name.removeprefix(measure.name).removeprefix("_")
         own = [each for each in measure.shown if each.ending == ending]
         for each in own or [Statistic(name, "rate" if kind == "b" else "mean")]:
-            if "honest" in each.key and minimised != "honest":  # only in JSON
+            if minimised != "honest" and (measure.name == COLUMN["honest"] or ending == "honest"):  # only in JSON
                 each = each._replace(heading="")
             if kind != "U":
                 shown[each.key] = name, measure, each

@@ -132,6 +132,16 @@ def test_meanings__also_of_measures_without_a_column_and_without_marks() -> None
     assert "``" not in str(meanings) and "docs/game.md" in meanings["Honest cost"]
 
 
+def test_heading__of_a_measure_of_ones_own_is_shown_whatever_its_name(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from ethbrake_marl import Part\nfrom ethbrake_marl.evaluation.measures import Statistic\n\n\n"
+        "def value(game, alert, last):\n    'Nothing.'\n    return alert.time_s\n\n\n"
+        "honest_gap = Part(value, shown=(Statistic('honest_gap', 'mean', 'Honest gap'),))\n"
+    )
+    result = eb.evaluate("paper-random", "full_brake", episodes=3, measures=f"{tmp_path / 'mine.py'}:honest_gap")
+    assert "honest_gap" in summarise(result).sheet().names
+
+
 def test_meanings__are_of_the_column_and_not_only_of_its_measure() -> None:
     told = summarise(eb.evaluate("paper-random", "full_brake", episodes=20, measures="pushed_m")).meanings()
     assert told["Vehicle 1 pushed > 5 m"].startswith("Share of worlds") and "Share" not in told["Vehicle 1 pushed (m)"]
