@@ -191,6 +191,10 @@ class Unfamiliar(UserWarning):
     """A trained policy, or a table of best known harm, was made for other worlds or another physics."""
 
 
+class CacheFault(UserWarning):
+    """The cache of compiled physics code is damaged, or cannot be written, so code is compiled again."""
+
+
 class FreeImpacts(UserWarning):
     """An objective gives some impact no weight, so causing it costs nothing."""
 

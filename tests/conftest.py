@@ -20,7 +20,8 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 }  # fmt: skip
 
 # `installed` comes first: what it finds is what the others, and all processes that they start, find.
-pytest_plugins = [f"tests.fixtures.{name}" for name in ("installed", "pictures", "commands", "registered", "other_law")]
+FIXTURES = ("installed", "kernels", "pictures", "commands", "registered", "other_law")
+pytest_plugins = [f"tests.fixtures.{name}" for name in FIXTURES]
 
 # Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
 typer.main.get_command_from_info = functools.cache(typer.main.get_command_from_info)

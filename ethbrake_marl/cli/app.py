@@ -21,7 +21,7 @@ from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
 from ethbrake_marl.cli.command import Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
-from ethbrake_marl.kernel_store import is_temporary, on_first_compilation
+from ethbrake_marl.kernel_store import obstacle, on_first_compilation
 from ethbrake_marl.registry import OURS, Registry, giver, points
 
 app = typer.Typer(
@@ -148,17 +148,10 @@ def prepare_streams() -> None:
     on_first_compilation(tell_compilation)
 
 
-def tell_compilation(folder: Path, empty: bool) -> None:
-    """Print that numba kernels are being compiled. ``empty``: ``folder``, which stores them, contains none yet."""
-    if is_temporary(folder):
-        what = (
-            "the physics; no folder for compiled kernels is writable, so every command compiles it again (for help:"
-            " ethbrake doctor)"
-        )
-    else:
-        part = "the physics for the first time, which takes a minute" if empty else "parts of the physics"
-        what = f"{part}; later commands use the stored result"
-    Out().note(f"compiling {what}")
+def tell_compilation(is_empty: bool) -> None:
+    """Print that numba kernels are being compiled. ``is_empty``: none are stored yet."""
+    part = "the physics for the first time, which takes a while" if is_empty else "parts of the physics"
+    Out().note(f"compiling {part}{'' if obstacle() else '; later commands use the stored result'}")
 
 
 def abandon_output() -> None:

@@ -1,27 +1,33 @@
-"""How kernels are compiled, and where their machine code is kept.
+"""How kernels are compiled, and how their machine code is stored.
 
 A kernel is a function on arrays of numbers, compiled by numba. Kernels use + - * / sqrt, min, max and comparisons only,
 without fast-math: a world has the same bits in every batch and on every processor.
 
-Numba does not notice when a function that a kernel calls changes. The folder of the machine code is therefore named by
-the digest of the core's kernels, of all kernels beside it, and of those in the folders of extensions that these import.
+Numba's own cache does not notice when a function that a kernel calls changes, and stops programs if its files are
+damaged. A file of machine code is therefore named by the digest of everything that decides it, above all of the sources
+of the core's kernels, of all kernels beside it, and of those in the folders of extensions that these import. Paths and
+times do not count, so all copies of this package share one cache. Code in ``python -OO`` is the same.
 """
 
 from __future__ import annotations
 
 import hashlib
+import pickle
 import re
-import shutil
-import warnings
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import llvmlite
 import numba
-from numba.core import config, event
+from numba.core import event
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
 
-from ethbrake_marl.kernel_store import cache_folder, can_be_trusted, home_folder, is_temporary, tell_compilation
+from ethbrake_marl.kernel_store import load, save, tell_compilation, warn_damaged
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -29,6 +35,7 @@ PACKAGE = Path(__file__).parents[1]
 SOURCES = ("motion", "episode")  # folders with the core's kernels
 _MARK = b"motion.compiling import"  # in every other file with kernels
 _EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE)
+_COMPILER = (numba.__version__, llvmlite.__version__, sys.version_info[:2], sys.abiflags)
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
@@ -44,14 +51,43 @@ class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
 event.register("numba:compile", _Teller())
 
 
+class _Cache(NullCache):  # type: ignore[misc]
+    """The machine code of one kernel for all types of arguments, as numba asks for it."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        code = function.__code__
+        self._name, self._cells = f"{Path(code.co_filename).stem}.{code.co_name}", function.__closure__ or ()
+        place = (function.__module__, function.__qualname__, code.co_firstlineno)
+        self._decided_by = (stamp_of(code.co_filename), *place, *_COMPILER)
+
+    def _file(self, signature: Any, codegen: Any) -> str:
+        values = dumps([cell.cell_contents for cell in self._cells])
+        decided_by = repr((*self._decided_by, signature, values, codegen.magic_tuple()))
+        return f"{self._name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:32]}"
+
+    def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
+        target_context.refresh()
+        name = self._file(sig, target_context.codegen())
+        data = load(name)
+        if data is None:
+            return None
+        try:
+            return CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  # the digest is checked
+        except Exception:  # such as a class that is gone
+            warn_damaged(name)
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        if not data.library.has_dynamic_globals:  # addresses in this process
+            save(self._file(sig, data.codegen), dumps(data._reduce()))
+
+
 def _compile(function: Function, **options: Any) -> Function:
-    before, config.CACHE_DIR = config.CACHE_DIR, str(folder_of(function.__code__.co_filename))
-    try:
-        compiled: Function = numba.njit(
-            cache=True, nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True, _nrt=False, **options
-        )(function)
-    finally:
-        config.CACHE_DIR = before
+    compiled: Function = numba.njit(
+        nogil=True, error_model="numpy", boundscheck=False, no_cfunc_wrapper=True, _nrt=False, **options
+    )(function)
+    if _source(Path(function.__code__.co_filename)):  # not typed at a prompt
+        compiled._cache = _Cache(function)  # type: ignore[attr-defined]
     return compiled
 
 
@@ -66,45 +102,29 @@ def large(function: Function) -> Function:
 
 
 @cache
-def folder_of(file: str) -> Path:
-    """Folder with the machine code of the kernels in ``file``, which may call those that it imports.
-
-    If the cache folder is temporary, machine code that may only be read (a container's image) is copied into it. Warns
-    if there is none to copy.
-    """
-    digest, folders, beside = hashlib.sha256(), [Path(file).parent], set()
+def stamp_of(file: str) -> str:
+    """Digest of all sources that decide the machine code of the kernels in ``file``, and of their names."""
+    folders, beside = [Path(file).parent], set()
     for folder in folders:  # which grow
         for path in folder.glob("*.py"):
-            content = path.read_bytes()
-            if _MARK in content:
+            if _MARK in _source(path):
                 beside.add(path)
-                imported = [PACKAGE / "extensions" / name.decode() for name in _EXTENSION.findall(content)]
+                imported = [PACKAGE / "extensions" / name.decode() for name in _EXTENSION.findall(_source(path))]
                 folders += [other for other in dict.fromkeys(imported) if other not in folders]
     core = {path for name in SOURCES for path in (PACKAGE / name).glob("*.py")}
-    for path in sorted({Path(file)} | beside | core):
-        digest.update(path.name.encode() + path.read_bytes())
-    folder = cache_folder() / digest.hexdigest()[:16]
-    if is_temporary(cache_folder()) and not _has_copied(home_folder(), folder):
-        _warn_once()
-    return folder
-
-
-def _has_copied(home: Path | None, folder: Path) -> bool:
-    """Copy the machine code for a temporary ``folder``; False if there is none that may be read and trusted."""
-    try:
-        kept = None if home is None or not can_be_trusted(home) else home / folder.name
-        if kept is None or not any(kept.rglob("*.*")):
-            return False
-        shutil.copytree(kept, folder, dirs_exist_ok=True)
-    except OSError:
-        return False
-    return True
+    digests = sorted(_digest(path) for path in {Path(file)} | beside | core)
+    return hashlib.sha256(b"".join(digests)).hexdigest()
 
 
 @cache
-def _warn_once() -> None:
-    warnings.warn(
-        f"{home_folder()}: cannot be written, or its disk is full, so every process compiles the physics again (20 s);"
-        " set NUMBA_CACHE_DIR to a folder that can be written",
-        stacklevel=2,
-    )
+def _digest(path: Path) -> bytes:
+    return hashlib.sha256(path.name.encode() + _source(path)).digest()
+
+
+@cache
+def _source(path: Path) -> bytes:
+    """Content of a source file; empty if it cannot be read, and nothing can be imported from it."""
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""

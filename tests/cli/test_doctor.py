@@ -1,9 +1,11 @@
 """``ethbrake doctor``: what it finds wrong, what it compiles."""
 
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
+from ethbrake_marl import kernel_store
 from ethbrake_marl.agents import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
@@ -58,3 +60,31 @@ def test_checks__other_physics_another_optimum_and_a_damaged_folder_are_findings
     assert not ok and "harm 40 (exact: 20)" in told
     monkeypatch.setattr(catalogue, "list_scenarios", Mock(side_effect=OSError("gone")))
     assert found("scenarios") == (False, "OSError: gone")
+
+
+def test_kernel_cache__that_is_damaged_is_named_and_mended(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder = tmp_path / "ethbrake_marl"
+    assert found("kernel cache") == (True, str(folder))
+    for name in "abcd":
+        kernel_store.save(name, name.encode())
+    (folder / "a.compiled").write_bytes(b"")
+    (folder / "b.compiled").unlink()
+    (folder / "b.compiled" / "inside").mkdir(parents=True)
+    (folder / "c.compiled").rename(folder / "e.compiled")
+    (folder / "README").write_text("of somebody else")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", Mock(side_effect=PermissionError))
+        patch.setattr(kernel_store, "TemporaryFile", Mock(side_effect=OSError(30, "Read-only file system")))
+        told = f"{folder}: Read-only file system; {doctor._UNSTORED}; damaged files: 3, of which 1 are deleted now"
+        assert found("kernel cache") == (False, told)
+    assert found("kernel cache") == (True, f"{folder}; damaged files: 2, of which 2 are deleted now")
+    assert found("kernel cache") == (True, str(folder))
+    assert {path.name for path in folder.iterdir()} == {"d.compiled", "README"} and kernel_store.load("d") == b"d"
+
+
+def test_compiling_ahead__without_a_folder_to_write_is_refused(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    told = f"{tmp_path}/file/ethbrake_marl: Not a directory; {doctor._UNSTORED}"
+    assert doctor.compile_ahead(training=False) == (False, told)

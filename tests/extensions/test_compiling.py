@@ -1,4 +1,4 @@
-"""Where machine code is kept, if the kernels of one extension call those of another."""
+"""On which sources machine code depends, if the kernels of one extension call those of another."""
 
 from pathlib import Path
 
@@ -15,17 +15,22 @@ def answer(x):
 """
 
 
-def test_folder__depends_on_the_kernels_of_another_extension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stamp__depends_on_the_kernels_of_another_extension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stamp() -> str:
+        for known in (compiling.stamp_of, compiling._digest, compiling._source):
+            known.cache_clear()
+        return compiling.stamp_of(str(file))
+
     monkeypatch.setattr(compiling, "PACKAGE", tmp_path)
-    one, other, folder_of = tmp_path / "extensions/one", tmp_path / "extensions/other", compiling.folder_of.__wrapped__
+    one, other = tmp_path / "extensions/one", tmp_path / "extensions/other"
     for folder in (one, other):
         folder.mkdir(parents=True)
         (folder / "kernels.py").write_text(KERNELS.format(factor=2.0))
     file, text = one / "kernels.py", KERNELS.format(factor=5.0)
-    alone = folder_of(str(file))
+    alone = stamp()
     (other / "kernels.py").write_text(text)
-    assert folder_of(str(file)) == alone
+    assert stamp() == alone
     file.write_text(f"{file.read_text()}\nfrom ethbrake_marl.extensions.other.kernels import answer\n")
-    with_other = folder_of(str(file))
+    with_other = stamp()
     (other / "kernels.py").write_text(KERNELS.format(factor=2.0))
-    assert folder_of(str(file)) != with_other != alone
+    assert stamp() != with_other != alone

@@ -1,27 +1,31 @@
-"""Where machine code is kept, and what happens where it cannot be."""
+"""Where machine code is stored, and that no state of its folder stops a program or makes it run other code."""
 
+import errno
+import importlib.util
 import os
 import shutil
 import subprocess
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
+from typing import NamedTuple
 from unittest.mock import Mock
 
 import pytest
 
 from ethbrake_marl import kernel_store
+from ethbrake_marl.errors import CacheFault
 from ethbrake_marl.motion import compiling
+from tests.fixtures.kernels import OWN, give_own_cache
 
 KERNELS = """\
-from ethbrake_marl.motion.compiling import folder_of, kernel, large
+from ethbrake_marl.motion.compiling import kernel, large
 
 @kernel
 def twice(x):
-    return {factor} * x
+    "A text that -OO leaves out, before a constant."
+    return {factor} * x if x is not None else None
 
 @large
 def answer(x):
@@ -29,67 +33,180 @@ def answer(x):
 """
 ASK = """\
 import sys, ethbrake_marl.kernel_store as store
-store.on_first_compilation(lambda folder, is_empty: print("compiles", is_empty))
+store.on_first_compilation(lambda is_empty: print("compiles", is_empty))
 import kernels
-print(kernels.answer(20.0), kernels.folder_of(kernels.__file__))
+print(kernels.answer(20.0))
 """
 
 
+def begin(folder: Path, cache: Path, *options: str) -> subprocess.Popen[str]:
+    path = f"{folder}{os.pathsep}{os.getcwd()}"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": path}
+    command = [sys.executable, "-B", *options, "-c", ASK]  # -B: a change within a second would not be noticed
+    return subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
 def test_machine_code__is_loaded_until_a_source_changes(tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": f"{tmp_path}{os.pathsep}{os.getcwd()}"}
-
-    def ask(factor: float) -> list[str]:
+    def ask(factor: float, *options: str) -> list[str]:
         (tmp_path / "kernels.py").write_text(KERNELS.format(factor=factor))
-        command = [sys.executable, "-B", "-c", ASK]  # byte code is not made again for a change within a second
-        done = subprocess.run(command, env=environment, text=True, capture_output=True, check=True)
-        assert done.stderr == ""
-        return done.stdout.split()
+        said, warned = begin(tmp_path, tmp_path / "cache", *options).communicate()
+        assert warned == ""
+        return said.split()
 
-    *said, answer, folder = ask(2.0)
-    assert (said, answer) == (["compiles", "True"], "42.0") and Path(folder).is_relative_to(cache)
-    assert ask(2.0) == ["42.0", folder]
-    *said, answer, other = ask(3.0)  # what another kernel contains
-    assert (said, answer) == (["compiles", "False"], "62.0") and other != folder
+    assert ask(2.0) == ["compiles", "True", "42.0"]
+    assert ask(2.0, "-OO") == ["42.0"]
+    assert ask(3.0) == ["compiles", "False", "62.0"]  # what another kernel contains
 
 
-def test_folder__depends_on_the_kernels_beside(tmp_path: Path) -> None:
-    file, folder_of = tmp_path / "kernels.py", compiling.folder_of.__wrapped__
-    file.write_text(KERNELS.format(factor=2.0))
-    folder = folder_of(str(file))
-    (tmp_path / "beside.py").write_text("no kernels")
-    assert folder_of(str(file)) == folder
-    (tmp_path / "beside.py").write_text(KERNELS.format(factor=5.0))
-    assert folder_of(str(file)) != folder
+@pytest.mark.slow
+def test_processes__begin_at_once_with_an_empty_cache(tmp_path: Path) -> None:
+    (tmp_path / "kernels.py").write_text(KERNELS.format(factor=2.0))
+    begun = [begin(tmp_path, tmp_path / "cache") for _ in range(8)]
+    ended = [process.communicate() for process in begun]
+    assert [said.split()[-1] for said, _ in ended] == ["42.0"] * 8 and not any(warned for _, warned in ended)
+    assert begin(tmp_path, tmp_path / "cache").communicate() == ("42.0\n", "")
+    assert {path.suffix for path in (tmp_path / "cache/ethbrake_marl").iterdir()} == {kernel_store.SUFFIX}
+
+
+def test_stamp__depends_on_the_kernels_beside_and_on_no_path(tmp_path: Path) -> None:
+    def stamp(folder: str = "one") -> str:
+        for known in (compiling.stamp_of, compiling._digest, compiling._source):
+            known.cache_clear()
+        return compiling.stamp_of(str(tmp_path / folder / "kernels.py"))
+
+    one, other = tmp_path / "one", tmp_path / "a" / "later" / "other"
+    one.mkdir()
+    (one / "kernels.py").write_text(KERNELS.format(factor=2.0))
+    alone = stamp()
+    (one / "beside.py").write_text("no kernels")
+    (one / ".#kernels.py").symlink_to("an editor's mark of a file that is open")
+    assert stamp() == alone
+    (one / "beside.py").write_text(KERNELS.format(factor=5.0))
+    assert stamp() != alone
+    shutil.copytree(one, other, symlinks=True, copy_function=shutil.copy)  # with other times
+    assert stamp("a/later/other") == stamp()
+    (other / "beside.py").rename(other / "aside.py")
+    assert stamp("a/later/other") != stamp()
+
+
+class Told(NamedTuple):
+    answer: float
+    compiled: int  # number of compilations
+    warned: list[str]
 
 
 @pytest.fixture
-def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], tuple[Path, list[str]]]:
-    """Ask for the folder of a file's machine code, as in a new process; also return what was warned."""
+def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], Told]:
+    """Call a kernel as in a new process."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    monkeypatch.setattr(compiling, "_warn_once", compiling._warn_once.__wrapped__)
+    (tmp_path / "kernels.py").write_text(KERNELS.format(factor=2.0))
+    place = importlib.util.spec_from_file_location("kernels", tmp_path / "kernels.py")
 
-    def ask() -> tuple[Path, list[str]]:
-        folder = kernel_store.cache_folder.__wrapped__()
-        monkeypatch.setattr(compiling, "cache_folder", lambda: folder)
+    def ask() -> Told:
+        monkeypatch.setattr(kernel_store, "_warned", [])
+        module = importlib.util.module_from_spec(place)
+        place.loader.exec_module(module)
         with warnings.catch_warnings(record=True) as warned:
             warnings.simplefilter("always")
-            return compiling.folder_of.__wrapped__(__file__), [str(each.message) for each in warned]
+            answer = module.answer(20.0)
+        assert all(each.category is CacheFault for each in warned)
+        missed = [sum(each.stats.cache_misses.values()) for each in (module.answer, module.twice)]
+        return Told(answer, sum(missed), [str(each.message) for each in warned])
 
     return ask
 
 
-def cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tempfile, "TemporaryFile", Mock(side_effect=PermissionError))
+def folder_of(tmp_path: Path) -> Path:
+    return tmp_path / "cache" / "ethbrake_marl"
 
 
-def is_full(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=10_000_000))
+def flip(file: Path, place: int) -> None:
+    content = bytearray(file.read_bytes())
+    content[place] ^= 1
+    file.write_bytes(content)
 
 
-def is_of_somebody_else(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(os, "getuid", lambda: 12345)
-    os.chown(os.environ["NUMBA_CACHE_DIR"] + "/ethbrake_marl", 54321, -1)
+def replace_by_folder(file: Path) -> None:
+    file.unlink()
+    file.mkdir()
+    (file / "inside").write_text("x")
+
+
+def replace_by_link(file: Path, to: str) -> None:
+    file.unlink()
+    file.symlink_to(to)
+
+
+def replace_by_pipe(file: Path) -> None:
+    file.unlink()
+    os.mkfifo(file)
+
+
+def exchange(file: Path) -> None:
+    """Put the sound file of another kernel there."""
+    shutil.copy(next(path for path in file.parent.iterdir() if path != file), file)
+
+
+def with_a_class_that_is_gone(file: Path) -> None:
+    kernel_store.save(file.name.removesuffix(file.suffix), b"cno_such_module\nClass\n.")
+
+
+DAMAGE = {
+    "empty": lambda file: file.write_bytes(b""),
+    "cut": lambda file: file.write_bytes(file.read_bytes()[:-1]),
+    "only its digest": lambda file: file.write_bytes(file.read_bytes()[:32]),
+    "longer": lambda file: file.write_bytes(file.read_bytes() + b"\0"),
+    "first byte": lambda file: flip(file, 0),
+    "byte of the machine code": lambda file: flip(file, 2000),
+    "last byte": lambda file: flip(file, -1),
+    "text": lambda file: file.write_text("from somewhere else\n" * 100),
+    "folder": replace_by_folder,
+    "dangling link": lambda file: replace_by_link(file, "nowhere"),
+    "link to a folder": lambda file: replace_by_link(file, ".."),
+    "link to itself": lambda file: replace_by_link(file, file.name),
+    "endless": lambda file: replace_by_link(file, "/dev/zero"),
+    "pipe": replace_by_pipe,
+    "another kernel": exchange,
+    "a class that is gone": with_a_class_that_is_gone,
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE)
+def test_damaged_file__is_compiled_again_and_replaced(damage: Callable, ask: Callable, tmp_path: Path) -> None:
+    assert ask() == (42.0, 2, [])
+    [file] = folder_of(tmp_path).glob("kernels.answer-*")
+    damage(file)
+    answer, compiled, warned = ask()
+    assert (answer, compiled, len(warned)) == (42.0, 1, 1) and warned[0].startswith(f"{folder_of(tmp_path)}: kernels")
+    assert ask() == (42.0, 0, []) and file.is_file() and not file.is_symlink()
+
+
+def test_cache__with_all_files_damaged_warns_once(ask: Callable, tmp_path: Path) -> None:
+    ask()
+    files = [*folder_of(tmp_path).iterdir()]
+    for file in files:
+        file.write_bytes(b"")
+    answer, compiled, warned = ask()
+    assert (answer, compiled, len(warned)) == (42.0, 2, 1)
+    assert ask() == (42.0, 0, []) and {*folder_of(tmp_path).iterdir()} == {*files}
+
+
+def test_cache__that_is_deleted_is_made_again(ask: Callable, tmp_path: Path) -> None:
+    for _ in range(2):
+        assert ask() == (42.0, 2, [])
+        shutil.rmtree(folder_of(tmp_path).parent)
+
+
+def fail(monkeypatch: pytest.MonkeyPatch, owner: object, name: str, number: int = errno.ENOSPC) -> None:
+    """Let a function of the system fail for the cache: by default because the disk is full."""
+    real = getattr(owner, name)
+
+    def failing(*given: object, **more: object) -> object:
+        if name == "fsync" or any("ethbrake_marl" in str(each) and "cache" in str(each) for each in given):
+            raise OSError(number, os.strerror(number))
+        return real(*given, **more)
+
+    monkeypatch.setattr(owner, name, failing)
 
 
 def has_no_home(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,21 +215,86 @@ def has_no_home(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "home", Mock(side_effect=RuntimeError))
 
 
-@pytest.mark.parametrize("kept", [False, True])
-@pytest.mark.parametrize("what", [cannot_be_written, is_full, is_of_somebody_else, has_no_home])
-def test_cache__that_cannot_be_used(what: Callable, kept: bool, asked: Callable, tmp_path: Path, monkeypatch) -> None:
+def is_of_somebody_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(os.environ["NUMBA_CACHE_DIR"], "ethbrake_marl")
+    folder.mkdir(parents=True, exist_ok=True)
+    os.chown(folder, 54321, -1)
+    monkeypatch.setattr(os, "getuid", lambda: 12345)
+
+
+def is_below_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    file = Path(os.environ["NUMBA_CACHE_DIR"]).with_name("file")
+    file.touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(file / "cache"))
+
+
+OBSTACLES = {
+    "no space for a byte": (lambda m: fail(m, Path, "write_bytes"), "No space left on device", True),
+    "no space at the end": (lambda m: fail(m, os, "fsync", errno.EDQUOT), "Disk quota exceeded", True),
+    "no space for a name": (lambda m: fail(m, os, "replace"), "No space left on device", True),
+    "only readable": (lambda m: fail(m, Path, "write_bytes", errno.EROFS), "Read-only file system", True),
+    "no folder can be made": (lambda m: fail(m, Path, "mkdir", errno.EACCES), "Permission denied", False),
+    "below a file": (is_below_a_file, "Not a directory", False),
+    "no home": (has_no_home, "no cache folder: HOME and XDG_CACHE_HOME are not set", False),
+    "of somebody else": (is_of_somebody_else, "belongs to another user", False),
+}
+
+
+@pytest.mark.parametrize("prepare, reason, is_readable", OBSTACLES.values(), ids=OBSTACLES)
+@pytest.mark.parametrize("is_full", [False, True])
+def test_cache__that_cannot_be_written(
+    is_full: bool, prepare: Callable, reason: str, is_readable: bool, ask: Callable, tmp_path: Path, monkeypatch
+) -> None:
     """Machine code that may be read is used without a word. Otherwise one warning says what to do."""
-    folder, warned = asked()
-    assert folder.is_relative_to(tmp_path / "cache") and warned == []
-    if kept:
-        folder.mkdir()
-        (folder / "kernel.nbi").touch()
-    if what is is_of_somebody_else and os.getuid() != 0:
+    if prepare is is_of_somebody_else and os.getuid() != 0:
         pytest.skip("only root can give files away")
-    what(monkeypatch)
-    temporary, warned = asked()
-    assert temporary.name == folder.name and kernel_store.is_temporary(temporary.parent)
-    is_used = kept and what in (cannot_be_written, is_full)
-    assert (temporary / "kernel.nbi").exists() == is_used
-    assert len(warned) == (not is_used) and all("set NUMBA_CACHE_DIR to a folder" in text for text in warned)
-    shutil.rmtree(temporary.parent)
+    if is_full:
+        ask()
+    before = {*tmp_path.rglob("*.*")}
+    prepare(monkeypatch)
+    for _ in range(2):
+        answer, compiled, warned = ask()
+        is_used = is_full and is_readable
+        assert (answer, compiled, len(warned)) == (42.0, 0 if is_used else 2, not is_used)
+        assert all(reason in text and "; set NUMBA_CACHE_DIR to a folder that can be written" in text for text in warned)
+        assert "None" not in "".join(warned) and {*tmp_path.rglob("*.*")} - before <= {folder_of(tmp_path)}
+
+
+def test_kernel__without_a_source_is_not_stored(ask: Callable, tmp_path: Path) -> None:
+    ask()
+    before = {*folder_of(tmp_path).iterdir()}
+    names: dict[str, Callable] = {"__name__": "typed"}
+    exec(compile(KERNELS.format(factor=4.0), "<stdin>", "exec"), names)
+    assert names["answer"](20.0) == 82.0 and {*folder_of(tmp_path).iterdir()} == before
+
+
+def test_kernels__of_one_text_with_other_values_are_told_apart(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+
+    def times(factor: float) -> Callable[[float], float]:
+        return compiling.large(lambda x: factor * x)
+
+    for _ in range(2):
+        assert [times(factor)(10.0) for factor in (2.0, 3.0)] == [20.0, 30.0]
+    assert len([*(tmp_path / "ethbrake_marl").iterdir()]) == 2
+
+
+# ---------------------------------------------------------------- the suite's own cache
+
+
+def test_suite__has_a_cache_of_its_own() -> None:
+    assert kernel_store.cache_folder().parent.name == OWN
+
+
+def test_suite__begins_with_the_sound_files_of_the_users_cache(ask: Callable, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    ask()
+    user = folder_of(tmp_path)
+    sound, damaged = sorted(user.iterdir())
+    damaged.write_bytes(b"")
+    before = {path: path.stat() for path in user.iterdir()}
+    for _ in range(2):
+        give_own_cache()
+        assert [path.name for path in kernel_store.cache_folder().iterdir()] == [sound.name]
+    assert kernel_store.cache_folder().parent == user.parent / OWN
+    assert {path: path.stat()[:-3] for path in user.iterdir()} == {path: old[:-3] for path, old in before.items()}

@@ -1,4 +1,4 @@
-"""PTX of a kernel, the code that NVIDIA's driver compiles for its GPU: made without a GPU, and stored in a file.
+"""PTX of a kernel, the code that NVIDIA's driver compiles for its GPU: made without a GPU, and stored in the cache.
 
 Multiplications and additions are not fused (``fma=0``), so every operation rounds as on a processor, and a world has
 the same bits there and here.
@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import naming_extras
-from ethbrake_marl.files.store import write_file
-from ethbrake_marl.motion.compiling import folder_of
+from ethbrake_marl.kernel_store import load, save
+from ethbrake_marl.motion.compiling import stamp_of
 
 NEWEST = (9, 0)  # GPUs that are newer run the code of this one
 PTX_VERSION = "8.4"  # every driver from 550 on reads it, and nothing here needs a newer one
@@ -30,11 +30,13 @@ def ptx_of(
     numba-cuda is not installed.
     """
     capability = min(capability, NEWEST)
-    file = folder_of(str(Path(__file__).with_name("threads.py"))) / f"{name}-{capability[0]}{capability[1]}.ptx"
-    if not file.exists():
-        file.parent.mkdir(parents=True, exist_ok=True)
-        write_file(file, made(kernel(), given, capability).encode())
-    return file.read_text()
+    stamp = stamp_of(str(Path(__file__).with_name("threads.py")))
+    file = f"{name}-{capability[0]}{capability[1]}-{stamp[:32]}"
+    code = load(file)
+    if code is None:
+        code = made(kernel(), given, capability).encode()
+        save(file, code)
+    return code.decode()
 
 
 def made(kernel: Callable[..., None], given: tuple[Any, ...], capability: tuple[int, int]) -> str:

@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 import torch
 
-from ethbrake_marl.errors import InvalidInput, MissingExtra
+from ethbrake_marl import kernel_store
+from ethbrake_marl.errors import CacheFault, InvalidInput, MissingExtra
 from ethbrake_marl.extensions.cuda import device, machine_code
 from ethbrake_marl.extensions.cuda.machine_code import PTX_VERSION, made, ptx_of
 from ethbrake_marl.extensions.cuda.worlds import Worlds
@@ -51,8 +52,9 @@ def test_without_the_compiler__the_extra_is_named() -> None:
 
 
 def test_code_that_has_been_made__needs_no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.extensions.cuda.machine_code.folder_of", lambda _: tmp_path)
-    (tmp_path / "play-90.ptx").write_text("as before")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(machine_code, "made", lambda kernel, *_: kernel)
+    assert ptx_of("play", lambda: "as before", (), (9, 0)) == "as before"
     for capability in ((9, 0), (12, 1)):  # a newer GPU runs it
         assert ptx_of("play", pytest.fail, (), capability) == "as before"
 
@@ -96,27 +98,28 @@ def test_a_device_that_cannot__says_why(
 
 
 def test_code__is_made_anew_when_the_threads_change(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their machine code is told apart from that of other sources by its folder."""
     copied = shutil.copytree(Path(machine_code.__file__).parent, tmp_path / "cuda")
     monkeypatch.setattr(machine_code, "__file__", str(copied / "machine_code.py"))
-    monkeypatch.setattr(compiling, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(machine_code, "folder_of", compiling.folder_of.__wrapped__)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(machine_code, "made", lambda kernel, *_: kernel)
     assert ptx_of("play", lambda: "old", (), (9, 0)) == "old"
     assert ptx_of("play", lambda: "new", (), (9, 0)) == "old"
     with (copied / "threads.py").open("a") as file:
         file.write("# changed\n")
+    for known in (compiling.stamp_of, compiling._digest, compiling._source):
+        known.cache_clear()
     assert ptx_of("play", lambda: "new", (), (9, 0)) == "new"
 
 
-def test_code__is_taken_from_a_folder_that_can_only_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It holds no kernels of a processor: those of ``threads`` are none."""
-    home, temporary = tmp_path / "home", tmp_path / "ethbrake_marl-temporary"
-    temporary.mkdir()
-    monkeypatch.setattr(compiling, "home_folder", lambda: home)
-    monkeypatch.setattr(machine_code, "folder_of", compiling.folder_of.__wrapped__)
+@pytest.mark.parametrize("content", [b"", b"as before", b"\xff" * 100, None])
+def test_code__that_is_damaged_is_made_anew(content: bytes | None, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kernel_store, "_warned", [])
     monkeypatch.setattr(machine_code, "made", lambda kernel, *_: kernel)
-    monkeypatch.setattr(compiling, "cache_folder", lambda: home)
     ptx_of("play", lambda: "made", (), (9, 0))
-    monkeypatch.setattr(compiling, "cache_folder", lambda: temporary)
-    assert ptx_of("play", pytest.fail, (), (9, 0)) == "made"
+    [file] = (tmp_path / "ethbrake_marl").iterdir()
+    file.unlink()
+    file.mkdir() if content is None else file.write_bytes(content)
+    with pytest.warns(CacheFault, match=rf"^{tmp_path}/ethbrake_marl: play-90-\w+\.compiled is damaged"):
+        assert ptx_of("play", lambda: "anew", (), (9, 0)) == "anew"
+    assert ptx_of("play", pytest.fail, (), (9, 0)) == "anew"
