@@ -6,22 +6,21 @@ contains, and wherever it cannot be written, programs compile again and warn onc
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import shutil
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
 from ethbrake_marl.errors import CacheFault
 from ethbrake_marl.files.store import write_file
 
 SUFFIX = ".compiled"
+UNSTORED = "every process compiles the physics again; set NUMBA_CACHE_DIR to a folder that can be written"
 _DIGEST_BYTES = 32
-_PROBE_BYTES = 100_000
 _tellers: list[Callable[[bool], None]] = []
 _warned: list[str] = []
 
@@ -35,55 +34,46 @@ def cache_folder() -> Path | None:
     return Path(home) / "ethbrake_marl"
 
 
-def load(name: str) -> bytes | None:
-    """Return the data that ``save`` has stored under a name; None if there are none, or if they are damaged."""
+def load(name: str, read: Callable[[bytes], Any]) -> Any:
+    """Return ``read(data)`` of the data that are stored under a name; None if there are none.
+
+    If they are damaged, or ``read`` raises an error, warns, deletes them and returns None.
+    """
     try:
         path = _trusted_folder() / f"{name}{SUFFIX}"
+        path.lstat()  # is there anything?
     except OSError:
         return None
-    if not os.path.lexists(path):
-        return None
-    data = _checked(path)
-    if data is None:
-        warn_damaged(name)
-    return data
+    content = _read(path, read)
+    if content is None:
+        _warn_once(f"{path.parent}: {path.name} is damaged and compiled again; ethbrake doctor checks all files")
+        _delete(path)
+    return content
 
 
 def save(name: str, data: bytes) -> None:
-    """Store data under a name, which must contain all that decides the data."""
+    """Store data under a name, which must contain all that decides the data. Warns if this is impossible."""
     try:
         path = _trusted_folder() / f"{name}{SUFFIX}"
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
         write_file(path, _digest(path, data) + data)
     except OSError as error:
-        _warn_once(
-            f"{_reason(error)}, so every process compiles the physics again; set NUMBA_CACHE_DIR to a folder that can"
-            " be written"
-        )
+        _warn_once(f"{_reason(error)}, so {UNSTORED}")
 
 
 def obstacle() -> str:
     """Return why compiled code cannot be stored; empty if it can."""
     try:
         with TemporaryFile(dir=_trusted_folder()) as file:
-            file.write(bytes(_PROBE_BYTES))
+            file.write(bytes(100_000))  # a disk that is full may still have names
     except OSError as error:
         return _reason(error)
     return ""
 
 
-def delete_damaged(folder: Path) -> list[Path]:
-    """Delete the damaged files of a cache, and return their paths. A file that cannot be deleted stays."""
-    damaged = [path for path in folder.glob(f"*{SUFFIX}") if _checked(path) is None]
-    for path in damaged:
-        with suppress(OSError):
-            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
-    return damaged
-
-
-def warn_damaged(name: str) -> None:
-    _warn_once(f"{cache_folder()}: {name}{SUFFIX} is damaged and is compiled again; ethbrake doctor checks all files")
+def delete_damaged() -> tuple[int, int]:
+    """Delete damaged files. Return the number of damaged files and of those that cannot be deleted."""
+    damaged = [path for path in _stored_files() if _read(path, bytes) is None]
+    return len(damaged), sum(not _delete(path) for path in damaged)
 
 
 def on_first_compilation(tell: Callable[[bool], None]) -> None:
@@ -95,9 +85,13 @@ def on_first_compilation(tell: Callable[[bool], None]) -> None:
 
 
 def tell_compilation() -> None:
-    folder = cache_folder()
     while _tellers:
-        _tellers.pop()(folder is None or not any(folder.glob(f"*{SUFFIX}")))
+        _tellers.pop()(not _stored_files())
+
+
+def _stored_files() -> list[Path]:
+    folder = cache_folder()
+    return [*folder.glob(f"*{SUFFIX}")] if folder else []
 
 
 def _trusted_folder() -> Path:
@@ -107,21 +101,30 @@ def _trusted_folder() -> Path:
     """
     folder = cache_folder()
     if folder is None:
-        raise FileNotFoundError(errno.ENOENT, "HOME and XDG_CACHE_HOME are not set")
+        raise OSError(0, "HOME and XDG_CACHE_HOME are not set")
     folder.mkdir(parents=True, exist_ok=True)
     if hasattr(os, "getuid") and folder.stat().st_uid not in (0, os.getuid()):
-        raise PermissionError(errno.EPERM, "belongs to another user")
+        raise OSError(0, "belongs to another user")
     return folder
 
 
-def _checked(path: Path) -> bytes | None:
-    """Return the data of a file; None if the digest does not fit, or if it cannot be read or is no file."""
+def _read(path: Path, read: Callable[[bytes], Any]) -> Any:
+    """Return ``read(data)`` of the data in a file; None if it is damaged."""
     try:
         content = path.read_bytes() if path.is_file() else b""
-    except OSError:
+        data = content[_DIGEST_BYTES:]
+        return read(data) if content[:_DIGEST_BYTES] == _digest(path, data) else None
+    except Exception:  # of reading, or of `read`: such as a class that is gone
         return None
-    data = content[_DIGEST_BYTES:]
-    return data if content[:_DIGEST_BYTES] == _digest(path, data) else None
+
+
+def _delete(path: Path) -> bool:
+    """Delete whatever stands in the place of a file. Return whether this was possible."""
+    try:
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+    except OSError:
+        return False
+    return True
 
 
 def _digest(path: Path, data: bytes) -> bytes:

@@ -19,7 +19,7 @@ import typer
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli.command import JsonOption, Out
-from ethbrake_marl.kernel_store import cache_folder, delete_damaged, obstacle
+from ethbrake_marl.kernel_store import UNSTORED, cache_folder, delete_damaged, obstacle
 
 EXTRAS = ("train", "marl", "export", "data", "render", "cluster")
 
@@ -48,8 +48,6 @@ for given in ({}, {"reward": {"harm": 0.05, "shaping": 0.05}}):  # shaped, as PP
     env.reset(seed=0)
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
 """
-
-_UNSTORED = "every process compiles the kernels again; set NUMBA_CACHE_DIR to a folder that can be written"
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -111,15 +109,9 @@ def _processor() -> tuple[bool, str]:
 
 
 def _kernel_cache() -> tuple[bool, str]:
-    folder, reason = cache_folder(), obstacle()
-    damaged = delete_damaged(folder) if folder else []
-    left = sum(os.path.lexists(path) for path in damaged)
-    notes = [reason or str(folder)]
-    if reason:
-        notes.append(_UNSTORED)
-    if damaged:
-        notes.append(f"damaged files: {len(damaged)}, of which {len(damaged) - left} are deleted now")
-    return not left, "; ".join(notes)
+    reason, (damaged, left) = obstacle(), delete_damaged()
+    notes = f"; damaged files: {damaged}, of which {damaged - left} are deleted now" if damaged else ""
+    return not left, (f"{reason}; {UNSTORED}" if reason else str(cache_folder())) + notes
 
 
 def _scenarios() -> tuple[bool, str]:
@@ -173,7 +165,7 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
     nearly all kernels of ``ethbrake run``. Returns whether all commands succeeded, and a message for the user.
     """
     if reason := obstacle():
-        return False, f"{reason}; {_UNSTORED}"
+        return False, f"{reason}; {UNSTORED}"
     begun = perf_counter()
     doors = [("-m", "ethbrake_marl", *door) for door in _DOORS if training or door[0] != "run"]
     doors = [_FOR_A_RUN] if run_alone else [*doors, ("-c", _IN_PYTHON)]

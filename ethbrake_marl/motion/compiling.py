@@ -12,6 +12,7 @@ times do not count, so all copies of this package share one cache. Code in ``pyt
 from __future__ import annotations
 
 import hashlib
+import os
 import pickle
 import re
 import sys
@@ -27,7 +28,7 @@ from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.serialize import dumps
 
-from ethbrake_marl.kernel_store import load, save, tell_compilation, warn_damaged
+from ethbrake_marl.kernel_store import load, save, tell_compilation
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -35,7 +36,6 @@ PACKAGE = Path(__file__).parents[1]
 SOURCES = ("motion", "episode")  # folders with the core's kernels
 _MARK = b"motion.compiling import"  # in every other file with kernels
 _EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE)
-_COMPILER = (numba.__version__, llvmlite.__version__, sys.version_info[:2], sys.abiflags)
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
@@ -52,34 +52,28 @@ event.register("numba:compile", _Teller())
 
 
 class _Cache(NullCache):  # type: ignore[misc]
-    """The machine code of one kernel for all types of arguments, as numba asks for it."""
+    """The machine code of one kernel for all types of its arguments, as numba asks for it and hands it over."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        code = function.__code__
-        self._name, self._cells = f"{Path(code.co_filename).stem}.{code.co_name}", function.__closure__ or ()
-        place = (function.__module__, function.__qualname__, code.co_firstlineno)
-        self._decided_by = (stamp_of(code.co_filename), *place, *_COMPILER)
+        self._function, self._stamp = function, stamp_of(function.__code__.co_filename)
 
-    def _file(self, signature: Any, codegen: Any) -> str:
-        values = dumps([cell.cell_contents for cell in self._cells])
-        decided_by = repr((*self._decided_by, signature, values, codegen.magic_tuple()))
-        return f"{self._name}-{hashlib.sha256(decided_by.encode()).hexdigest()[:32]}"
+    def _name(self, signature: Any, codegen: Any) -> str:
+        """Name of the stored file: a digest of all that decides the machine code."""
+        function = self._function
+        versions = (numba.__version__, llvmlite.__version__, sys.version_info[:2], sys.abiflags)
+        place = (function.__module__, function.__qualname__, function.__code__.co_firstlineno)
+        values = dumps([cell.cell_contents for cell in function.__closure__ or ()])
+        decided_by = repr((self._stamp, *versions, *place, values, signature, codegen.magic_tuple()))
+        return f"{function.__name__}-{hashlib.sha256(decided_by.encode()).hexdigest()[:32]}"
 
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         target_context.refresh()
-        name = self._file(sig, target_context.codegen())
-        data = load(name)
-        if data is None:
-            return None
-        try:
-            return CompileResult._rebuild(target_context, *pickle.loads(data))  # noqa: S301  # the digest is checked
-        except Exception:  # such as a class that is gone
-            warn_damaged(name)
-            return None
+        name = self._name(sig, target_context.codegen())
+        return load(name, lambda data: CompileResult._rebuild(target_context, *pickle.loads(data)))  # noqa: S301
 
     def save_overload(self, sig: Any, data: Any) -> None:
         if not data.library.has_dynamic_globals:  # addresses in this process
-            save(self._file(sig, data.codegen), dumps(data._reduce()))
+            save(self._name(sig, data.codegen), dumps(data._reduce()))
 
 
 def _compile(function: Function, **options: Any) -> Function:
@@ -112,19 +106,12 @@ def stamp_of(file: str) -> str:
                 imported = [PACKAGE / "extensions" / name.decode() for name in _EXTENSION.findall(_source(path))]
                 folders += [other for other in dict.fromkeys(imported) if other not in folders]
     core = {path for name in SOURCES for path in (PACKAGE / name).glob("*.py")}
-    digests = sorted(_digest(path) for path in {Path(file)} | beside | core)
+    sources = {Path(file)} | beside | core
+    digests = sorted(hashlib.sha256(path.name.encode() + _source(path)).digest() for path in sources)
     return hashlib.sha256(b"".join(digests)).hexdigest()
-
-
-@cache
-def _digest(path: Path) -> bytes:
-    return hashlib.sha256(path.name.encode() + _source(path)).digest()
 
 
 @cache
 def _source(path: Path) -> bytes:
     """Content of a source file; empty if it cannot be read, and nothing can be imported from it."""
-    try:
-        return path.read_bytes()
-    except OSError:
-        return b""
+    return path.read_bytes() if path.is_file() and os.access(path, os.R_OK) else b""

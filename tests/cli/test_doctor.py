@@ -76,15 +76,17 @@ def test_kernel_cache__that_is_damaged_is_named_and_mended(tmp_path: Path, monke
     with monkeypatch.context() as patch:
         patch.setattr(Path, "unlink", Mock(side_effect=PermissionError))
         patch.setattr(kernel_store, "TemporaryFile", Mock(side_effect=OSError(30, "Read-only file system")))
-        told = f"{folder}: Read-only file system; {doctor._UNSTORED}; damaged files: 3, of which 1 are deleted now"
+        told = f"{folder}: Read-only file system; {kernel_store.UNSTORED}; damaged files: 3, of which 1 are deleted now"
         assert found("kernel cache") == (False, told)
     assert found("kernel cache") == (True, f"{folder}; damaged files: 2, of which 2 are deleted now")
     assert found("kernel cache") == (True, str(folder))
-    assert {path.name for path in folder.iterdir()} == {"d.compiled", "README"} and kernel_store.load("d") == b"d"
+    assert {path.name for path in folder.iterdir()} == {"d.compiled", "README"} and kernel_store.load(
+        "d", bytes
+    ) == b"d"
 
 
 def test_compiling_ahead__without_a_folder_to_write_is_refused(tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
-    told = f"{tmp_path}/file/ethbrake_marl: Not a directory; {doctor._UNSTORED}"
+    told = f"{tmp_path}/file/ethbrake_marl: Not a directory; {kernel_store.UNSTORED}"
     assert doctor.compile_ahead(training=False) == (False, told)

@@ -32,11 +32,11 @@ def ptx_of(
     capability = min(capability, NEWEST)
     stamp = stamp_of(str(Path(__file__).with_name("threads.py")))
     file = f"{name}-{capability[0]}{capability[1]}-{stamp[:32]}"
-    code = load(file)
+    code: str | None = load(file, bytes.decode)
     if code is None:
-        code = made(kernel(), given, capability).encode()
-        save(file, code)
-    return code.decode()
+        code = made(kernel(), given, capability)
+        save(file, code.encode())
+    return code
 
 
 def made(kernel: Callable[..., None], given: tuple[Any, ...], capability: tuple[int, int]) -> str:
