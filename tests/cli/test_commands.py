@@ -13,7 +13,7 @@ from unittest.mock import Mock
 import pytest
 import typer
 
-from ethbrake_marl import __version__
+from ethbrake_marl import __version__, kernel_store
 from ethbrake_marl.cli import app as frame
 from ethbrake_marl.cli.app import run_command, whole_command
 from ethbrake_marl.cli.command import Out
@@ -184,3 +184,20 @@ def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatc
         os.dup2(before, 1)
         os.close(before)
     assert capfd.readouterr() == ("result\n", "raw")
+
+
+@pytest.mark.parametrize("name, said", [("", "the physics for the first time, which takes a while"), ("a", "parts of")])
+def test_compilation__is_announced(name: str, said: str, tmp_path, monkeypatch, capsys) -> None:
+    """What is said promises no time, and no stored result where none can be stored."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(kernel_store, "_tellers", [frame.tell_compilation])
+    if name:
+        kernel_store.save(name, b"")
+    kernel_store.tell_compilation()
+    kernel_store.tell_compilation()
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"compiling {said}") and line.endswith("; later commands use the stored result")
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    frame.tell_compilation(is_empty=True)
+    assert capsys.readouterr().err == "compiling the physics for the first time, which takes a while\n"
