@@ -20,8 +20,10 @@ from typing import Any, TypeVar
 
 import numba
 from numba.core import config, event
+from numba.core.compiler_lock import global_compiler_lock
 
 from ethbrake_marl.kernel_store import cache_folder, can_be_trusted, home_folder, is_temporary, tell_compilation
+from ethbrake_marl.stopping import Postponed
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -41,7 +43,20 @@ class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
         pass
 
 
+class _Postponer(event.Listener):  # type: ignore[misc]
+    """Postpone Ctrl-C until numba has compiled and stored a function: LLVM's calls of Python lose every exception."""
+
+    postponed = Postponed()
+
+    def on_start(self, happened: event.Event) -> None:
+        self.postponed.begin()
+
+    def on_end(self, happened: event.Event) -> None:
+        self.postponed.end(only_arrived=global_compiler_lock.is_locked())
+
+
 event.register("numba:compile", _Teller())
+event.register("numba:compiler_lock", _Postponer())
 
 
 def _compile(function: Function, **options: Any) -> Function:
