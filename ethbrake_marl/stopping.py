@@ -44,9 +44,8 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
 class Postponed:
     """Ctrl-C in the main thread, postponed while code runs in which Python would lose an exception."""
 
-    def __init__(self) -> None:
-        self._handler: Any = None  # handler of Ctrl-C that waits; None: nothing is postponed
-        self._arrived = False
+    _handler: Any = None  # handler of Ctrl-C that waits; None: nothing is postponed
+    _arrived = False
 
     def begin(self) -> None:
         """Postpone Ctrl-C from now on, unless it is postponed already or has no handler in Python."""

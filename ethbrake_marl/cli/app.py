@@ -67,6 +67,7 @@ def main() -> None:
     prepare_streams()
     status = run_command(sys.argv[1:])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command has ended
+    exec("")  # noqa: S102  # after Ctrl-C inside another `exec`, Python would end without this status
     sys.exit(status)
 
 

@@ -183,6 +183,10 @@ class _PlainConsole(Console):
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
         super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False, force_jupyter=False)
 
+    def on_broken_pipe(self) -> NoReturn:
+        """Raise the ``BrokenPipeError`` again; rich would discard stderr, where stdout is redirected, and exit."""
+        raise
+
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for piece in super().render(renderable, options):
             yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)
