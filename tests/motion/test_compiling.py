@@ -2,19 +2,23 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
+from types import FrameType, SimpleNamespace
 from unittest.mock import Mock
 
+import numba
 import pytest
+from numba.core import event
 
 from ethbrake_marl import kernel_store
 from ethbrake_marl.motion import compiling
+from ethbrake_marl.stopping import stop_on_signal
 
 KERNELS = """\
 from ethbrake_marl.motion.compiling import folder_of, kernel, large
@@ -116,3 +120,32 @@ def test_cache__that_cannot_be_used(what: Callable, kept: bool, asked: Callable,
     assert (temporary / "kernel.nbi").exists() == is_used
     assert len(warned) == (not is_used) and all("set NUMBA_CACHE_DIR to a folder" in text for text in warned)
     shutil.rmtree(temporary.parent)
+
+
+def test_ctrl_c_while_llvm_calls_python__is_no_lost_exception() -> None:
+    """LLVM hands a finished function over by a call of Python, whose exceptions vanish."""
+    thirds = numba.njit(lambda x: x / 3.0)
+    calls = []
+
+    def interrupt(frame: FrameType, happened: str, argument: object) -> None:
+        if frame.f_code.co_name == "_raw_object_cache_notify" and happened == "call" and not calls:
+            calls.append(frame)
+            signal.raise_signal(signal.SIGINT)
+
+    sys.setprofile(interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            thirds(6.0)
+    finally:
+        sys.setprofile(None)
+    assert calls and thirds(6.0) == 2.0
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_while_llvm_calls_python__reaches_a_handler_that_does_not_raise() -> None:
+    with stop_on_signal() as stop:
+        event.start_event("numba:compiler_lock")
+        signal.raise_signal(signal.SIGINT)
+        assert not stop()
+        event.end_event("numba:compiler_lock")
+        assert stop()
