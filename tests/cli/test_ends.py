@@ -11,7 +11,7 @@ import time
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import pytest
 import typer
@@ -127,21 +127,19 @@ def make():
 """
 
 
-def interrupted(moment: Any, words: Sequence[str], **environment: str) -> tuple[int, list[str]]:
-    """Start a program in its own group, send Ctrl-C to the group; return status and stderr without notes of progress.
+def interrupted(begun: str, seconds: float, words: Sequence[str], **environment: str) -> tuple[int, list[str]]:
+    """Start a program in its own group, and send Ctrl-C to the group; return status and stderr without progress.
 
-    ``moment``: the seconds after which Ctrl-C is sent, or the text on stderr after which it is.
+    Ctrl-C is sent ``seconds`` after the program has written ``begun`` on stderr, if anything.
     """
     process = subprocess.Popen(
         words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
         env={**os.environ, **environment},
     )  # fmt: skip
     assert process.stderr is not None
-    if isinstance(moment, str):
-        while moment not in process.stderr.readline():
-            assert process.poll() is None
-    else:
-        time.sleep(moment)
+    while begun and begun not in process.stderr.readline():
+        assert process.poll() is None
+    time.sleep(seconds)
     os.killpg(process.pid, signal.SIGINT)
     lines = process.communicate(timeout=120)[1].splitlines()
     return process.returncode, [each for each in lines if " of " not in each and not each.startswith("compiling")]
@@ -150,20 +148,21 @@ def interrupted(moment: Any, words: Sequence[str], **environment: str) -> tuple[
 def test_ctrl_c__is_one_line_and_status_130_even_inside_exec(tmp_path: Path) -> None:
     (tmp_path / "slow.py").write_text(AGENT.format(code='print("begun", flush=True); time.sleep(60)'))
     line = [*RUN, "evaluate", "--agents", f"{tmp_path}/slow.py:make"]
-    assert interrupted("begun", line) == (130, ["interrupted; nothing was written"])
+    assert interrupted("begun", 0.0, line) == (130, ["interrupted; nothing was written"])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [1.0, 3.0, 6.0, 10.0])
+@pytest.mark.parametrize("seconds", [0.0, 1.0, 3.0, 10.0])
 def test_ctrl_c_while_kernels_compile__is_one_line_and_keeps_those_that_are_finished(seconds, tmp_path: Path) -> None:
     line = [*RUN, "study", "front", "--output", str(tmp_path / "front"), "--episodes", "20"]
-    told = interrupted(seconds, line, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
+    told = interrupted("compiling", seconds, line, NUMBA_CACHE_DIR=str(tmp_path / "cache"))
     assert told == (130, ["interrupted; nothing was written"])
-    assert seconds < 6.0 or len(list(tmp_path.rglob("*.nbi"))) > 3
+    assert seconds < 10.0 or [*tmp_path.rglob("*.nbc")]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seconds", [1.0, 1.5, 2.0, 2.5, 3.0, 4.0])
+@pytest.mark.parametrize("seconds", [1.5, 2.0, 2.5, 3.0, 4.0])
 def test_ctrl_c_while_processes_start_and_work__is_one_line(seconds: float) -> None:
     line = [*RUN, "evaluate", "--agents", "e_v2x_bm,ppo+step", "--episodes", "10000", "--jobs", "2"]
-    assert interrupted(seconds, line) == (130, ["interrupted; nothing was written"])
+    status, (told,) = interrupted("", seconds, line)
+    assert status == 130 and told.startswith("interrupted; ")
