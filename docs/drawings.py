@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -138,5 +139,6 @@ def _knowledge(axes: Axes, scenario: eb.Scenario) -> None:
 DRAWINGS = {"timeline": draw_timeline, "regimes": draw_regimes, "knowledge": draw_knowledge}
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for name, draw in DRAWINGS.items():
         write_picture(FOLDER / f"model-{name}.svg", draw(), force=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import sys
 import threading
 import time
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import redirect_stdout
 from functools import cache
 from itertools import islice
+from multiprocessing import resource_tracker
 from typing import Any
 
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, naming_extras
@@ -55,10 +57,15 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     one_thread = {"backend": backend, "inner_max_num_threads": 1} if backend.supports_inner_max_num_threads else {}
     with parallel_config(**one_thread):
         parallel = Parallel(jobs, batch_size=1, return_as="generator" if streams else "list")
-    work = (delayed(_answer)(_pickled(call)) for call in calls)
+    work = (delayed(_answer)(os.getpid(), _pickled(call)) for call in calls)
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:
-        results = parallel(batch)
+        resource_tracker.ensure_running()  # it starts with the signal unblocked, and would unblock it here, too
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT} if streams else ())
+        try:  # with Ctrl-C blocked in the processes that this starts
+            results = parallel(batch)
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         try:
             for result in results:  # noqa: UP028  # `yield from` would close `results` outside the clause below
                 yield result
@@ -80,17 +87,21 @@ def _pickled(call: Call) -> bytes:
         raise InvalidInput(f"this cannot be sent to another process ({error}); use one process (jobs=1)") from error
 
 
-def _answer(call: bytes) -> Any:
-    """Run a pickled call in a worker process; its prints go to stderr."""
-    _end_with_parent()
+def _answer(caller: int, call: bytes) -> Any:
+    """Run a pickled call of the process ``caller``, in another process or thread; its prints go to stderr."""
+    if os.getpid() != caller:
+        _become_worker()
     with redirect_stdout(sys.stderr):
         function, *arguments = pickle.loads(call)
         return function(*arguments)
 
 
 @cache
-def _end_with_parent() -> None:
-    """Make this worker process exit when its parent process ends, even during a call."""
+def _become_worker() -> None:
+    """Leave Ctrl-C to the parent process and to calls that listen to it; exit when the parent ends, even in a call."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def watch(parent: int) -> None:
         while os.getppid() == parent:

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM set a flag, which a long computation checks between steps, instead of raising an exception."""
+"""What Ctrl-C and SIGTERM do: set a flag that a long computation checks between steps, or wait until it is safe."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -19,7 +20,7 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
     returns False.
     """
     asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
+    if not _in_main_thread():
         yield asked.is_set
         return
     before = {number: signal.getsignal(number) for number in _SIGNALS}
@@ -38,3 +39,33 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
         yield asked.is_set
     finally:
         restore()
+
+
+class Postponed:
+    """Ctrl-C in the main thread, postponed while code runs in which Python would lose an exception."""
+
+    _handler: Any = None  # handler of Ctrl-C that waits; None: nothing is postponed
+    _arrived = False
+
+    def begin(self) -> None:
+        """Postpone Ctrl-C from now on, unless it is postponed already or has no handler in Python."""
+        handler = signal.getsignal(signal.SIGINT)
+        if self._handler is None and callable(handler) and _in_main_thread():
+            self._arrived = False
+            signal.signal(signal.SIGINT, self._listen)
+            self._handler = handler
+
+    def _listen(self, number: int, frame: FrameType | None) -> None:
+        self._arrived = True
+
+    def end(self, *, only_arrived: bool = False) -> None:
+        """Postpone no more, and act on a Ctrl-C that has arrived; ``only_arrived``: go on unless one has arrived."""
+        if self._handler is not None and _in_main_thread() and (self._arrived or not only_arrived):
+            handler, self._handler = self._handler, None
+            signal.signal(signal.SIGINT, handler)
+            if self._arrived:
+                signal.raise_signal(signal.SIGINT)
+
+
+def _in_main_thread() -> bool:
+    return threading.current_thread() is threading.main_thread()

@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import argparse
+
 import numpy as np
 
 from ethbrake_marl import load_scenario
 from ethbrake_marl.worlds.channel import PRESETS
 
+argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
 base = load_scenario("cooperation-2-paper")
 for preset in [*PRESETS][1:]:
     worlds = base.replace(v2x=preset, latency_s=0).sample(100_000, seed=7)

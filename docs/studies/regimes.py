@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-import sys
+import argparse
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -24,6 +24,9 @@ def way(speed, braking, onset, time):
     return speed * np.minimum(time, onset) + speed * after - braking * after**2 / 2
 
 
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("picture", help="file for the figure")
+picture = parser.parse_args().picture
 figure, panels = plt.subplots(1, 4, figsize=(11, 2.9), layout="constrained")
 for axes, (name, (gap, v_l, a_l, v_f, a_f, tau)) in zip(panels, CASES.items(), strict=True):
     time = np.linspace(0.0, max(v_l / a_l, tau + v_f / a_f), 4001)
@@ -40,4 +43,4 @@ for axes, (name, (gap, v_l, a_l, v_f, a_f, tau)) in zip(panels, CASES.items(), s
     axes.tick_params(labelsize=8)
 panels[0].set_ylabel("position (m)", fontsize=9)
 panels[0].legend(frameon=False, fontsize=8.5)
-figure.savefig(sys.argv[1], dpi=110)
+figure.savefig(picture, dpi=110)

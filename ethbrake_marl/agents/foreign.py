@@ -82,9 +82,10 @@ def ask_model(model: Any, seen: Observations) -> Any:
 
 def ask_torch(module: Any, seen: Observations) -> Any:
     torch = sys.modules["torch"]
-    parameter = next(iter(module.parameters()), None)
+    parameter = next(iter(module.parameters()), torch.zeros(0, dtype=torch.float32, device="cpu"))
     with torch.no_grad():
-        return module(torch.from_numpy(seen).to("cpu" if parameter is None else parameter.device))
+        answer = module(torch.from_numpy(seen).to(parameter))
+        return answer.float() if getattr(answer, "dtype", None) == torch.bfloat16 else answer  # which numpy lacks
 
 
 def ask_onnx(session: Any, seen: Observations) -> Any:

@@ -6,19 +6,21 @@ import gc
 import io
 import os
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
+from typer.completion import shell_complete
 from typer.core import TyperCommand
 from typer.exceptions import TyperException
 from typer.main import get_command, get_group
 
 from ethbrake_marl import __version__
 from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
-from ethbrake_marl.cli.command import Out, example
+from ethbrake_marl.cli.command import INTERRUPTED, Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.kernel_store import obstacle, on_first_compilation
 from ethbrake_marl.registry import OURS, Registry, giver, points
@@ -30,6 +32,7 @@ app = typer.Typer(
     help="Ethical emergency braking: train, shield and evaluate agents. Every command has a --help with an example.",
     epilog=example("run", "evaluate --agents full_brake,e_v2x_bm --episodes 1000"),
 )
+_COMPLETE = "_ETHBRAKE_COMPLETE"  # variable with which a shell asks to complete a command line
 _NAMES = "Names that can be used in --set, recipes and scenarios: ethbrake scenario parts"
 for name, command, shown in (
     ("run", run.run_command, "run --steps 200000 --seed 1"),
@@ -61,28 +64,25 @@ def _about(
 def main() -> None:
     gc.set_threshold(20_000)  # Python's default of 700 costs a run 1.5 CPU-s, and there are hardly any reference cycles
     prepare_streams()
-    sys.exit(run_command(sys.argv[1:]))
+    status = run_command(sys.argv[1:])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the command has ended
+    exec("")  # noqa: S102  # after Ctrl-C inside another `exec`, Python would end without this status
+    sys.exit(status)
 
 
 def run_command(arguments: Sequence[str]) -> int:
     """Run the command line ``ethbrake ARGUMENTS``, and return its exit status.
 
     0: success. 1: the reader of the output has closed the pipe. 2: wrong usage, invalid input or a file error,
-    explained in one line on stderr. A command may choose another status, such as 130 after Ctrl-C. Every other
-    exception is a bug of this program and is raised.
+    explained in one line on stderr. 130: Ctrl-C. A command may choose another status. Every other exception is a bug of
+    this program and is raised.
     """
-    asked = _shell_asks(os.environ)
     try:
-        variable = None if asked else ""  # None: the default variable; "": shell completion is off
-        with naming_extras():
-            status = whole_command()(arguments, prog_name="ethbrake", standalone_mode=False, complete_var=variable)
+        status = _status_of(arguments)
         sys.stdout.flush()
-    except SystemExit as stop:
-        if asked:
-            raise
-        if isinstance(stop.__context__, BrokenPipeError):  # the reader of the output has closed the pipe
-            return 1
-        return _refuse(f"your own code ended the process: SystemExit: {stop.code}")
+    except typer.Abort:
+        Out().note("Aborted!")
+        return 1
     except TyperException as error:
         context = getattr(error, "ctx", None)
         where = context.command_path if context else "ethbrake"
@@ -91,16 +91,40 @@ def run_command(arguments: Sequence[str]) -> int:
         return _refuse(f"{message} (see: {where} --help)")
     except EthBrakeError as error:
         return _refuse(str(error))
+    except BrokenPipeError:
+        abandon_output()
+        return 1
     except OSError as error:
         abandon_output()
         return _refuse(f"{error.filename or 'output'!s:.200}: {error.strerror or error}")
     except MemoryError as error:
         return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")
-    except (Exception, KeyboardInterrupt):
+    except KeyboardInterrupt:
+        Out().note("interrupted; repeat the command")
+        return INTERRUPTED
+    except Exception:
         raise
     except BaseException as error:  # GeneratorExit and similar, which this package never raises
         return _refuse(f"your own code ended the process: {describe_error(error)}")
-    return status if isinstance(status, int) else 0
+    return status
+
+
+def _status_of(arguments: Sequence[str]) -> int:
+    """Return the status with which a command ends. SystemExit: of typer, or of a command from another package."""
+    try:
+        with naming_extras():
+            command = whole_command()
+            if _shell_asks(os.environ):
+                return shell_complete(command, {}, "ethbrake", _COMPLETE, os.environ[_COMPLETE])
+            with command.make_context("ethbrake", [*arguments]) as context:
+                command.invoke(context)
+    except typer.Exit as stop:
+        return stop.exit_code
+    except SystemExit as stop:
+        if isinstance(stop.code, str):
+            Out().note(stop.code)
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    return 0
 
 
 def _shell_asks(environment: Mapping[str, str]) -> bool:
@@ -108,10 +132,10 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
 
     False if only one of the shell's variables for completion is set: it may be left over from an earlier command.
     """
-    if environment.get("_ETHBRAKE_COMPLETE") == "complete_bash":
+    if environment.get(_COMPLETE) == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
     others = ("complete_zsh", "complete_fish", "complete_powershell", "complete_pwsh")
-    return environment.get("_ETHBRAKE_COMPLETE") in others and "_TYPER_COMPLETE_ARGS" in environment
+    return environment.get(_COMPLETE) in others and "_TYPER_COMPLETE_ARGS" in environment
 
 
 def _refuse(reason: str) -> int:
@@ -126,14 +150,14 @@ def prepare_streams() -> None:
     write to stdout without Python's ``sys.stdout`` goes to stderr. Warnings of this package are printed in one line. A
     message announces the first compilation of numba kernels.
     """
-    for name in ("stdout", "stderr"):
-        if getattr(sys, name) is None:  # closed by the caller: nobody reads it
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
+    for name, mode in (("stdin", "r"), ("stdout", "r"), ("stderr", "w")):  # a closed stdout refuses results
+        if getattr(sys, name) is None:  # closed by the caller: keep its number from the next file that is opened
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode, closefd=False))
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")
-        if sys.stdout is sys.__stdout__ and sys.stderr is not None:
+        if sys.stdout is sys.__stdout__:
             buffering = 1 if sys.stdout.line_buffering else -1
-            sys.stdout = os.fdopen(os.dup(1), "w", buffering, sys.stdout.encoding, "replace")
+            sys.stdout = os.fdopen(os.dup(1), "w", buffering, sys.stdout.encoding, "replace", closefd=False)
             os.dup2(2, 1)
     shown = warnings.showwarning
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +21,8 @@ from ethbrake_marl.progress import Progress, ShownProgress
 
 # special characters allowed in results; the no-break space is used between a number and its unit
 _KEPT = "\n\t\N{NO-BREAK SPACE}"
+
+INTERRUPTED = 130  # exit status after Ctrl-C: 128 + SIGINT, as shells expect
 
 ScenarioOption = Annotated[
     str, typer.Option(metavar="NAME|PATH", help="Name of a shipped or registered scenario, or path of a YAML file.")
@@ -74,7 +76,8 @@ def example(*lines: str) -> str:
 
 
 def say(text: str) -> None:
-    typer.echo(one_line(text), err=True)
+    with suppress(OSError):  # nobody can be told
+        typer.echo(one_line(text), err=True)
 
 
 class Out:
@@ -104,9 +107,16 @@ class Out:
         self.show_progress.end()
         if isinstance(error, KeyboardInterrupt):
             self.interrupted(f"interrupted; {self.remains}")
+        if isinstance(error, SystemExit):
+            raise InvalidInput(f"your own code ended the process: SystemExit: {error.code}") from error
 
-    def result(self, content: Any, *shown: RenderableType, end: str = "\n") -> None:
-        """Print the result: ``content`` as JSON if the user gave ``--json``, otherwise ``shown``."""
+    def result(self, content: Any, *shown: RenderableType, end: str = "\n", kept: bool = False) -> None:
+        """Print the result: ``content`` as JSON if the user gave ``--json``, otherwise ``shown``.
+
+        ``kept``: a file contains the result, so nothing is lost if standard output is closed.
+        """
+        if kept and not self._stdout.writable():
+            return
         if self.as_json:
             self.print_json(content)
         else:
@@ -156,7 +166,7 @@ class Out:
 
     def interrupted(self, text: str) -> NoReturn:
         self.note(text)
-        raise typer.Exit(130)  # 128 + SIGINT, as shells expect
+        raise typer.Exit(INTERRUPTED)
 
     def progress(self, name: str, done: int, total: int) -> None:
         self.show_progress(Progress(name, done, total))
@@ -165,11 +175,17 @@ class Out:
 class _PlainConsole(Console):
     """Console of the library rich that prints texts literally, without markup, and escapes control characters.
 
+    In a notebook, too, it prints to ``file``.
+
     ``width`` is in characters; None: the terminal's width.
     """
 
     def __init__(self, file: TextIO, *, width: int | None = None) -> None:
-        super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False)
+        super().__init__(file=file, width=width, markup=False, emoji=False, highlight=False, force_jupyter=False)
+
+    def on_broken_pipe(self) -> NoReturn:
+        """Raise the ``BrokenPipeError`` again; rich would discard stderr, where stdout is redirected, and exit."""
+        raise
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for piece in super().render(renderable, options):

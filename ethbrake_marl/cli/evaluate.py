@@ -123,10 +123,11 @@ def _show(out: Out, every: dict[str, Compared], output: Path | None, per_world: 
     if len(tables) > 1:
         sheet = summarise_lists(tables, results)
         scenarios = (name for name, table in tables.items() for _ in table)
-        out.result([{"scenario": name, **row} for name, row in zip(scenarios, sheet.json(), strict=True)], sheet)
+        rows = [{"scenario": name, **row} for name, row in zip(scenarios, sheet.json(), strict=True)]
+        out.result(rows, sheet, kept=output is not None)
         return
     (table,) = tables.values()
-    out.result(table.to_json(), *table.tables())
+    out.result(table.to_json(), *table.tables(), kept=output is not None)
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:

@@ -82,7 +82,7 @@ def run_command(
             f" {experiment.learned}{'' if single else f' (scheme {trained.training.scheme})'} with a shield. All agents"
             f" minimise {harm}{f', except that the {experiment.learned} minimises {own}' if own else ''}.\n"
         )
-        out.result(experiment.compared.table.to_json(), Text(headline), *tables)
+        out.result(experiment.compared.table.to_json(), Text(headline), *tables, kept=True)
         out.note(where)
         tell_end(out, trained.status, trained.steps, trained.directory)
 

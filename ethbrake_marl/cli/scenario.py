@@ -289,4 +289,4 @@ def scenario_sample(
         elif output is not None:
             out.write(output, "\n".join([*lines, ""]), what="worlds")
         if output is None or out.as_json:
-            out.result(states, *lines)
+            out.result(states, *lines, kept=output is not None)

@@ -195,6 +195,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
         },
         table,
         f"\nThe agent is {result.agent}. Evaluate it on other worlds:\n  {command}",
+        kept=True,
     )
     tell_end(out, result.status, result.steps, result.directory)
 

@@ -26,9 +26,11 @@ import numba
 from numba.core import event
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
 
 from ethbrake_marl.kernel_store import load, save, tell_compilation
+from ethbrake_marl.stopping import Postponed
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -48,7 +50,20 @@ class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
         pass
 
 
+class _Postponer(event.Listener):  # type: ignore[misc]
+    """Postpone Ctrl-C until numba has compiled and stored a function: LLVM's calls of Python lose every exception."""
+
+    postponed = Postponed()
+
+    def on_start(self, happened: event.Event) -> None:
+        self.postponed.begin()
+
+    def on_end(self, happened: event.Event) -> None:
+        self.postponed.end(only_arrived=global_compiler_lock.is_locked())
+
+
 event.register("numba:compile", _Teller())
+event.register("numba:compiler_lock", _Postponer())
 
 
 class _Cache(NullCache):  # type: ignore[misc]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 import threading
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -182,8 +182,8 @@ def _prepared(
 ) -> Iterator[BetweenUpdates]:
     """Build environment and model for a training, without writing anything; at the end restore the random generators.
 
-    Inside the block, Ctrl-C only sets a flag, and torch uses one thread: a second thread makes training 3 to 15 times
-    slower if another process uses the cores.
+    Inside the block, Ctrl-C only sets a flag, and torch has its usual type and device and one thread: a second thread
+    makes training 3 to 15 times slower if another process uses the cores.
     """
     if not _ONE_TRAINING.acquire(blocking=False):
         raise InvalidInput(
@@ -191,16 +191,20 @@ def _prepared(
             " wait until it has ended, or train in another process"
         )
     states = random.getstate(), np.random.get_state(), torch.get_rng_state(), torch.get_num_threads()  # noqa: NPY002
+    dtype, device = torch.get_default_dtype(), torch.get_default_device()
+    usual = nullcontext() if device.type == "cpu" else torch.device("cpu")  # which costs time in every call of torch
     try:
         torch.set_num_threads(1)
+        torch.set_default_dtype(torch.float32)
         evaluate = None if measure is None else measure(training)
-        with stop_on_signal() as stop, closing(make_environment(training)) as environment:
+        with usual, stop_on_signal() as stop, closing(make_environment(training)) as environment:
             yield BetweenUpdates(training, folder, environment, evaluate, Progress.listener(on_progress), stop)
     finally:
         random.setstate(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         torch.set_rng_state(states[2])
         torch.set_num_threads(states[3])
+        torch.set_default_dtype(dtype)
         _ONE_TRAINING.release()
 
 

@@ -1,5 +1,6 @@
 """``docs/internals/layout.md``: ``python -m tests.docs.layout`` makes it from the package, a test compares it."""
 
+import argparse
 import ast
 import tomllib
 from collections import defaultdict
@@ -137,4 +138,5 @@ def page() -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     PAGE.write_text(page(), "utf-8")

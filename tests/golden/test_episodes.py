@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 from pathlib import Path
@@ -67,6 +68,7 @@ def test_episodes__are_those_of_the_record(name: str) -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     found = {name: played(*case) for name, case in CASES.items()}
     DIGESTS.write_text(json.dumps({name: digest for name, (digest, _) in found.items()}, indent=1) + "\n", "utf-8")
     np.savez_compressed(

@@ -6,6 +6,7 @@ change only with the physics. ``python -m tests.golden.test_motion`` records bot
 
 from __future__ import annotations
 
+import argparse
 import hashlib
 import json
 from pathlib import Path
@@ -86,4 +87,5 @@ def test_motion__has_the_bits_of_the_record(name: str) -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     FILE.write_text(json.dumps({name: figures(name) for name in WORLDS}, indent=2) + "\n", "utf-8")

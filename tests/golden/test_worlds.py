@@ -4,6 +4,7 @@
 rejected draws. ``python -m tests.golden.test_worlds`` records them anew, which breaks all lists that people have used.
 """
 
+import argparse
 import hashlib
 import json
 from pathlib import Path
@@ -47,5 +48,6 @@ def test_worlds__are_those_of_the_record(name: str) -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for file, record in ((LISTS, listed), (TRAINING, trained_on)):
         file.write_text(json.dumps({entry.name: record(entry.name) for entry in list_scenarios()}, indent=1) + "\n")

@@ -4,19 +4,24 @@ import errno
 import importlib.util
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import NamedTuple
 from unittest.mock import Mock
 
+import numba
 import pytest
+from numba.core import event
 
 from ethbrake_marl import kernel_store
 from ethbrake_marl.errors import CacheFault
 from ethbrake_marl.motion import compiling
+from ethbrake_marl.stopping import stop_on_signal
 from tests.fixtures.kernels import OWN, give_own_cache
 
 KERNELS = """\
@@ -298,3 +303,32 @@ def test_suite__begins_with_the_sound_files_of_the_users_cache(ask: Callable, tm
         assert [path.name for path in kernel_store.cache_folder().iterdir()] == [sound.name]
     assert kernel_store.cache_folder().parent == user.parent / OWN
     assert {path: path.stat()[:-3] for path in user.iterdir()} == {path: old[:-3] for path, old in before.items()}
+
+
+def test_ctrl_c_while_llvm_calls_python__is_no_lost_exception() -> None:
+    """LLVM hands a finished function over by a call of Python, whose exceptions vanish."""
+    thirds = numba.njit(lambda x: x / 3.0)
+    calls = []
+
+    def interrupt(frame: FrameType, happened: str, argument: object) -> None:
+        if frame.f_code.co_name == "_raw_object_cache_notify" and happened == "call" and not calls:
+            calls.append(frame)
+            signal.raise_signal(signal.SIGINT)
+
+    sys.setprofile(interrupt)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            thirds(6.0)
+    finally:
+        sys.setprofile(None)
+    assert calls and thirds(6.0) == 2.0
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_ctrl_c_while_llvm_calls_python__reaches_a_handler_that_does_not_raise() -> None:
+    with stop_on_signal() as stop:
+        event.start_event("numba:compiler_lock")
+        signal.raise_signal(signal.SIGINT)
+        assert not stop()
+        event.end_event("numba:compiler_lock")
+        assert stop()

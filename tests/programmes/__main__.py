@@ -28,7 +28,7 @@ def main(words: list[str]) -> int:
     """Run the cases of a programme. Return 0 if a case ran and none failed, 1 if not, 2 for an unknown name."""
     if not words or words[0] not in programmes():
         print("\n".join(f"{name:12} {line}" for name, line in programmes().items()))
-        return 2 if words else 0
+        return 2 if {*words} - {"-h", "--help"} else 0
     programme = import_module(f"tests.programmes.{words[0]}")
     parser = argparse.ArgumentParser(
         f"python -m tests.programmes {words[0]}",

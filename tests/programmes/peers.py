@@ -7,6 +7,7 @@ processor time (all threads) of a process that does nothing else.
 
 from __future__ import annotations
 
+import argparse
 import json
 import statistics
 import sys
@@ -214,4 +215,6 @@ def cases(given: Given) -> Cases:
 
 
 if __name__ == "__main__":
-    tell(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", choices=[*LOOPS], help="simulator")
+    tell(parser.parse_args().name)

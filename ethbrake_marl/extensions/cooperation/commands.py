@@ -96,7 +96,7 @@ def ablate_command(
             measured = with_optima(plan, measure(plan, out.show_progress), jobs or 1, out.show_progress)
             results, paths = write_ablation(plan, measured)
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
-        out.result(results, *tables(results), results["conditions"], *alarms)
+        out.result(results, *tables(results), results["conditions"], *alarms, kept=True)
         out.note(f"results: {', '.join(map(str, paths))}")
 
 

@@ -93,7 +93,7 @@ def front_command(
         output.mkdir(parents=True, exist_ok=True)
         out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
         out.write(output / "front.png", picture_bytes(front_figure(results), "front.png"), "figure")
-        out.result(results, front_sheet(results), hypervolume_sheet(results))
+        out.result(results, front_sheet(results), hypervolume_sheet(results), kept=True)
 
 
 FRONT = Part(

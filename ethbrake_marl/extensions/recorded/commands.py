@@ -71,7 +71,7 @@ def from_data_command(
             out.write(rows, result.csv, what="rows")
         out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
         lists = {"found": result.found, "refused": result.refused, "skipped": result.skipped}
-        out.result({"scenario": str(output), "rows": str(rows), **lists}, *result.found)
+        out.result({"scenario": str(output), "rows": str(rows), **lists}, *result.found, kept=True)
 
 
 FROM_DATA = Part(

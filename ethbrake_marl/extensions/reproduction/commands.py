@@ -72,7 +72,7 @@ def reproduce_command(
         results = items.reproduce(settings, chosen, this_machine(), force=out.force)
         if results is None:
             out.interrupted(f"interrupted; {REMAINS}")
-        out.result(items.plain(results), items.overview(results))
+        out.result(items.plain(results), items.overview(results), kept=True)
         if not full:
             out.note(items.QUICK)
         out.note(f"page: {output / items.PAGE}")

@@ -6,7 +6,7 @@ scenario and searches one world, and compares the bits with the same code withou
 
 from __future__ import annotations
 
-import sys
+import argparse
 from typing import Any
 
 import numpy as np
@@ -24,11 +24,14 @@ def launch(kernel: Kernel, on: torch.device, n: int, *given: Any) -> None:
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("worlds", type=int, help="worlds of each scenario")
+    given = parser.parse_args()
     asked = {"rounds": 1, "restarts": 1, "drawn": 2, "changes": 3, "device": "cpu"}
     (ends, commands), values = search(problem(1), **asked)
     Kernel.launch = launch  # type: ignore[method-assign]
     for name in SIX.values():
-        print(name, whole_episodes(name, int(sys.argv[1])))
+        print(name, whole_episodes(name, given.worlds))
     again, the_same = search(problem(1), **asked)
     assert np.array_equal(again.ends, ends) and np.array_equal(again.commands_mps2, commands) and values == the_same
     print("search", values["first"].item())
