@@ -245,7 +245,7 @@ def take(memory: Any, rows: Any) -> Any:
 
 
 def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
-    """A memory (``mapped``) with ``new`` in ``rows``: a copy, or with ``donate`` the same arrays, if they are writable."""
+    """A memory (``mapped``) with ``new`` in ``rows``: a copy, or with ``donate`` the same writable arrays."""
 
     def written(old: Any, part: Any) -> Any:
         array = old if donate and old.flags.writeable else old.copy()

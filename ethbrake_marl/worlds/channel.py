@@ -112,6 +112,8 @@ class Extension(Protocol):
 
 def register_v2x_extension(key: str, extension: Extension) -> None:
     """Register the extension for a key of ``v2x``. Entry points: ``ethbrake_marl.v2x_extensions``."""
+    if extension.name in ("physics", "shaping", "shield"):  # memories that a game has itself
+        raise InvalidInput(f"key {key!r} of v2x: the name of its memory, {extension.name!r}, is in use; choose another")
     EXTENSIONS.add(key, extension, lambda other: other is extension)
 
 
@@ -126,7 +128,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     "sensors-only": {"hears": "none"},
 }  # the key `preset` of a preset of the user names the one of these on which it is based
 
-OF_GAME = ("physics", "shaping", "shield")  # names of memories that no extension may have
 OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
 
 
@@ -197,12 +198,11 @@ class V2X(Part):
 
     def _check(self) -> None:
         """Refuse keys without effect, and a channel by which a vehicle may never learn anything."""
-        owners: dict[str, str | None] = dict.fromkeys(OF_GAME)
-        for key in self.model_extra or ():
-            owner = owners.setdefault(EXTENSIONS[key].name, key)
-            right = f"has the same name of its memory, {EXTENSIONS[key].name!r}, as {owner or 'a part of every game'}"
-            alike = owner is not None and EXTENSIONS[owner] is EXTENSIONS[key]
-            require(alike, (key,), UNSHOWN, f"{right}; leave one of them out, or rename the memory")
+        keys = {EXTENSIONS[key]: key for key in self.model_extra or ()}.values()
+        right = (
+            f"{' and '.join(keys)} belong to different extensions, whose games would replace each other; leave one out"
+        )
+        require(len(keys) < 2, (), UNSHOWN, right)
         used = [key for extension in self.extensions for key in extension.uses(self)]
         unused = [key for key in OF_MESSAGES if key not in used]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)

@@ -15,8 +15,7 @@ from ethbrake_marl.episode.objectives import Declared, free_pairs, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import FreeImpacts, InvalidInput
-from ethbrake_marl.worlds.channel import EXTENSIONS
+from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.worlds.physics import PHYSICS
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -60,26 +59,18 @@ def game_of(
             observation={**now, **observation} if isinstance(observation, Mapping) else observation
         )
     bodies = np.array(scenario.learners, np.int64)
-    times = scenario.time_step_s, scenario.horizon_s
-    rewarding, rules = Rewarding.of(reward, scenario.objective, scenario.vehicles, bodies, times, reward_vector, report)
+    rewarding, rules = Rewarding.of(
+        reward, scenario.objective, scenario.vehicles, bodies, (scenario.time_step_s, scenario.horizon_s),
+        reward_vector, report,
+    )  # fmt: skip
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))
     game = Game(Pool(scenario), scenario.name, rules, rewarding, views, bodies, scripts)
-    v2x = (scenario.members or (scenario,))[0].v2x  # members of a mixture have the same extensions
-    layers: dict[Any, str] = {EXTENSIONS[key]: f"key v2x.{key}" for key in v2x.model_extra or ()}
+    for extension in (scenario.members or (scenario,))[0].v2x.extensions:  # members of a mixture have the same
+        game = extension.game(game)
     if scenario.physics is not None:
-        layers[PHYSICS[scenario.physics]] = f"physics {scenario.physics}"
-    last = ""
-    for layer, name in layers.items():
-        changed = layer.game(game)
-        if not isinstance(changed, type(game)):
-            raise InvalidInput(
-                f"scenario {scenario.name!r}: {name} replaces the game of {last}; leave one of them out, or let {name}"
-                " return a subclass of the game's own class"
-            )
-        last = last if type(changed) is type(game) else name
-        game = changed
+        game = PHYSICS[scenario.physics].game(game)
     return scenario, game
 
 

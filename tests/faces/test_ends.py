@@ -19,7 +19,8 @@ NEWS = PAPER.replace(
     v2x={"preset": "nominal", "link_latency_s": 0.25, "persistence": "periodic", "tells": ["place", "speed"]}
 )
 EVERY = {
-    "harm": 1.0, "harm_count": "honest", "terminal": 3.0, "shaping": 0.5, "still_moving": 7.0, "risk": 0.1, "last": 11.0,
+    "harm": 1.0, "harm_count": "honest", "terminal": 3.0, "shaping": 0.5, "still_moving": 7.0, "risk": 0.1,
+    "last": 11.0,
 }  # fmt: skip
 NAMES = {"vector": "max_episode_steps"}  # of the argument; otherwise max_cycles
 

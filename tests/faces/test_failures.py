@@ -24,7 +24,8 @@ class NextStep(Vector):
         self.env, self.n = wrap(eb.EthBrakeVectorEnv(n, scenario, **settings)), n
 
     def step(self, action: Any) -> Any:
-        return SimpleNamespace(bits=lambda given=self.env.step(action): repr(given).encode())
+        told = repr(self.env.step(action)).encode()
+        return SimpleNamespace(bits=lambda: told)
 
 
 INTERFACES: dict[str, Callable[..., Any]] = {**BARE, "next step": NextStep}
@@ -32,11 +33,11 @@ SHORT = PAPER.replace(horizon_s=1.0)  # five steps; Vehicle 3 may act at 0.8 s
 
 
 class Trap:
-    """A part of the user's: raises while it is ``set`` if ``when`` holds."""
+    """A part of a user that raises while it is set."""
 
     is_set = False
 
-    def spring(self, what: Any = None) -> None:
+    def spring(self) -> None:
         if self.is_set:
             raise ZeroDivisionError("the user's own")
 
@@ -152,7 +153,13 @@ def standing(env: Any) -> str:
     """Everything that the next call begins from."""
     base = env.unwrapped
     saved = base.snapshot() if hasattr(base, "snapshot") else None
-    parts = [base.episode, base.stream[2:], saved, getattr(base, "_np_random_seed", None), getattr(base, "_options", None)]
+    parts = [
+        base.episode,
+        base.stream[2:],
+        saved,
+        getattr(base, "_np_random_seed", None),
+        getattr(base, "_options", None),
+    ]
     with np.printoptions(threshold=10**9, floatmode="unique"):
         return repr(parts)
 
@@ -191,7 +198,7 @@ def test_reset_and_step__that_fail_can_be_called_again(name: str, culprit: str) 
         seen = [interface.reset(7).tobytes(), interface.reset().tobytes()]
         runs.append(seen + [interface.step(action).bits() for action in actions(3, 13, interface.n)])
     assert runs[0] == runs[1] and len(failures) >= 2
-    assert any(failures) or culprit == "begin" and n == 1  # an episode alone begins only in a reset
+    assert any(failures) or (culprit == "begin" and n == 1)  # an episode alone begins only in a reset
 
 
 @pytest.mark.parametrize("name", ["shielded vector", "shielded sb3", "shielded parallel"])

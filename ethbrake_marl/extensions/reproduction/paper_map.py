@@ -158,11 +158,10 @@ class MappedGame(Game):
 
 class PaperMap:
     def check(self, scenario: Scenario) -> None:
-        """Raise an error for an obstacle, brakes that build up, and messages."""
+        """Raise an error for an obstacle, and for brakes that build up."""
         right = "is not known to physics: paper-map; leave one of the two out"
         for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
             require(key not in scenario.sources, (key,), UNSHOWN, right)
-        require(not scenario.v2x.extensions, ("v2x",), UNSHOWN, right)
 
     def game(self, game: Game) -> Game:
         """Return the game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
