@@ -335,6 +335,7 @@ def open_game(
     reward: Any = "harm",
     observation: Any = None,
     reward_vector: Any = None,
+    report: Sequence[str] = (),
 ) -> tuple[Scenario, Game]:
     """Return a scenario and its game. Vehicles whose role names an agent are driven by this agent.
 
@@ -343,7 +344,7 @@ def open_game(
     loaded = load_scenario(scenario)
     if learners is not None:
         loaded = loaded.with_learners(learners)
-    return game_of(loaded, scripts_of(loaded), reward, observation, reward_vector)
+    return game_of(loaded, scripts_of(loaded), reward, observation, reward_vector, report)
 
 
 def check_learners(scenario: Scenario) -> None:

@@ -31,35 +31,37 @@ SMALL = 1e-3  # a gain in harm (m2/s2) too small to search for
 TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
-def coupled(alert: State, body: int, count: str = "first", horizon_s: float = 8.0) -> Choice:
+def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Floats = 8.0) -> Choice:
     """Return the constant deceleration of vehicle ``body`` with the least simulated harm in every world, and this harm.
 
     All other vehicles hold ``alert.wanted``. ``count`` is the harm to minimise (``episode.counts``). If the closed
     form's choice does no harm, it is the result. Ties: the least harm in the other count decides, then the middle
     deceleration. The harm has kinks and jumps, so a deceleration between two samples of the search may do less.
+    ``horizon_s``: time until which harm counts, one for all worlds or one for each, [n].
     """
+    until_s = np.full(alert.n, horizon_s, np.float64)
     braking = np.maximum(-alert.wanted, 0.0)
     braking[:, body] = alert.car[:, BRAKING, body]
     best = closed_form(alert, braking, body).deceleration_mps2
-    harm = harms(alert, body, best[:, np.newaxis], count, horizon_s)[:, :, 0]
+    harm = harms(alert, body, best[:, np.newaxis], count, until_s)[:, :, 0]
     rows = np.flatnonzero(harm.any(axis=0))
     if len(rows):
-        best[rows], harm[0, rows], _ = search(alert.take(rows), body, count, horizon_s).T
+        best[rows], harm[0, rows], _ = search(alert.take(rows), body, count, until_s[rows]).T
     failed = np.flatnonzero(np.isinf(harm[0]))  # for every deceleration
     if len(failed):
-        raise failure(alert, failed[0], alert.time_s[failed[0]], horizon_s)
+        raise failure(alert, failed[0], alert.time_s[failed[0]], until_s[failed[0]])
     return Choice(best, harm[0])
 
 
-def harms(alert: State, body: int, tried: Floats, count: str, horizon_s: float) -> Floats:
+def harms(alert: State, body: int, tried: Floats, count: str, until_s: Floats) -> Floats:
     """Return the harm if vehicle ``body`` holds each of the decelerations ``tried`` [n, C] (m/s2), [2, n, C].
 
     The first row is the harm in ``count``, the second in the count that breaks ties.
     """
-    return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], horizon_s, count)
+    return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], until_s, count)
 
 
-def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
+def search(alert: State, body: int, count: str, until_s: Floats) -> Floats:
     """Return the best deceleration of each world and its harm, in ``count`` and in the count that breaks ties: [n, 3].
 
     It divides all decelerations into ``FIRST_PARTS`` equal cells, and then repeatedly those cells that may contain a
@@ -69,14 +71,14 @@ def search(alert: State, body: int, count: str, horizon_s: float) -> Floats:
     best = np.full((alert.n, 3), np.inf)
     rows, step = np.arange(alert.n), alert.car[:, BRAKING, body] / FIRST_PARTS
     at = step[:, np.newaxis] * np.arange(FIRST_PARTS + 1)
-    harm = harms(alert, body, at, count, horizon_s)
+    harm = harms(alert, body, at, count, until_s)
     while len(rows):
         cells = np.empty((2, at.size), np.int64)
         row, part = cells[:, : find_cells(rows, at, harm, step, best, cells)]
         left, right = harm[:, row, part, np.newaxis], harm[:, row, part + 1, np.newaxis]
         rows, step = rows[row], step / PARTS
         at = at[row, part, np.newaxis] + step[rows, np.newaxis] * np.arange(PARTS + 1)
-        inside = harms(alert.take(rows), body, at[:, 1:-1], count, horizon_s)
+        inside = harms(alert.take(rows), body, at[:, 1:-1], count, until_s[rows])
         harm = np.concatenate([left, inside, right], axis=2)
     return best
 

@@ -112,7 +112,8 @@ class Game(NamedTuple):
         Raises ``InvalidInput`` for worlds of another physics.
         """
         check_exact(alert, f"scenario {self.name!r}")
-        return one_step.first_decision(alert, self.deciders, self.rules.time_step_s, self.rules.horizon_s)
+        rules = self.rules
+        return one_step.first_decision(alert, self.deciders, rules.time_step_s, rules.horizon_s, rules.most_steps)
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """``step`` (same arguments) without the shield, and without reward terms other than harm and terminal."""

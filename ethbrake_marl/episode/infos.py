@@ -11,7 +11,7 @@ world_first_impact_harm   harm of the whole line so far, first impact of each pa
 world_total_harm          the same over all impacts
 collided                  whether the world has had an impact
 cost                      harm of the line in the last step, in the reward's count, m2/s2
-reward_NAME               term NAME of the reward in the last step, without its weight
+reward_NAME               term NAME of the reward or of ``report`` in the last step, without its weight
 world_seed, world         seed and number of the world; the number is -1 for a world made by the caller
 shield_NAME               values that a shield reports
 ========================  ==========================================================================================
@@ -74,13 +74,13 @@ def numbers(state: State, bodies: Ints) -> Floats:
 
 def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str, Any]:
     """Cost, seed, world number and reward terms: name -> [n] or [n, N]. ``step`` is None after a reset."""
-    counted = game.rewarding.counted
+    reported = game.rewarding.reported
     worlds = {"world_seed": np.full(state.n, seed), "world": state.clock[:, NUMBER].astype(np.int64)}
     if step is None:
         nothing = np.zeros(state.n)
-        return {"cost": nothing, **worlds, **{f"reward_{name}": nothing for name in counted}}
+        return {"cost": nothing, **worlds, **{f"reward_{name}": nothing for name in reported}}
     terms = step.terms or game.rewarding.shared(step)
-    return {"cost": step.counted, **worlds, **{f"reward_{name}": terms[name] for name in counted}}
+    return {"cost": step.counted, **worlds, **{f"reward_{name}": terms[name] for name in reported}}
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:

@@ -28,7 +28,7 @@ def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
 
 
 @large
-def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, horizon_s, count, scratch, out):
+def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, count, scratch, out):
     """Follow plans [n, T, L] of the L learners, in place; write the harm to ``out`` [n].
 
     An episode stops above the harm ``most`` [n]. After T decisions the last one repeats. The other arguments are those
@@ -38,7 +38,7 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, ho
         harm = amount_so_far(line[k], count)
         while clock[k, ENDED] == 0.0 and harm <= most[k]:
             command(car[k], wanted[k], learners, plans[k, min(int(clock[k, STEPS]), plans.shape[1] - 1)])
-            met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s, horizon_s)
+            met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
             harm = math.inf if met == FAILED else amount_so_far(line[k], count)
         out[k] = harm
 
@@ -48,7 +48,7 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, mem
     """Write the harm to ``out`` [2, n, C] if ``bodies`` [B] hold the commands ``tried`` [n, C, B] (m/s2).
 
     The other bodies hold ``wanted``. Row 0 of ``out`` counts by the weights ``count`` [6], row 1 by ``other``. ``time``
-    [n] and ``until`` (s): from when to when they hold. ``line``, ``car`` and ``wanted`` are arrays of a ``State``;
+    and ``until`` [n] (s): from when to when they hold. ``line``, ``car`` and ``wanted`` are arrays of a ``State``;
     ``memory``: ``working_memory``, overwritten.
     """
     scratch, here, commands = memory
@@ -61,7 +61,7 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, mem
                     here[row, i] = line[k, row, i]
             for b in range(len(bodies)):
                 commands[bodies[b]] = tried[k, j, b]
-            failed = drive(here, car[k], commands, scratch, time[k], until) == FAILED
+            failed = drive(here, car[k], commands, scratch, time[k], until[k]) == FAILED
             note_motion(here)
             out[0, k, j] = math.inf if failed else amount_so_far(here, count)
             out[1, k, j] = math.inf if failed else amount_so_far(here, other)
@@ -88,7 +88,7 @@ def played(
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     out, rules = np.empty(len(plans)), game.rules
     play_worlds(
-        line, car, clock, wanted, plans, most, rules.learners, rules.time_step_s, rules.horizon_s, weights_of(count),
+        line, car, clock, wanted, plans, most, rules.learners, rules.time_step_s, weights_of(count),
         scratch_for(wanted.shape[1]), out,
     )  # fmt: skip
     return State(line, car, clock, know, wanted, memories), out
@@ -99,8 +99,10 @@ def price(game: Game, state: State, plans: Floats, count: Count, most: Any = mat
     return played(game, state, plans, count, most)[1]
 
 
-def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float, count: Count) -> Floats:
-    """Harm if ``bodies`` hold constant commands until the horizon ``until_s``, [2, n, C] m2/s2.
+def hold(
+    state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, until_s: float | Floats, count: Count
+) -> Floats:
+    """Harm if ``bodies`` hold constant commands until ``until_s`` (one time or [n]), [2, n, C] m2/s2.
 
     The first row is the harm in ``count``, the second in the count that decides ties. ``tried`` [n, C, B] are C sets of
     commands for the B bodies (m/s2); the other bodies hold ``wanted`` [n, N + 1].
@@ -110,13 +112,13 @@ def hold(state: State, wanted: Floats, bodies: Sequence[int], tried: Floats, unt
     out, counts = np.empty((2, *tried.shape[:2])), (weights_of(count), weights_of(other_count(count)))
     hold_worlds(
         state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(tried),
-        state.time_s.copy(), until_s, *counts, working_memory(wanted.shape[1]), out,
+        state.time_s.copy(), np.full(state.n, until_s, np.float64), *counts, working_memory(wanted.shape[1]), out,
     )  # fmt: skip
     return out
 
 
 def descend(
-    state: State, bodies: Sequence[int], shares: Floats, rounds: int, horizon_s: float, count: Count
+    state: State, bodies: Sequence[int], shares: Floats, rounds: int, until_s: float | Floats, count: Count
 ) -> tuple[Floats, Floats]:
     """Choose the best constant share of each body's brakes, one body after the other, while all others brake fully.
 
@@ -126,7 +128,7 @@ def descend(
     wanted, least = -state.car[:, BRAKING], np.zeros(state.n)
     for body in list(bodies) * rounds:
         tried = -state.car[:, BRAKING, [body]] * shares
-        harm = hold(state, wanted, [body], tried[:, :, np.newaxis], horizon_s, count)[0]
+        harm = hold(state, wanted, [body], tried[:, :, np.newaxis], until_s, count)[0]
         wanted[:, body] = np.take_along_axis(tried, harm.argmin(axis=1)[:, np.newaxis], 1)[:, 0]
         least = harm.min(axis=1)
     return wanted, least

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import not_
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -183,18 +183,27 @@ class Rewarding(NamedTuple):
 
     params: RewardParams
     counted: tuple[str, ...]  # names of the terms whose weight is not 0
-    terms: tuple[tuple[str, float, TermFunction], ...]  # name, weight (0: only a component) and function
+    reported: tuple[str, ...]  # these terms, and others whose value infos contain
+    terms: tuple[tuple[str, float, TermFunction], ...]  # name, weight (0: only a component or in infos) and function
     shaping: Shaping | None
     components: tuple[str, ...]  # of a vector reward
 
     @classmethod
     def of(
-        cls, reward: Reward, objective: Declared, vehicles: int, learners: Ints, times: tuple[float, float], vector: Any
+        cls,
+        reward: Reward,
+        objective: Declared,
+        vehicles: int,
+        learners: Ints,
+        times: tuple[float, float],
+        vector: Any,
+        report: Sequence[str] = (),
     ) -> tuple[Rewarding, Rules]:
         """The reward, and the rules of a step with its weights.
 
         ``objective`` is the scenario's; ``times`` are time step and horizon (s); ``vector`` lists the components of a
-        vector reward, or is None. Warns if an objective has no effect.
+        vector reward, or is None; ``report`` lists terms whose value infos contain, with or without a weight. Warns if
+        an objective has no effect.
         """
         params = reward_params(reward)
         declared = objective if params.objective is None else params.objective
@@ -203,7 +212,12 @@ class Rewarding(NamedTuple):
         except InvalidInput as error:
             raise InvalidInput(f"reward: {error}") from None
         line_only = all(each.kind is OBJECTIVES["total"] for each in objectives)
-        if not line_only and params.harm == 0.0:
+        if isinstance(report, str) or not isinstance(report, Sequence):
+            raise InvalidInput(f"report = {report!r}: must be a list of names of terms, such as ['risk', 'jerk']")
+        for name in report:
+            if name not in (*BUILT_IN, *own_terms()):
+                raise unknown_name("term", name, (*BUILT_IN, *own_terms()), may_be_own=True)
+        if not line_only and params.harm == 0.0 and "harm" not in report:
             what = declared if isinstance(declared, str) else ", ".join(declared)
             warnings.warn(
                 WithoutEffect(
@@ -220,6 +234,7 @@ class Rewarding(NamedTuple):
         harm = params.harm if line_only else 0.0  # the compiled step rewards the line's harm; `growth` any other
         rules = Rules(learners, *times, harm, params.terminal, COUNTS[params.harm_count])
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
+        reported = tuple(dict.fromkeys((*counted, *report)))
         components = () if vector is None else components_of(vector, counted, vehicles)
         functions: dict[str, TermFunction] = {
             "harm": partial(growth, objectives, params.harm_count),
@@ -229,13 +244,13 @@ class Rewarding(NamedTuple):
             "push": push,
             "drove": drove,
             "still_moving": still_moving,
-            **{name: TERMS[name].value for name in params.terms},
+            **{name: TERMS[name].value for name in reported if name not in BUILT_IN},
             **{name: component(name, params.harm_count) for name in components if name not in counted},
         }
-        needed = {*counted, *components} - ({"harm"} if line_only else set())
+        needed = {*reported, *components} - ({"harm"} if line_only else set())
         terms = tuple((n, params.weights.get(n, 0.0), function) for n, function in functions.items() if n in needed)
-        shaping = Shaping(rules, params.shaping_discount) if params.shaping else None
-        return cls(params, counted, terms, shaping, components), rules
+        shaping = Shaping(rules, params.shaping_discount) if "shaping" in reported else None
+        return cls(params, counted, reported, terms, shaping, components), rules
 
     @property
     def is_compiled(self) -> bool:
@@ -251,13 +266,13 @@ class Rewarding(NamedTuple):
         for name, weight, _ in self.terms:
             if weight:
                 extra += weight * _wide(values[name])
-        if self.shaping is not None:
+        if self.params.shaping:
             extra += self.params.shaping * values["shaping"]
         extra[before.ended] = 0.0
         known = {**self.shared(step), **values}
         step = step._replace(reward=step.reward + extra, terms=known)
         if self.components:
-            step = step._replace(terms={name: known[name] for name in known if name in self.counted})
+            step = step._replace(terms={name: known[name] for name in known if name in self.reported})
             vector = np.stack([np.broadcast_to(_wide(known[name]), extra.shape) for name in self.components], axis=2)
             vector[before.ended] = 0.0
             step = step._replace(vector=vector)
@@ -266,7 +281,7 @@ class Rewarding(NamedTuple):
     def shared(self, step: Step) -> dict[str, Floats]:
         """Values of the terms that the compiled step computes, name -> [n]."""
         known = {"harm": -step.counted, "terminal": step.out[SAFE_END]}
-        return {name: value for name, value in known.items() if name in self.counted}
+        return {name: value for name, value in known.items() if name in self.reported}
 
 
 def _wide(value: Floats) -> Floats:

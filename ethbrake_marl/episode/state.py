@@ -31,10 +31,11 @@ from ethbrake_marl.motion.layout import (
 TIME = 0  # time since the alert (s)
 FIRST_DECISION = 1  # time of the first decision (s)
 STEPS = 2  # number of steps taken
-LAST = 3  # number of the step that ends at the horizon
+LAST = 3  # number of the last step, unless all vehicles come to rest before
 ENDED = 4  # 1 once the episode has ended
 NUMBER = 5  # number of the world in its list; -1: the caller has made it
-CLOCK_COLUMNS = 6
+END = 6  # time at which the last step ends (s): the horizon, or earlier after `Rules.most_steps`
+CLOCK_COLUMNS = 7
 
 PHYSICS = "physics"  # a memory of this name marks worlds whose impacts are not exact (`worlds.physics`)
 
@@ -244,10 +245,10 @@ def take(memory: Any, rows: Any) -> Any:
 
 
 def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
-    """A memory (``mapped``) with ``new`` in ``rows``: a copy, or with ``donate`` the same arrays."""
+    """A memory (``mapped``) with ``new`` in ``rows``: a copy, or with ``donate`` the same writable arrays."""
 
     def written(old: Any, part: Any) -> Any:
-        array = old if donate else old.copy()
+        array = old if donate and old.flags.writeable else old.copy()
         array[rows] = part
         return array
 

@@ -11,6 +11,7 @@ import numpy as np
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.state import (
     CLOCK_COLUMNS,
+    END,
     ENDED,
     FIRST_DECISION,
     LAST,
@@ -47,7 +48,7 @@ from ethbrake_marl.motion.layout import (
 HARM = 0  # first-impact harm of the step (m2/s2)
 TOTAL_HARM = 1  # harm of all impacts of the step (m2/s2)
 TERMINATED = 2  # 1 if all vehicles have come to rest
-TRUNCATED = 3  # 1 if the horizon has come first
+TRUNCATED = 3  # 1 if the end of the last step has come first
 SAFE_END = 4  # 1 if the episode has ended without any impact
 COUNTED = 5  # harm of the step in the reward's count (m2/s2)
 OUT_ROWS = 6
@@ -65,6 +66,7 @@ class Rules(NamedTuple):
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
     counting: Floats = COUNTS["first"]  # weights of what counts in the reward (``episode.counts``)
+    most_steps: float = np.inf  # number of steps after which an episode is truncated, as at the horizon
 
 
 class Step(NamedTuple):
@@ -108,7 +110,7 @@ class Step(NamedTuple):
 
     @property
     def truncated(self) -> Bools:
-        """Whether the episode ended in this step at the horizon, [n]."""
+        """Whether the episode ended in this step at the horizon, or after the most steps (``Rules``), [n]."""
         return self.out[TRUNCATED] == 1.0
 
     @property
@@ -139,13 +141,13 @@ def stands(line, wanted):
 
 @kernel
 def note_motion(line):
-    """Store each vehicle's squared speed at the horizon in the row MOVING of one world's ``line``."""
+    """Store each vehicle's squared speed at the end in the row MOVING of one world's ``line``."""
     for i in range(1, line.shape[1]):
         line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
 
 
 @kernel
-def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
+def advance(line, car, clock, wanted, scratch, time_step_s):
     """Advance one running world to its next decision, in place; return ``drive``'s result, and whether all is at rest.
 
     Arguments as in ``step_worlds``, without the axis of worlds. Decision times are multiples of the time step after the
@@ -153,7 +155,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s, horizon_s):
     """
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
-    until = horizon_s if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
+    until = clock[END] if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
     met = drive(line, car, wanted, scratch, clock[TIME], until)
     clock[TIME] = until
     at_rest = met != FAILED and stands(line, wanted)
@@ -177,9 +179,7 @@ def beside_harm(line: Floats, count: Floats) -> float:
 
 
 @large
-def step_worlds(
-    line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, horizon_s, harm, terminal, count
-):
+def step_worlds(line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, harm, terminal, count):
     """Advance every running episode by one step, in place; return the row of an invalid action and of a failed world.
 
     -1 stands for none. An action is invalid if it is not a number in [-1, 1]; then nothing has moved. ``line`` to
@@ -201,7 +201,7 @@ def step_worlds(
             continue
         command(car[k], wanted[k], learners, actions[k])
         before = beside_harm(line[k], count)
-        met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s, horizon_s)
+        met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
         if met == FAILED:
             failed = k
         impacts = 0.0
@@ -276,15 +276,19 @@ def advanced(state: State, until_s: Floats) -> State:
     return state._replace(line=line, car=car, clock=clock, wanted=wanted)
 
 
-def first_decision(alert: State, deciders: Ints, time_step_s: float, horizon_s: float) -> State:
+def first_decision(
+    alert: State, deciders: Ints, time_step_s: float, horizon_s: float, most_steps: float = np.inf
+) -> State:
     """Episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
 
-    Until then all vehicles hold ``alert.wanted``.
+    Until then all vehicles hold ``alert.wanted``. The other arguments are those of ``Rules``.
     """
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
     state = advanced(alert, first)
     state.clock[:, FIRST_DECISION] = first
-    state.clock[:, LAST] = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
+    steps = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
+    state.clock[:, LAST] = np.minimum(steps, most_steps)
+    state.clock[:, END] = np.where(steps <= most_steps, horizon_s, first + most_steps * time_step_s)
     return state
 
 
@@ -303,8 +307,8 @@ def step(
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
     scratch = scratch_for(wanted.shape[1])
     refused, failed = step_worlds(
-        line, car, clock, wanted, actions, scratch, out, reward, rules.learners, rules.time_step_s, rules.horizon_s,
-        rules.harm, rules.terminal, rules.counting,
+        line, car, clock, wanted, actions, scratch, out, reward, rules.learners, rules.time_step_s, rules.harm,
+        rules.terminal, rules.counting,
     )  # fmt: skip
     if refused >= 0:
         _check_actions(rules, actions[refused])

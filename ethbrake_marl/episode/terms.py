@@ -35,7 +35,7 @@ from ethbrake_marl.episode.counts import ROWS, own_amounts, pair_amounts
 from ethbrake_marl.episode.functions import called, check_finite, described
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.play import descend
-from ethbrake_marl.episode.state import State, check_exact
+from ethbrake_marl.episode.state import END, State, check_exact
 from ethbrake_marl.episode.step import Rules, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
@@ -144,7 +144,7 @@ def potential(rules: Rules, state: State) -> Floats:
     further = state.line.copy()
     further[:, ROWS] = 0.0
     state = state._replace(line=further)
-    _, least = descend(state, learners, BRAKING_SHARES, rounds, rules.horizon_s, rules.counting)
+    _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], rules.counting)
     least[state.ended] = 0.0
     return -least
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.infos import dictionaries
 from ethbrake_marl.episode.state import ENDED, State
-from ethbrake_marl.episode.step import TRUNCATED, Step
+from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.rendering import make_renderer
 from ethbrake_marl.faces.stream import Stream
@@ -24,20 +25,16 @@ class Face:
 
     def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
         """Set the game of this environment. An episode is truncated after ``most_steps``; None: only at the horizon."""
+        (self.scenario, self.game), self.render_mode = opened, render_mode
         if most_steps is not None:
             check_whole_number("number of steps of an episode", most_steps, 1)
-        (self.scenario, self.game), self.render_mode, self._most_steps = opened, render_mode, most_steps
-        self.stream, self.renderer = Stream(*opened), make_renderer(self, render_mode)
+            self.game = self.game._replace(rules=self.game.rules._replace(most_steps=float(most_steps)))
+        self.stream, self.renderer = Stream(self.scenario, self.game), make_renderer(self, render_mode)
         self._of_state = self.scenario.horizon_s, self.scenario.has_obstacle
 
     def _need_learner(self) -> None:
         if not len(self.game.rules.learners):
             raise InvalidInput(f"scenario {self.scenario.name!r} has no learner; pass learners=['vehicle_2']")
-
-    def _begin(self, n: int, seed: int | None, options: Any) -> State:
-        self.episode = self.stream.reset(n, seed, options)
-        self.renderer.began(self.episode)
-        return self.episode
 
     def _begun(self, what: str) -> State:
         if self.episode is None:
@@ -45,24 +42,27 @@ class Face:
         return self.episode
 
     def _advance(self, actions: Floats) -> tuple[State, Step]:
+        """Return the state after a step, and what happened in it. The running episode changes only in ``_keep``."""
         before = self._begun("step")
         if not self.begins_again and before.clock[0, ENDED] == 1.0:
             raise InvalidInput("step: no episode is running; call reset first")
-        state, step = self.game.step(before, actions, donate=self.begins_again)
-        if self._most_steps is not None:
-            rows = (state.steps >= self._most_steps) & (step.terminated | ~state.ended)
-            state.clock[rows, ENDED] = 1.0
-            step.out[TRUNCATED, rows] = 1.0
-        self.episode = state
-        return state, step
+        return self.game.step(before, actions)
+
+    def _keep(self, stream: Stream, state: State, show: Callable[[State], None]) -> None:
+        """Show the state (a method of the renderer), and replace the running episode and the sequence of worlds.
+
+        A reset or step does this last: if something fails before, it can be called again.
+        """
+        show(state)
+        self.stream, self.episode = stream, state
 
     def _rewards(self, step: Step) -> Floats:
         """Return the rewards of a step, [n, B], or vector rewards, [n, B, K]."""
         rewards: Floats = (step.reward if step.vector is None else step.vector).take(self.bodies - 1, axis=1)
         return rewards
 
-    def _infos(self, state: State, step: Step | None) -> list[dict[str, Any]]:
-        return dictionaries(self.game, state, step, self.stream.seed or 0, self.bodies)
+    def _infos(self, stream: Stream, state: State, step: Step | None) -> list[dict[str, Any]]:
+        return dictionaries(self.game, state, step, stream.seed or 0, self.bodies)
 
     def describe_worlds(self) -> dict[str, Any]:
         """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""

@@ -66,20 +66,25 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
         observation: Any = None,
         actions: int | None = None,
         reward_vector: Any = None,
+        report: Sequence[str] = (),
+        max_cycles: int | None = None,
     ) -> None:
-        game = scenario, learners, reward, observation, reward_vector
-        self.observation_space, self.action_space = self._open_one(game, render_mode, actions, None)
+        game = scenario, learners, reward, observation, reward_vector, report
+        self.observation_space, self.action_space = self._open_one(game, render_mode, actions, max_cycles)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
-        state = self._begin(1, seed, options)
-        super().reset(seed=self.stream.seed if seed is not None else None)
-        return self._observe(state)[0], self._infos(state, None)[0]
+        stream, state = self.stream.reset(1, seed, options)
+        answer = self._observe(state)[0], self._infos(stream, state, None)[0]
+        self._keep(stream, state, self.renderer.began)
+        super().reset(seed=stream.seed if seed is not None else None)
+        return answer
 
     def step(self, action: Any) -> tuple[Observations, Any, bool, bool, dict[str, Any]]:
         """Advance by one time step with an ``action`` [1]."""
         state, step = self._advance(checked_actions(action, (1, 1), self.name, self.actions))
-        self.renderer.stepped(state)
         reward = self._rewards(step)[0, 0]
         ended = bool(step.terminated[0]), bool(step.truncated[0])
         number = float(reward) if step.vector is None else reward
-        return self._observe(state)[0], number, *ended, self._infos(state, step)[0]
+        answer = self._observe(state)[0], number, *ended, self._infos(self.stream, state, step)[0]
+        self._keep(self.stream, state, self.renderer.stepped)
+        return answer

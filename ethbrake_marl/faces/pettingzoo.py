@@ -42,10 +42,12 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
             ``harm``, the default, pushing is free; under ``honest`` it hardly pays (``episode.counts``).
         observation: features that every vehicle observes, or vehicle -> features; None: the scenario's.
         agents: which vehicles are agents: ``all``, or the ``learners`` (for libraries that train every agent).
-        max_cycles: number of steps after which an episode is truncated; None: only at the horizon.
+        max_cycles: number of steps after which an episode is truncated, as at a horizon; None: only at the horizon.
         actions: None: numbers in [-1, 1]. K >= 2: indices of K evenly spaced numbers.
         reward_vector: None: rewards are numbers. ``vehicles``, or a list of components (``episode.terms``): rewards are
             arrays.
+        report: names of terms (``episode.terms``) whose value infos contain as ``reward_NAME``, with or without a
+            weight in the reward.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.parallel_env(scenario="paper-random")
@@ -70,8 +72,9 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         max_cycles: int | None = None,
         actions: int | None = None,
         reward_vector: Any = None,
+        report: Sequence[str] = (),
     ) -> None:
-        self._open(open_game(scenario, learners, reward, observation, reward_vector), render_mode, max_cycles)
+        self._open(open_game(scenario, learners, reward, observation, reward_vector, report), render_mode, max_cycles)
         if agents not in ("all", "learners"):
             raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
         if agents == "learners" or actions is not None:
@@ -113,23 +116,26 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
         Options: ``{"initial_state": ...}``, or ``{"listed_world": {"seed": 7, "number": 3}}`` of an evaluation list.
         """
-        state = self._begin(1, seed, options)
-        return self._observations(state), self._by_agent(self._infos(state, None))
+        stream, state = self.stream.reset(1, seed, options)
+        answer = self._observations(state), self._by_agent(self._infos(stream, state, None))
+        self._keep(stream, state, self.renderer.began)
+        return answer
 
     def step(
         self, actions: Mapping[str, Any]
     ) -> tuple[dict[str, Observations], dict[str, Any], dict[str, bool], dict[str, bool], Infos]:
         """Advance by one time step. Raises ``InvalidInput`` for a missing or bad action of a learner."""
         state, step = self._advance(self._columns(actions))
-        self.renderer.stepped(state)
         rewards = self._rewards(step)[0]
-        return (
+        answer = (
             self._observations(state),
             self._by_agent(rewards.tolist() if step.vector is None else [*rewards]),
             dict.fromkeys(self.possible_agents, bool(step.terminated[0])),
             dict.fromkeys(self.possible_agents, bool(step.truncated[0])),
-            self._by_agent(self._infos(state, step)),
+            self._by_agent(self._infos(self.stream, state, step)),
         )
+        self._keep(self.stream, state, self.renderer.stepped)
+        return answer
 
     def state(self) -> Observations:
         """Return the full state of the line, [S] float32."""

@@ -14,7 +14,7 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.infos import per_body
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, put
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.actions import action_space, checked_actions
@@ -42,11 +42,14 @@ def make_sb3_vec_env(
     step_infos: bool = False,
     render_mode: str | None = None,
     actions: int | None = None,
+    report: Sequence[str] = (),
+    max_cycles: int | None = None,
 ) -> EthBrakeVecEnv:
     """Return an environment for Stable-Baselines3 with ``n_envs`` worlds, simulated together.
 
     It has one row for each learner of each world, world by world: ``num_envs`` is ``n_envs`` times the learners.
-    ``scenario``, ``learners``, ``reward``, ``observation`` and ``actions`` are as in ``EthBrakeParallelEnv``.
+    ``scenario``, ``learners``, ``reward``, ``observation``, ``actions``, ``report`` and ``max_cycles`` are as in
+    ``EthBrakeParallelEnv``.
 
     - ``seed``: seed of the training worlds; None: a random one.
     - ``horizon_is_end``: report an episode that reaches the horizon as ended, not as truncated. Harm after the horizon
@@ -61,8 +64,10 @@ def make_sb3_vec_env(
     (4, 27)
     """
     check_whole_number("n_envs", n_envs, 1)
-    opened = open_game(scenario, learners, reward, observation)
-    return EthBrakeVecEnv(*opened, int(n_envs), seed, horizon_is_end, appended, step_infos, render_mode, actions)
+    opened = open_game(scenario, learners, reward, observation, report=report)
+    return EthBrakeVecEnv(
+        *opened, int(n_envs), seed, horizon_is_end, appended, step_infos, render_mode, actions, max_cycles
+    )
 
 
 class EthBrakeVecEnv(Face, VecEnv):
@@ -94,11 +99,12 @@ class EthBrakeVecEnv(Face, VecEnv):
         step_infos: bool = False,
         render_mode: str | None = None,
         actions: int | None = None,
+        max_cycles: int | None = None,
     ) -> None:
         self.bodies = game.rules.learners
         self.n, self.num_envs, self.actions = n, n * len(self.bodies), actions
         self.horizon_is_end, self.appended, self.step_infos = horizon_is_end, appended, step_infos
-        self._open((scenario, game), render_mode)
+        self._open((scenario, game), render_mode, max_cycles)
         self._need_learner()
         self._first: State | None = None  # each running episode at its first decision
         self._return, self._steps = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
@@ -129,14 +135,17 @@ class EthBrakeVecEnv(Face, VecEnv):
     def reset(self) -> Observations:
         """Start an episode in every world: the next worlds, or those of ``set_options``."""
         options = self._options
-        self._reset_options()
         if options != options[:1] * self.num_envs:
+            self._reset_options()
             raise InvalidInput("set_options: all worlds are simulated together; give the same options to every row")
-        state = self._begin(self.n, self._seeds[0], options[0])
+        stream, state = self.stream.reset(self.n, self._seeds[0], options[0])
+        seen = self._observe(state)
+        self._keep(stream, state, self.renderer.began)
+        self._reset_options()
         self._reset_seeds()
         self._first = copy.deepcopy(state)
-        self._return[:], self._steps[:] = 0.0, 0
-        return self._observe(state)
+        self._return, self._steps = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
+        return seen
 
     def step_async(self, actions: Any) -> None:
         self._given = actions
@@ -145,43 +154,41 @@ class EthBrakeVecEnv(Face, VecEnv):
         """Advance every world by one time step; where an episode ends, the next one begins in the same rows."""
         actions = checked_actions(self._given, (self.num_envs, 1), "the learners", self.actions)
         state, step = self._advance(actions.reshape(self.n, -1))
-        reward, over = self._rewards(step).reshape(-1), state.ended
-        self._return += reward
-        self._steps += 1
+        stream, seen, ended = self.stream, self._observe(state), np.flatnonzero(state.ended)
+        reward = self._rewards(step).reshape(-1)
+        first, returns, steps = self._first, self._return + reward, self._steps + 1
         if self.step_infos:
-            infos = self._infos(state, step)
+            infos = self._infos(stream, state, step)
         elif self.game.shield is not None:
             infos = per_body(self.game.own_infos(state), self.n, self.bodies)
         else:
             infos = [{} for _ in range(self.num_envs)]
-        if over.any():
-            state = self._renew(state, step, np.flatnonzero(over), infos)
-        self.renderer.stepped(state)
-        return self._observe(state), reward.astype(np.float32), over.repeat(len(self.bodies)), infos
+        if len(ended):
+            rows = (ended[:, np.newaxis] * len(self.bodies) + np.arange(len(self.bodies))).reshape(-1)
+            last = zip(rows.tolist(), self._last_infos(state, step, ended), seen[rows], strict=True)
+            for row, info, observation in last:
+                episode = {"r": returns[row].item(), "l": steps[row].item(), "t": 0.0}
+                infos[row] = {**info, "terminal_observation": observation, "episode": episode}
+            stream, new = stream.next_episodes(len(ended))
+            seen[rows], returns[rows], steps[rows] = self._observe(new), 0.0, 0
+            state, first = (put(each, ended, new, donate=self.render_mode is None) for each in (state, first))
+        self._keep(stream, state, self.renderer.stepped)
+        self._first, self._return, self._steps = first, returns, steps
+        over = (step.terminated | step.truncated).repeat(len(self.bodies))
+        return seen, reward.astype(np.float32), over, infos
 
-    def _renew(self, state: State, step: Step, ended: Any, infos: list[dict[str, Any]]) -> State:
-        """Add final infos of the worlds ``ended`` to ``infos``, and start the next episodes in their rows."""
-        L, last = len(self.bodies), state.take(ended)
-        rows = (ended[:, np.newaxis] * L + np.arange(L)).reshape(-1)
+    def _last_infos(self, state: State, step: Step, ended: Any) -> list[dict[str, Any]]:
+        """Return the infos of each learner of the worlds ``ended`` (indices), whose last ``step`` led to ``state``."""
         terms = {name: term[ended] for name, term in step.terms.items()}
         step = step._replace(reward=step.reward[ended], out=step.out[:, ended], terms=terms)
-        cut = (step.truncated & (not self.horizon_is_end)).repeat(L).tolist()
-        ends = rows.tolist(), self._infos(last, step), cut, self._observe(last)
-        sums = self._return[rows].tolist(), self._steps[rows].tolist()
-        for row, info, truncated, seen, gained, steps in zip(*ends, *sums, strict=True):
-            info["TimeLimit.truncated"], info["terminal_observation"] = truncated, seen
-            info["episode"] = {"r": gained, "l": steps, "t": 0.0}
-            infos[row] = info
-        self._return[rows], self._steps[rows] = 0.0, 0
-        new = self.stream.next_episodes(len(ended))
-        self._first = self._first.put(ended, new, donate=True)  # type: ignore[union-attr]  # a reset has made it
-        self.episode = state.put(ended, new, donate=True)
-        return self.episode
+        cut = (step.truncated & (not self.horizon_is_end)).repeat(len(self.bodies)).tolist()
+        infos = self._infos(self.stream, state.take(ended), step)
+        return [{**info, "TimeLimit.truncated": truncated} for info, truncated in zip(infos, cut, strict=True)]
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:
         """Infos at the first decision of each row's running episode."""
-        return [] if self._first is None else self._infos(self._first, None)
+        return [] if self._first is None else self._infos(self.stream, self._first, None)
 
     @reset_infos.setter
     def reset_infos(self, infos: list[dict[str, Any]]) -> None:
@@ -205,7 +212,8 @@ class EthBrakeVecEnv(Face, VecEnv):
     def restore(self, saved: dict[str, Any]) -> None:
         """Continue from a ``snapshot``. It can be restored several times."""
         saved = copy.deepcopy(saved)
-        self.stream.seed, self.stream.next = saved["stream"]
+        seed, following = saved["stream"]
+        self.stream = self.stream._replace(seed=seed, next=following)
         for name in SAVED:
             setattr(self, name, saved[name])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,34 +23,34 @@ class UnknownResetOption(UserWarning):
     """``options`` of ``reset`` has an unknown key."""
 
 
-class Stream:
-    """The training worlds of a seed, one after the other. World k of a seed is always the same, in any row."""
+class Stream(NamedTuple):
+    """The training worlds of a seed, one after the other. World k of a seed is always the same, in any row.
 
-    def __init__(self, scenario: Scenario, game: Game) -> None:
-        self.scenario, self.game = scenario, game
-        self.seed: int | None = None
-        self.next = 0  # number of the next world
-        self.given: Drawn | None = None  # the worlds that the last reset asked for
+    It is never changed: who begins episodes gets the stream of the worlds that follow.
+    """
 
-    def reset(self, n: int, seed: int | None, options: Any = None) -> State:
+    scenario: Scenario
+    game: Game
+    seed: int | None = None
+    next: int = 0  # number of the next world
+    given: Drawn | None = None  # the worlds that the last reset asked for
+
+    def reset(self, n: int, seed: int | None, options: Any = None) -> tuple[Stream, State]:
         """Return new episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
 
         The first reset without a seed draws a random one. ``options`` may specify the worlds instead. Raises
-        ``InvalidInput`` for a bad seed or option, and then changes nothing; warns of unknown options.
+        ``InvalidInput`` for a bad seed or option; warns of unknown options.
         """
         first = self.next if seed is None else 0
         seed = chosen_seed(self.seed if seed is None else seed)
         given = self._asked_for(n, options)
         state = self.game.reset(self.game.draw(n, seed, first) if given is None else given.worlds)
-        self.seed, self.next, self.given = seed, first + (n if given is None else 0), given
-        return state
+        return self._replace(seed=seed, next=first + (n if given is None else 0), given=given), state
 
-    def next_episodes(self, n: int) -> State:
+    def next_episodes(self, n: int) -> tuple[Stream, State]:
         """Return new episodes in the next n worlds. They share no memory with other episodes."""
         assert self.seed is not None
-        state = self.game.reset(self.game.draw(n, self.seed, self.next))
-        self.next += n
-        return state
+        return self._replace(next=self.next + n), self.game.reset(self.game.draw(n, self.seed, self.next))
 
     def describe(self, state: State) -> dict[str, Any]:
         """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
@@ -75,7 +75,7 @@ class Stream:
                 f"reset: options has the unknown keys {', '.join(unknown)}, which are ignored; known keys:"
                 f" {', '.join(OPTIONS)}",
                 UnknownResetOption,
-                stacklevel=5,
+                stacklevel=4,
             )
         if all(name in options for name in OPTIONS):
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")

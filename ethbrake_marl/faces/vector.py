@@ -11,12 +11,13 @@ from gymnasium.vector.utils import batch_space
 
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import State, put
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.actions import checked_actions
 from ethbrake_marl.faces.gymnasium import OneLearner
 from ethbrake_marl.faces.rendering import render_metadata
+from ethbrake_marl.faces.stream import Stream
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.worlds.game import AnyScenario
 
@@ -29,11 +30,11 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
     Args:
         num_envs: number of worlds.
         scenario: as in ``EthBrakeParallelEnv``; so are ``learners``, ``reward``, ``observation``, ``actions`` and
-            ``reward_vector``.
+            ``reward_vector`` and ``report``.
         render_mode: a mode of ``metadata["render_modes"]``; ``render`` returns one picture per world.
         autoreset_mode: Gymnasium's ``NextStep`` (the step after the last one of an episode starts the next episode,
             ignores the action and has reward 0) or ``SameStep``.
-        max_episode_steps: number of steps after which an episode is truncated; None: only at the horizon.
+        max_episode_steps: as ``max_cycles`` there.
 
     >>> import ethbrake_marl as eb
     >>> import numpy as np
@@ -59,22 +60,24 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         max_episode_steps: int | None = None,
         actions: int | None = None,
         reward_vector: Any = None,
+        report: Sequence[str] = (),
     ) -> None:
         check_whole_number("num_envs", num_envs, 1)
         if autoreset_mode not in ("NextStep", "SameStep", AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise InvalidInput(f"autoreset_mode = {autoreset_mode!r}: must be 'NextStep' or 'SameStep'")
         self.num_envs, self.autoreset_mode = int(num_envs), AutoresetMode(autoreset_mode)
         self.metadata = {**render_metadata(), "autoreset_mode": self.autoreset_mode}
-        game = scenario, learners, reward, observation, reward_vector
+        game = scenario, learners, reward, observation, reward_vector, report
         spaces = self._open_one(game, render_mode, actions, max_episode_steps)
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = (batch_space(space, self.num_envs) for space in spaces)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
-        state = self._begin(self.num_envs, seed, options)
-        super().reset(seed=self.stream.seed if seed is not None else None)
-        every = np.ones(self.num_envs, np.bool_)
-        return self._observe(state), self._columns(state, None, every, every)
+        stream, state = self.stream.reset(self.num_envs, seed, options)
+        answer = self._observe(state), masked(self._columns(stream, state, None), np.ones(self.num_envs, np.bool_))
+        self._keep(stream, state, self.renderer.began)
+        super().reset(seed=stream.seed if seed is not None else None)
+        return answer
 
     def step(self, actions: Any) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
         """Advance every world by one time step with ``actions`` [n, 1]."""
@@ -82,33 +85,35 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         numbers = checked_actions(actions, (self.num_envs, 1), "the learners", self.actions)
         numbers[renewed] = 0.0  # the action of a row that begins again is ignored
         state, step = self._advance(numbers)
-        every, infos = np.ones(self.num_envs, np.bool_), dict[str, Any]()
+        stream, seen, columns = self.stream, self._observe(state), self._columns(self.stream, state, step)
+        infos = dict[str, Any]()
         if same and state.ended.any():
             renewed, final = state.ended, np.full(self.num_envs, None, dtype=object)
-            for row, seen in zip(np.flatnonzero(renewed), self._observe(state)[renewed], strict=True):
-                final[row] = seen
-            last = self._columns(state, step, renewed, renewed)
-            infos = {"final_obs": final, "_final_obs": renewed, "final_info": last, "_final_info": renewed.copy()}
+            for row, last in zip(np.flatnonzero(renewed), seen[renewed], strict=True):
+                final[row] = last
+            infos = {"final_obs": final, "_final_obs": renewed}
+            infos |= {"final_info": masked(columns, renewed), "_final_info": renewed.copy()}
         if renewed.any():
-            state = self.episode = state.put(renewed, self.stream.next_episodes(int(renewed.sum())), donate=True)
-        self.renderer.stepped(state)
-        infos |= self._columns(state, step, every, ~renewed)
-        return self._observe(state), self._rewards(step)[:, 0], step.terminated, step.truncated, infos
+            stream, new = stream.next_episodes(int(renewed.sum()))
+            seen[renewed] = self._observe(new)
+            columns = put(columns, renewed, self._columns(stream, new, None))
+            state = state.put(renewed, new, donate=self.render_mode is None)
+        infos |= masked(columns, np.ones(self.num_envs, np.bool_))
+        self._keep(stream, state, self.renderer.stepped)
+        return seen, self._rewards(step)[:, 0], step.terminated, step.truncated, infos
 
     def render(self) -> Any:
         pictures = super().render()
         return None if pictures is None else tuple(pictures)
 
-    def _columns(self, state: State, step: Step | None, rows: Bools, stepped: Bools) -> dict[str, Any]:
-        """Return infos in Gymnasium's vector form: arrays of values, each with a mask of the rows that have a value.
+    def _columns(self, stream: Stream, state: State, step: Step | None) -> dict[str, Any]:
+        return arrays(self.game, state, step, stream.seed or 0, self.bodies[0])
 
-        The mask is ``rows`` [n]. Cost and reward terms of rows that have not ``stepped`` are 0: their last step belongs
-        to an earlier episode.
-        """
-        infos: dict[str, Any] = {}
-        for name, column in arrays(self.game, state, step, self.stream.seed or 0, self.bodies[0]).items():
-            of_step = name == "cost" or name.startswith("reward_")
-            valid = rows & stepped if of_step else rows
-            infos[name] = column.copy() if valid.all() else np.where(valid, column, np.zeros((), column.dtype))
-            infos[f"_{name}"] = rows.copy()
-        return infos
+
+def masked(columns: dict[str, Any], rows: Bools) -> dict[str, Any]:
+    """Return infos in Gymnasium's vector form: arrays of values, each with the mask ``rows`` [n] of its valid rows."""
+    infos: dict[str, Any] = {}
+    for name, column in columns.items():
+        infos[name] = column.copy() if rows.all() else np.where(rows, column, np.zeros((), column.dtype))
+        infos[f"_{name}"] = rows.copy()
+    return infos

@@ -17,7 +17,7 @@ from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import price
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
@@ -71,7 +71,7 @@ class EpisodeShield:
         ((body, agent),) = self.drivers.items()
         remembered = begin(game.agents({body: agent})[body], alert, body)
         known = alert._replace(wanted=state.wanted)
-        choice = coupled(known, body, self.count, game.rules.horizon_s) if self.coupled else pairwise(known, body)
+        choice = coupled(known, body, self.count, state.clock[:, END]) if self.coupled else pairwise(known, body)
         backup = to_action(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
         held_back = held(game, backup)
         own = state._replace(memories={**state.memories, body: remembered})

@@ -15,7 +15,7 @@ from ethbrake_marl.agents.drive import Agent, propose, to_action
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import descend, hold
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.motion.layout import BRAKING, Floats
 
 SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
@@ -30,16 +30,16 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
     One learner: E-V2X-BM. Several: full braking; E-V2X-BM of one learner while the others brake fully; and each
     learner's best share of its brakes, chosen one after the other.
     """
-    learners, n, horizon_s = game.rules.learners, state.n, game.rules.horizon_s
+    learners, n, until_s = game.rules.learners, state.n, state.clock[:, END]
     full = alert._replace(wanted=state.wanted.copy())
     full.wanted[:, learners] = -alert.car[:, BRAKING, learners]
     actions = []
     for column, body in enumerate(learners.tolist()):
         action = np.full((n, len(learners)), -1.0)
-        action[:, column] = to_action(alert, body, -coupled(full, body, count, horizon_s).deceleration_mps2)
+        action[:, column] = to_action(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
         actions.append(action)
     if len(learners) > 1:
-        wanted, _ = descend(state, learners.tolist(), SHARES, ROUNDS, horizon_s, count)
+        wanted, _ = descend(state, learners.tolist(), SHARES, ROUNDS, until_s, count)
         descended = [to_action(alert, body, wanted[:, body]) for body in learners.tolist()]
         actions += [np.stack(descended, axis=1), np.full((n, len(learners)), -1.0)]
     return [held(game, action) for action in actions]
@@ -67,7 +67,7 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
             alone[:, column * len(ALONE) : (column + 1) * len(ALONE), column] = ALONE
         actions = np.concatenate([actions, alone], axis=1)
     commands = actions.repeat(each, axis=0) * states.car[:, np.newaxis, BRAKING, learners]
-    harm = hold(states, states.wanted, learners.tolist(), commands, game.rules.horizon_s, count)[0]
+    harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], count)[0]
     harm = harm.reshape(len(plans), each, -1).max(axis=1)
     best = harm.argmin(axis=1)
     return actions[rows, best, np.newaxis], harm[rows, best]

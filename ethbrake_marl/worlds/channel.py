@@ -112,6 +112,8 @@ class Extension(Protocol):
 
 def register_v2x_extension(key: str, extension: Extension) -> None:
     """Register the extension for a key of ``v2x``. Entry points: ``ethbrake_marl.v2x_extensions``."""
+    if extension.name in ("physics", "shaping", "shield"):  # memories that a game has itself
+        raise InvalidInput(f"key {key!r} of v2x: the name of its memory, {extension.name!r}, is in use; choose another")
     EXTENSIONS.add(key, extension, lambda other: other is extension)
 
 
@@ -196,6 +198,10 @@ class V2X(Part):
 
     def _check(self) -> None:
         """Refuse keys without effect, and a channel by which a vehicle may never learn anything."""
+        extended = {EXTENSIONS[key]: key for key in self.model_extra or ()}
+        names = " and ".join(extended.values())
+        right = f"{names} belong to different extensions, whose games would replace each other; leave one out"
+        require(len(extended) < 2, (), UNSHOWN, right)
         used = [key for extension in self.extensions for key in extension.uses(self)]
         unused = [key for key in OF_MESSAGES if key not in used]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)

@@ -77,6 +77,8 @@ def _check_channel(scenario: Scenario) -> None:
         require(sent or kind.v2x is None, ("vehicle_types", name, "v2x"), kind.v2x, right)
     right = "works only with v2x: paper, because messages before the alert are not modelled"
     require(scenario.alert_s is None or not v2x.by_link, ("alert_s",), scenario.alert_s, right)
+    right = f"is not known to physics: {scenario.physics}; leave one of the two out"
+    require(scenario.physics is None or not v2x.extensions, ("v2x",), UNSHOWN, right)
     for extension in v2x.extensions:
         extension.check(scenario)
 

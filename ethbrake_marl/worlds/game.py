@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,7 @@ def game_of(
     reward: Reward = "harm",
     observation: Any = None,
     reward_vector: Any = None,
+    report: Sequence[str] = (),
 ) -> tuple[Scenario, Game]:
     """The scenario (with the given observation) and its game. ``names.open_game`` does the same from names.
 
@@ -59,8 +60,9 @@ def game_of(
         )
     bodies = np.array(scenario.learners, np.int64)
     rewarding, rules = Rewarding.of(
-        reward, scenario.objective, scenario.vehicles, bodies, (scenario.time_step_s, scenario.horizon_s), reward_vector
-    )
+        reward, scenario.objective, scenario.vehicles, bodies, (scenario.time_step_s, scenario.horizon_s),
+        reward_vector, report,
+    )  # fmt: skip
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))

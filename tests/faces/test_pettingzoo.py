@@ -51,8 +51,8 @@ def test_agents__are_given_what_their_own_vehicle_observes(agents: str) -> None:
     assert env.agents == (names if agents == "all" else [names[i - 1] for i in env.scenario.learners])
 
 
-def test_max_cycles__truncates_also_an_episode_that_it_ends_with() -> None:
-    for most, ends in ((9, (False, True)), (10, (True, True)), (11, (True, False))):
+def test_max_cycles__truncates_only_what_has_not_come_to_rest() -> None:
+    for most, ends in ((9, (False, True)), (10, (True, False)), (11, (True, False))):
         env = began(scenario=REST, max_cycles=most)  # at rest after 10 steps
         while env.agents:
             _, _, terminations, truncations, _ = env.step({"vehicle_2": [-1.0]})

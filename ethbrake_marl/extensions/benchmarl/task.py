@@ -76,8 +76,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         if shield is not None:
             game = game._replace(shield=guarded(NOBODY, shield, loaded, "first", {}).shield)
         self.game = game
-        self.stream = Stream(loaded, self.game)
-        self.stream.seed = chosen_seed(seed)
+        self.stream = Stream(loaded, self.game, chosen_seed(seed))
         rows = n, len(self.learners)
         seen = _bound(FeatureBox(views.pop().features), rows)
         whole = _bound(FeatureBox(state_features(loaded.vehicles, *self.of_state)), (n,))
@@ -96,34 +95,35 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
     def _reset(self, tensordict: Any, **settings: Any) -> Any:
         """Start new episodes in all worlds or, if ``tensordict`` has a mask ``_reset``, where it is True."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None:
-            self.episode = self.stream.next_episodes(self.batch_size[0])
-        else:
-            rows = np.flatnonzero(mask.numpy().reshape(-1))
-            self.episode = self.episode.put(rows, self.stream.next_episodes(len(rows)), donate=True)
-        return TensorDict(self._observe(), batch_size=self.batch_size)
+        rows = np.arange(self.batch_size[0]) if mask is None else np.flatnonzero(mask.numpy().reshape(-1))
+        stream, new = self.stream.next_episodes(len(rows))
+        state = new if mask is None else self.episode.put(rows, new)
+        content = self._observe(state)
+        self.stream, self.episode = stream, state
+        return TensorDict(content, batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
         shape = self.batch_size[0], len(self.learners)
         actions = checked_actions(tensordict[GROUP, "action"].numpy(), shape, "the learners", self.actions)
-        self.episode, step = self.game.step(self.episode, actions, donate=True)
+        state, step = self.game.step(self.episode, actions)
         terminated, truncated = step.terminated, step.truncated
         if self.horizon_is_end:
             terminated, truncated = terminated | truncated, np.zeros_like(truncated)
-        content = self._observe()
+        content = self._observe(state)
         content[GROUP]["reward"] = torch.from_numpy(step.reward[:, self.learners - 1, np.newaxis].astype(np.float32))
-        for name, flag in (("done", self.episode.ended), ("terminated", terminated), ("truncated", truncated)):
+        for name, flag in (("done", state.ended), ("terminated", terminated), ("truncated", truncated)):
             content[name] = torch.from_numpy(flag[:, np.newaxis])
+        self.episode = state
         return TensorDict(content, batch_size=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
-            self.stream.seed, self.stream.next = chosen_seed(seed), 0
+            self.stream = self.stream._replace(seed=chosen_seed(seed), next=0)
 
-    def _observe(self) -> dict[str, Any]:
-        seen = torch.from_numpy(self.game.observe_alike(self.episode, self.learners))
+    def _observe(self, state: State) -> dict[str, Any]:
+        seen = torch.from_numpy(self.game.observe_alike(state, self.learners))
         own = TensorDict({"observation": seen}, batch_size=seen.shape[:2])
-        return {GROUP: own, "state": torch.from_numpy(full_state(self.episode, *self.of_state))}
+        return {GROUP: own, "state": torch.from_numpy(full_state(state, *self.of_state))}
 
 
 class LineTask(TaskClass):  # type: ignore[misc]

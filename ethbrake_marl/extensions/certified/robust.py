@@ -16,7 +16,7 @@ import numpy as np
 from ethbrake_marl.agents.drive import MODEL, Agent
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import hold
-from ethbrake_marl.episode.state import State, mapped, take
+from ethbrake_marl.episode.state import END, State, mapped, take
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.motion.layout import BRAKING, COUNT, GAP, SPEED, Bools, Floats
@@ -63,7 +63,7 @@ class MembersShield(StepShield):
             return plans
         actions = np.repeat(SHARES[:, np.newaxis], len(learners), axis=1)
         commands = actions * states.car[:, np.newaxis, BRAKING, learners]
-        harm = hold(states, states.wanted, learners.tolist(), commands, game.rules.horizon_s, self.count)[0]
+        harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.count)[0]
         best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
         return [*plans, held(game, actions[best])]
 

@@ -123,7 +123,7 @@ def searched_worlds(problem: Problem, on: torch.device) -> tuple[Searched, Kerne
         return torch.from_numpy(np.moveaxis(array, 0, -1).copy()).to(on)
 
     count, state = problem.harm_count, problem.state
-    numbers = np.array([problem.time_step_s, problem.horizon_s, problem.aim, 0.0])
+    numbers = np.array([problem.time_step_s, problem.aim, 0.0])
     weights = np.stack([weights_of(count), weights_of(other_count(count))])
     at = rows_of(state, int(problem.bodies[0]))
     forward = (state.speeds_mps >= 0.0).all(axis=1) & (len(problem.bodies) == 1)

@@ -129,7 +129,7 @@ class MappedGame(Game):
                 " a scenario that has physics: paper-map"
             )
         rules = self.rules
-        state = one_step.first_decision(alert, self.deciders, rules.time_step_s, rules.horizon_s)
+        state = one_step.first_decision(alert, self.deciders, rules.time_step_s, rules.horizon_s, rules.most_steps)
         if state.collided.any():
             raise InvalidInput(
                 f"scenario {self.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
@@ -158,15 +158,14 @@ class MappedGame(Game):
 
 class PaperMap:
     def check(self, scenario: Scenario) -> None:
-        """Raise an error for an obstacle, brakes that build up, and messages."""
+        """Raise an error for an obstacle, and for brakes that build up."""
         right = "is not known to physics: paper-map; leave one of the two out"
         for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
             require(key not in scenario.sources, (key,), UNSHOWN, right)
-        require(not scenario.v2x.extensions, ("v2x",), UNSHOWN, right)
 
     def game(self, game: Game) -> Game:
         """Return the game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
-        counted = [name for name in game.rewarding.counted if name in EXACT_ALONE]
+        counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
         if game.rules.counting[2:].any() or counted:
             what = f"the term {counted[0]}" if counted else "harm_count honest"
             raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")

@@ -15,7 +15,7 @@ from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.search.extremes import extreme_profiles
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, best_of, problem_of
@@ -106,9 +106,8 @@ def starting_profiles(problem: Problem, alert: State, given: Sequence[Profiles] 
 
 
 def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
-    choice = coupled(
-        alert._replace(wanted=problem.state.wanted), int(problem.bodies[0]), problem.harm_count, problem.horizon_s
-    )
+    alert, end_s = alert._replace(wanted=problem.state.wanted), problem.state.clock[:, END]
+    choice = coupled(alert, int(problem.bodies[0]), problem.harm_count, end_s)
     return problem.constant(-choice.deceleration_mps2[:, np.newaxis, np.newaxis])
 
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import amount_so_far
-from ethbrake_marl.episode.state import FIRST_DECISION, LAST
+from ethbrake_marl.episode.state import END, FIRST_DECISION, LAST
 from ethbrake_marl.episode.step import note_motion, stands
 from ethbrake_marl.extensions.search.pricing import UInt64s, worth
 from ethbrake_marl.motion.compiling import kernel, large
@@ -25,7 +25,7 @@ OTHER_WEIGHT = 1e-8  # weight of the other count of harm in what is minimised: i
 RESOLUTION = 1048576.0  # commands are multiples of 1 / 2^20 m/s2: short to store and exactly repeatable
 
 # numbers of a world
-TIME_STEP, HORIZON, AIM, STEPWISE, NUMBERS = range(5)
+TIME_STEP, AIM, STEPWISE, NUMBERS = range(4)
 
 # how random profiles and changes are drawn: a whole profile, or three phases of a plan and changes of a few steps
 KIND, ATTENTION, LONGEST_CHANGE, LONGEST_WHILE, DRAWING = range(5)
@@ -46,7 +46,7 @@ class World(NamedTuple):
     bodies: Ints  # [B] vehicles that are controlled
     bounds: Floats  # [B, 2] their smallest and largest command (m/s2)
     shares: Floats  # [3, N + 1], as in `Problem`
-    numbers: Floats  # [NUMBERS] time step (s), horizon (s), aim, whether step by step
+    numbers: Floats  # [NUMBERS] time step (s), aim, whether step by step
     weights: Floats  # [2, 6] of the count that is minimised, and of the one that decides ties
     random: UInt64s  # [1] state of the random stream
     scratch: Floats  # of the physics
@@ -107,7 +107,7 @@ def follow(world, lines, ends, commands, phase, most):
                 start = clock[FIRST_DECISION] + step * numbers[TIME_STEP]
                 step = step + 1 if numbers[STEPWISE] == 1.0 else ends[p]
                 until = clock[FIRST_DECISION] + step * numbers[TIME_STEP]
-                until = numbers[HORIZON] if step >= clock[LAST] else until
+                until = clock[END] if step >= clock[LAST] else until
                 if drive(line, world.car, world.wanted, world.scratch, start, until) == FAILED:
                     return value, -1
                 at_rest = stands(line, world.wanted)

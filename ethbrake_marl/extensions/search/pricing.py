@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, own_amount, pair_amount, weights_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
-from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, State, check_exact
+from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, LAST, STEPS, State, check_exact
 from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
@@ -124,7 +124,6 @@ class Problem(NamedTuple):
     bodies: Ints  # [B] vehicles that are controlled (1: Vehicle 1)
     state: State  # at the first decision; all other vehicles hold ``wanted``
     time_step_s: float
-    horizon_s: float
     harm_count: str  # what is minimised (`episode.counts`)
     aim: float  # WHOLE, WEIGHTED or LARGEST
     shares: Floats  # [n, 3, N + 1] weights of what a pair's front and rear vehicle share, and of the rear's own amount
@@ -136,7 +135,7 @@ class Problem(NamedTuple):
 
     @property
     def last_step(self) -> Ints:
-        """Number of decisions before the horizon, [n]."""
+        """Number of decisions before the end, [n]."""
         return self.state.clock[:, LAST].astype(np.int64)
 
     @property
@@ -183,7 +182,7 @@ class Problem(NamedTuple):
         failed = np.zeros(self.n, np.bool_)
         ends, commands = np.ascontiguousarray(profiles.ends, np.int64), np.ascontiguousarray(profiles.commands_mps2)
         follow_worlds(
-            line, car, clock, wanted, ends, commands, self.bodies, self.time_step_s, self.horizon_s,
+            line, car, clock, wanted, ends, commands, self.bodies, self.time_step_s,
             scratch_for(wanted.shape[1]), failed,
         )  # fmt: skip
         if failed.any():
@@ -269,20 +268,20 @@ def problem_of(
     wanted = alert.wanted.copy()
     wanted[:, game.rules.learners] = -alert.car[:, BRAKING][:, game.rules.learners]
     wanted[:, chosen] = 0.0
-    dt, horizon = game.rules.time_step_s, game.rules.horizon_s
+    dt, horizon_s, most_steps = game.rules.time_step_s, game.rules.horizon_s, game.rules.most_steps
     decide = chosen if deciders is None else np.array(deciders, np.int64)
-    state = first_decision(alert._replace(wanted=wanted, memories={}), decide, dt, horizon)
+    state = first_decision(alert._replace(wanted=wanted, memories={}), decide, dt, horizon_s, most_steps)
     shares = np.zeros((alert.n, 3, wanted.shape[1]))
-    times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST]]]
-    identity = identities(alert._replace(wanted=wanted), chosen, np.hstack([*times, np.full((alert.n, 1), horizon)]))
-    return aimed(Problem(chosen, state, dt, horizon, count, WHOLE, shares, identity), objective)
+    times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST, END]]]
+    identity = identities(alert._replace(wanted=wanted), chosen, np.hstack(times))
+    return aimed(Problem(chosen, state, dt, count, WHOLE, shares, identity), objective)
 
 
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
     """Return a hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
     Hashed are the world, the commands of all other vehicles, which vehicles are controlled (``bodies``), and ``times``
-    [n, 4]: first decision, time step, number of steps, horizon.
+    [n, 4]: first decision, time step, number of steps, end.
     """
     line, car, digests = alert.line, alert.car, np.empty(alert.n, np.uint64)
     controlled = np.zeros(alert.wanted.shape)
@@ -352,7 +351,7 @@ def worths(line, shares, weights, aim, out):
 
 
 @large
-def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, horizon_s, scratch, failed):
+def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s, scratch, failed):
     """Simulate every profile in place, decision by decision. ``failed`` [n]: a check of the physics failed.
 
     ``line``, ``car``, ``clock``, ``wanted``: as in ``State``. ``ends``, ``commands``: as in ``Profiles``.
@@ -364,5 +363,5 @@ def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s,
                 phase += 1
             for b in range(len(bodies)):
                 wanted[k, bodies[b]] = commands[k, phase, b]
-            met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s, horizon_s)
+            met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
             failed[k] = met == FAILED

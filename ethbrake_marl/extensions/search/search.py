@@ -198,7 +198,7 @@ def field_for(profiles: int, phases: int, controlled: int) -> Field:
 
 def prepared(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
     state = problem.state
-    numbers = np.array([problem.time_step_s, problem.horizon_s, problem.aim, stepwise])
+    numbers = np.array([problem.time_step_s, problem.aim, stepwise])
     count = problem.harm_count
     weights = np.stack([weights_of(count), weights_of(other_count(count))])
     world = World(

@@ -1,0 +1,145 @@
+"""An end after a number of steps is the end of a shorter horizon: rewards, infos, flags, shields and searches."""
+
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+import ethbrake_marl as eb
+from ethbrake_marl.episode.play import price
+from ethbrake_marl.extensions.search.best_harm import best_harm
+from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.faces.registration import register_environments
+from tests.contract.interfaces import BARE, CRASH, EPISODE, FIVE, PAPER, REST, STEP, actions
+
+PAIR = eb.load_scenario("cooperation-3-pair").replace(v2x="paper")
+NEWS = PAPER.replace(
+    v2x={"preset": "nominal", "link_latency_s": 0.25, "persistence": "periodic", "tells": ["place", "speed"]}
+)
+EVERY = {
+    "harm": 1.0, "harm_count": "honest", "terminal": 3.0, "shaping": 0.5, "still_moving": 7.0, "risk": 0.1,
+    "last": 11.0,
+}  # fmt: skip
+NAMES = {"vector": "max_episode_steps"}  # of the argument; otherwise max_cycles
+
+
+def last(before: eb.State, step: eb.Step, after: eb.State) -> Any:
+    """Time, flags and harm of the step that ends an episode."""
+    flags = step.truncated * 2.0 + step.terminated * 4.0 + step.safe_end * 8.0
+    return after.ended * (1.0 + after.time_s + flags + after.harm("honest"))
+
+
+@pytest.fixture(autouse=True)
+def _last() -> None:
+    eb.register_term("last", last)
+
+
+def first_s(scenario: eb.Scenario) -> float:
+    """Time of the first decision, the same in every world."""
+    (time_s,) = set(eb.open_game(scenario)[1].reset(scenario.sample(20, seed=7)).time_s)
+    return float(time_s)
+
+
+def told(env: Any, steps: int, learners: list[str]) -> list[Any]:
+    """All that an environment of PettingZoo returns in several episodes."""
+    values = []
+    for k, action in enumerate(actions(3, steps, len(learners))):
+        if not env.agents:
+            values.append(env.reset(seed=7 if k == 0 else None))
+        values.append(env.step(dict(zip(learners, action, strict=True)))[1:])
+    return values
+
+
+@pytest.mark.parametrize("scenario", [PAPER, PAIR, NEWS, FIVE], ids=["paper", "two learners", "messages", "scripts"])
+@pytest.mark.parametrize("steps", [4, 5, 12])
+def test_most_steps__are_a_shorter_horizon_to_every_term(scenario: eb.Scenario, steps: int) -> None:
+    horizon_s = first_s(scenario) + steps * scenario.time_step_s
+    learners = [f"vehicle_{body}" for body in scenario.learners]
+    runs = [
+        told(eb.parallel_env(each, reward=EVERY, max_cycles=most), 5 * steps, learners)
+        for each, most in ((scenario, steps), (scenario.replace(horizon_s=horizon_s), None))
+    ]
+    assert str(runs[0]) == str(runs[1])
+    ends = [value for value in runs[0] if len(value) == 4 and any(value[2].values())]
+    assert len(ends) == 5 and all(end[3]["vehicle_2"]["reward_still_moving"] == -1.0 for end in ends)
+
+
+@pytest.mark.parametrize("name", [*BARE, *STEP, "episode parallel"])
+def test_most_steps__are_a_shorter_horizon_at_every_interface(name: str) -> None:
+    make = partial(BARE["parallel"], wrap=EPISODE) if name == "episode parallel" else (BARE | STEP)[name]
+    most = {NAMES.get(name.split()[-1], "max_cycles"): 4}
+    runs = []
+    for scenario, settings in ((PAPER, most), (PAPER.replace(horizon_s=0.5 + 4 * 0.1), {})):
+        interface = make(scenario, 4, reward=EVERY, **settings)
+        interface.reset(7)
+        runs.append([interface.step(action).bits() for action in actions(3, 9, interface.n)])
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize("name", BARE)
+@pytest.mark.parametrize("most", [10, 11, 10**9, 2**70])
+def test_most_steps__that_are_not_reached_change_nothing(name: str, most: int) -> None:
+    runs = []
+    for settings in ({NAMES.get(name, "max_cycles"): most}, dict[str, Any]()):
+        interface = BARE[name](REST, 2, reward=EVERY, **settings)  # at rest in its 10th step
+        interface.reset(7)
+        runs.append([interface.step(np.full((interface.n, 1), -1.0, np.float32)).bits() for _ in range(21)])
+    assert runs[0] == runs[1]
+
+
+def test_most_steps__from_each_world_s_own_first_decision() -> None:
+    scenario = PAPER.replace(latency_s=[0, {"uniform": [0.1, 0.6]}, 0.7])
+    env = eb.EthBrakeVectorEnv(5, scenario, reward=EVERY, max_episode_steps=4, autoreset_mode="SameStep")
+    state, drawn = env.reset(seed=7)[1]["time_s"], scenario.sample(5, 7, channel="training")
+    driven = actions(3, 4, 5)
+    for action in driven:
+        _, rewards, _, truncated, infos = env.step(action)
+    assert truncated.all() and len(set(state)) == 5
+    for k in range(5):
+        horizon_s = float(state[k] + 4 * 0.1)
+        alone = eb.EthBrakeEnv(scenario.replace(horizon_s=horizon_s), reward=EVERY)
+        alone.reset(options={"initial_state": {
+            "gaps_m": drawn.gaps_m[k], "speeds_mps": drawn.speeds_mps[k], "latency_s": drawn.latency_s[k],
+            "braking_capacity_mps2": drawn.braking_capacity_mps2[k], "mass_t": drawn.mass_t[k],
+            "driving_capacity_mps2": drawn.driving_capacity_mps2[k], "restitution": drawn.restitution[k],
+        }})  # fmt: skip
+        for action in driven:
+            _, reward, terminated, cut, info = alone.step(action[k])
+        assert (reward, terminated, cut) == (rewards[k], False, True)
+        final = {name: column[k] for name, column in infos["final_info"].items() if name in info}
+        assert {**final, "world_seed": 0, "world": 0} == {**info, "world_seed": 0, "world": 0}
+
+
+def test_terminal__is_paid_by_hand_and_through_gymnasium() -> None:
+    register_environments()
+    env = gymnasium.make("EthBrake-v1", scenario="paper-random", reward={"harm": 0, "terminal": 1}, max_cycles=2)
+    env.reset(seed=7)
+    assert [env.step([0.0])[1:4] for _ in range(2)] == [(0.0, False, False), (1.0, False, True)]
+    crash = eb.EthBrakeEnv(CRASH, reward={"harm": 1, "harm_count": "honest"}, max_cycles=4)
+    crash.reset()
+    costs = [crash.step([0.0])[1] for _ in range(4)]  # coasting at 20 m/s to the end at 0.9 s; Vehicle 1 has 14.6 m/s
+    assert costs == [0.0, 0.0, 0.0, pytest.approx(-(20.0**2) - 14.6**2)]
+
+
+def test_physics_of_another_kind__ends_there_too() -> None:
+    paper_map = PAPER.replace(physics="paper-map")
+    runs = [
+        told(eb.parallel_env(each, reward={"harm": 1, "terminal": 2}, max_cycles=most), 12, ["vehicle_2"])
+        for each, most in ((paper_map, 4), (paper_map.replace(horizon_s=0.5 + 4 * 0.1), None))
+    ]
+    assert str(runs[0]) == str(runs[1])
+
+
+def test_plans_and_searches__end_where_the_game_does() -> None:
+    env, worlds = eb.parallel_env(PAPER, max_cycles=9), PAPER.sample(20, seed=7)
+    shorter = PAPER.replace(horizon_s=0.5 + 9 * 0.1)
+    problems = [problem_of(env.game, worlds), problem_of(eb.open_game(shorter)[1], worlds)]
+    assert (problems[0].identity == problems[1].identity).all()
+    ends = [problem.follow(problem.coasting()) for problem in problems]
+    assert ends[0].harm("honest").tolist() == ends[1].harm("honest").tolist()
+    state = env.game.reset(worlds)
+    assert price(env.game, state, np.zeros((20, 1, 1)), "honest").tolist() == ends[0].harm("honest").tolist()
+    best = [best_harm(game, worlds, counts=["honest"], budget=50).harm for game in (env.game, eb.open_game(shorter)[1])]
+    assert best[0]["honest"].tolist() == best[1]["honest"].tolist()
