@@ -34,6 +34,7 @@ STEPS = 2  # number of steps taken
 LAST = 3  # number of the step that ends at the horizon
 ENDED = 4  # 1 once the episode has ended
 NUMBER = 5  # number of the world in its list; -1: the caller has made it
+LISTED = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
 CLOCK_COLUMNS = 6
 
 PHYSICS = "physics"  # a memory of this name marks worlds whose impacts are not exact (`worlds.physics`)

@@ -284,8 +284,13 @@ def first_decision(alert: State, deciders: Ints, time_step_s: float, horizon_s: 
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
     state = advanced(alert, first)
     state.clock[:, FIRST_DECISION] = first
-    state.clock[:, LAST] = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
+    state.clock[:, LAST] = last_step(first, time_step_s, horizon_s)
     return state
+
+
+def last_step(first_s: Any, time_step_s: float, horizon_s: float) -> Any:
+    """Number of the step that ends at the horizon, if the first decision is at ``first_s``."""
+    return np.ceil((horizon_s - first_s) / time_step_s - ROUNDING)
 
 
 def step(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.observe import Observations
@@ -13,14 +15,32 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
-from ethbrake_marl.faces.rendering import render_metadata
-from ethbrake_marl.faces.spaces import FeatureBox, reward_box
+from ethbrake_marl.faces.rendering import Metadata
+from ethbrake_marl.faces.spaces import feature_box, reward_box
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.scenario import plain
 
 
 class OneLearner(Face):
     """A game with one learner, for Gymnasium's single and vector environments."""
+
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How Gymnasium made this environment, in plain data, and the largest number of steps of an episode."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None:
+            known = {"learners": [self.name], "observation": self.scenario.observation}  # a set or iterator was given
+            kwargs = {
+                name: plain(value if value is None else known.get(name, value)) for name, value in spec.kwargs.items()
+            }
+            spec = replace(spec, kwargs=kwargs, max_episode_steps=self._longest())
+        self._spec = spec
 
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
@@ -33,7 +53,7 @@ class OneLearner(Face):
         (self.name,) = names
         if components := self.game.rewarding.components:  # as MO-Gymnasium has it
             self.reward_space, self.reward_dim = reward_box(components), len(components)
-        return FeatureBox(self.game.views[self.bodies[0]].features), action_space(actions)
+        return feature_box(self.game.views[self.bodies[0]].features), action_space(actions)
 
     def _observe(self, state: State) -> Observations:
         seen: Observations = self.game.observe_alike(state, self.bodies)[:, 0]
@@ -55,7 +75,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     (0.0, False, False)
     """
 
-    metadata: dict[str, Any] = render_metadata()  # as Gymnasium declares it
+    metadata: Any = Metadata()
 
     def __init__(
         self,

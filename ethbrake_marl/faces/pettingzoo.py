@@ -15,8 +15,8 @@ from ethbrake_marl.episode.state import ENDED, State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
-from ethbrake_marl.faces.rendering import render_metadata
-from ethbrake_marl.faces.spaces import FeatureBox, reward_box
+from ethbrake_marl.faces.rendering import Metadata
+from ethbrake_marl.faces.spaces import feature_box, reward_box
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
@@ -57,7 +57,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
     """
 
-    metadata: dict[str, Any] = {"name": "ethbrake_v1", "is_parallelizable": True, **render_metadata()}  # noqa: RUF012
+    metadata: Any = Metadata(name="ethbrake_v1", is_parallelizable=True)
 
     def __init__(
         self,
@@ -76,15 +76,16 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
             raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
         if agents == "learners" or actions is not None:
             self._need_learner()
+        self.np_random = np.random.default_rng()  # for wrappers that draw
         names, learning = self.scenario.vehicle_names, self.game.rules.learners
         self.actions, self.bodies = actions, np.arange(1, len(names) + 1) if agents == "all" else learning
         self.possible_agents = [names[i - 1] for i in self.bodies]
         self._learners = {names[i - 1]: c for c, i in enumerate(learning)}
         views = [self.game.views[i] for i in self.bodies]
         self._alike = len(set(views)) == 1
-        self.observation_spaces = dict(zip(self.possible_agents, (FeatureBox(v.features) for v in views), strict=True))
+        self.observation_spaces = dict(zip(self.possible_agents, (feature_box(v.features) for v in views), strict=True))
         self.action_spaces = {a: action_space(actions if a in self._learners else None) for a in self.possible_agents}
-        self.state_space = FeatureBox(state_features(len(names), *self._of_state))
+        self.state_space = feature_box(state_features(len(names), *self._of_state))
         if components := self.game.rewarding.components:  # as MOMAland has it
             self.reward_spaces = {agent: reward_box(components) for agent in self.possible_agents}
 
@@ -114,6 +115,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         Options: ``{"initial_state": ...}``, or ``{"listed_world": {"seed": 7, "number": 3}}`` of an evaluation list.
         """
         state = self._begin(1, seed, options)
+        if seed is not None:
+            self.np_random = np.random.default_rng(seed)
         return self._observations(state), self._by_agent(self._infos(state, None))
 
     def step(

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import NUMBER, State
+from ethbrake_marl.episode.infos import names_of_worlds
+from ethbrake_marl.episode.state import LISTED, NUMBER, State
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.sampling import Drawn, merged
@@ -28,43 +30,62 @@ class Stream:
 
     def __init__(self, scenario: Scenario, game: Game) -> None:
         self.scenario, self.game = scenario, game
-        self.seed: int | None = None
-        self.next = 0  # number of the next world
-        self.given: Drawn | None = None  # the worlds that the last reset asked for
+        self.seed: Any = None  # of all rows, or of each row, [n]
+        self.next: Any = 0  # number of the next world, of all rows or of each row
+        self.given: tuple[Drawn, int] | None = None  # the worlds that the last reset asked for, and their seed or -1
 
-    def reset(self, n: int, seed: int | None, options: Any = None) -> State:
+    def reset(self, n: int, seed: Any, options: Any = None) -> State:
         """Return new episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
 
-        The first reset without a seed draws a random one. ``options`` may specify the worlds instead. Raises
-        ``InvalidInput`` for a bad seed or option, and then changes nothing; warns of unknown options.
+        A list has the seed of each row, which begins with the first world of its own seed. The first reset without a
+        seed draws a random one. ``options`` may specify the worlds instead. Raises ``InvalidInput`` for a bad seed or
+        option, and then changes nothing; warns of unknown options.
         """
-        first = self.next if seed is None else 0
-        seed = chosen_seed(self.seed if seed is None else seed)
+        chosen, first = self.seed, self.next
+        if seed is not None or chosen is None:
+            several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
+            chosen, first = chosen_seeds(n, seed) if several else (chosen_seed(seed), 0)
         given = self._asked_for(n, options)
-        state = self.game.reset(self.game.draw(n, seed, first) if given is None else given.worlds)
-        self.seed, self.next, self.given = seed, first + (n if given is None else 0), given
+        worlds, after = self._draw(np.arange(n), chosen, first) if given is None else (given[0].worlds, first)
+        state = self.game.reset(worlds)
+        self.seed, self.next, self.given = chosen, after, given
         return state
 
-    def next_episodes(self, n: int) -> State:
-        """Return new episodes in the next n worlds. They share no memory with other episodes."""
-        assert self.seed is not None
-        state = self.game.reset(self.game.draw(n, self.seed, self.next))
-        self.next += n
+    def next_episodes(self, rows: Ints) -> State:
+        """Return new episodes in the next world of each row. They share no memory with other episodes."""
+        worlds, after = self._draw(rows, self.seed, self.next)
+        state = self.game.reset(worlds)
+        self.next = after
         return state
+
+    def _draw(self, rows: Ints, seed: Any, first: Any) -> tuple[State, Any]:
+        """Return the next world of each row, and ``next`` after it."""
+        if isinstance(seed, int):
+            return self.game.draw(len(rows), seed, first), first + len(rows)
+        drawn = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), channel="training") for k in rows]
+        return State.join(drawn), first + np.isin(np.arange(len(first)), rows)
+
+    def seeds_of(self, state: State) -> Any:
+        """Return the seed of each running world, [n], or of all; -1 for a world that the caller made."""
+        if self.given is None:
+            return self.seed
+        own, given = np.full(state.n, self.seed).tolist(), (state.clock[:, NUMBER] < 0.0).tolist()
+        return exact([self.given[1] if known else seed for known, seed in zip(given, own, strict=True)])
 
     def describe(self, state: State) -> dict[str, Any]:
         """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
-        numbers, seed = state.clock[:, NUMBER].astype(np.int64), self.seed or 0
-        place, parts = np.arange(state.n), [] if self.given is None else [self.given]
+        numbers, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed)
+        place, parts = np.arange(state.n), [] if self.given is None else [self.given[0]]
         of_stream = np.flatnonzero(numbers >= 0)
         place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
-        parts += [self.scenario.draw(1, seed, first=int(k), channel="training") for k in numbers[of_stream]]
+        parts += [self.scenario.draw(1, int(seeds[k]), first=int(numbers[k]), channel="training") for k in of_stream]
         drawn = merged(parts, np.arange(sum(part.worlds.n for part in parts)))
         columns = {name: column[place] for name, column in columns_of(drawn).items()}
-        return {**columns, "world_seed": np.full(state.n, seed), "world": numbers}
+        names = names_of_worlds(state, self.seeds_of(state))
+        return {**columns, "world_seed": names["world_seed"], "world": names["world"]}
 
-    def _asked_for(self, n: int, options: Any) -> Drawn | None:
-        """Return the worlds that ``options`` of a reset specify, or None."""
+    def _asked_for(self, n: int, options: Any) -> tuple[Drawn, int] | None:
+        """Return the worlds that ``options`` of a reset specify, and their seed or -1; or None."""
         if options is None:
             return None
         if not isinstance(options, Mapping):
@@ -81,7 +102,7 @@ class Stream:
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
             one = worlds_from_state(self.scenario, options["initial_state"])
-            return Drawn.given(one.take(np.zeros(n, np.int64)))
+            return Drawn.given(one.take(np.zeros(n, np.int64))), -1
         if "listed_world" not in options:
             return None
         wanted = options["listed_world"]
@@ -91,8 +112,20 @@ class Stream:
                 " instance {'seed': 7, 'number': 3}"
             )
         drawn = self.scenario.draw(n, wanted["seed"], first=wanted["number"])
-        drawn.worlds.clock[:, NUMBER] = -1.0
-        return drawn
+        drawn.worlds.clock[:, NUMBER] = LISTED - drawn.worlds.clock[:, NUMBER]
+        return drawn, int(wanted["seed"])
+
+
+def chosen_seeds(n: int, seeds: Any) -> tuple[Ints, Ints]:
+    """Return the seed of each row, and the number of its next world. Raises ``InvalidInput`` for a bad list."""
+    if len(seeds) != n:
+        raise InvalidInput(f"reset: seed has {len(seeds)} entries; must be one seed, or a list of {n} seeds")
+    return exact([chosen_seed(seed) for seed in seeds]), np.zeros(n, np.int64)
+
+
+def exact(seeds: list[int]) -> Ints:
+    """Return seeds as an array: of objects if one exceeds 63 bits, because numpy would round it."""
+    return np.array(seeds, np.int64 if max(seeds) < 2**63 else object)
 
 
 def chosen_seed(seed: int | None) -> int:

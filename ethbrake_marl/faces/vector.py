@@ -64,15 +64,21 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         if autoreset_mode not in ("NextStep", "SameStep", AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise InvalidInput(f"autoreset_mode = {autoreset_mode!r}: must be 'NextStep' or 'SameStep'")
         self.num_envs, self.autoreset_mode = int(num_envs), AutoresetMode(autoreset_mode)
-        self.metadata = {**render_metadata(), "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**render_metadata(many=True), "autoreset_mode": self.autoreset_mode}
         game = scenario, learners, reward, observation, reward_vector
         spaces = self._open_one(game, render_mode, actions, max_episode_steps)
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = (batch_space(space, self.num_envs) for space in spaces)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
+        """Start an episode in every world.
+
+        With an int, row k begins with world k of the seed. With a list of seeds, row k has the episodes of
+        ``EthBrakeEnv`` with the k-th seed. Options: ``initial_state`` is the same world in every row; with
+        ``{"listed_world": {"seed": 7, "number": 3}}`` row k has world 3 + k of the list.
+        """
         state = self._begin(self.num_envs, seed, options)
-        super().reset(seed=self.stream.seed if seed is not None else None)
+        super().reset(seed=None if seed is None else int(np.ravel(self.stream.seed)[0]))
         every = np.ones(self.num_envs, np.bool_)
         return self._observe(state), self._columns(state, None, every, every)
 
@@ -90,7 +96,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
             last = self._columns(state, step, renewed, renewed)
             infos = {"final_obs": final, "_final_obs": renewed, "final_info": last, "_final_info": renewed.copy()}
         if renewed.any():
-            state = self.episode = state.put(renewed, self.stream.next_episodes(int(renewed.sum())), donate=True)
+            state = self.episode = state.put(renewed, self.stream.next_episodes(np.flatnonzero(renewed)), donate=True)
         self.renderer.stepped(state)
         infos |= self._columns(state, step, every, ~renewed)
         return self._observe(state), self._rewards(step)[:, 0], step.terminated, step.truncated, infos
@@ -106,7 +112,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         to an earlier episode.
         """
         infos: dict[str, Any] = {}
-        for name, column in arrays(self.game, state, step, self.stream.seed or 0, self.bodies[0]).items():
+        for name, column in arrays(self.game, state, step, self.stream.seeds_of(state), self.bodies[0]).items():
             of_step = name == "cost" or name.startswith("reward_")
             valid = rows & stepped if of_step else rows
             infos[name] = column.copy() if valid.all() else np.where(valid, column, np.zeros((), column.dtype))

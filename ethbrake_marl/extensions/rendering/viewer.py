@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from typing import Any
 
 import numpy as np
@@ -73,10 +74,15 @@ class Window(Viewer):
     def __init__(self, environment: Any) -> None:
         super().__init__(environment)
         if self.many:
-            raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
-        need("pygame")
+            self.check(many=True)
         self.window: Any = None
         self.closed = False
+
+    @staticmethod
+    def check(many: bool) -> None:
+        if many:
+            raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
+        import_pygame()
 
     def began(self, state: State) -> None:
         super().began(state)
@@ -91,9 +97,7 @@ class Window(Viewer):
         """Do nothing: the window shows every step by itself."""
 
     def _play(self) -> None:
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        import pygame
-
+        pygame = import_pygame()
         clock = pygame.time.Clock()
         for frame in [] if self.closed else self.step_frames():
             size = frame.shape[1::-1]
@@ -119,6 +123,26 @@ class Window(Viewer):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "window": None}
+
+
+def import_pygame() -> Any:
+    """Import the module pygame of the package pygame-ce.
+
+    Raises ``MissingExtra`` without a module, and ``InvalidInput`` if the package pygame has put its module there.
+    """
+    need("pygame")
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the package pygame uses what Python will remove
+        import pygame
+    if not hasattr(pygame, "Window"):
+        raise InvalidInput(
+            "render_mode = 'human': needs a module pygame that has Window, as of the package pygame-ce; the installed"
+            f" one, {pygame.__name__} {getattr(pygame, '__version__', '')}, has none, as of the package pygame;"
+            " uninstall both packages and install pygame-ce again, or use gymnasium.make, whose window takes either,"
+            " or 'rgb_array'"
+        )
+    return pygame
 
 
 def _open(pygame: Any, size: tuple[int, int]) -> Any:
