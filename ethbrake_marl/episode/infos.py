@@ -77,8 +77,8 @@ def names_of_worlds(state: State, seed: Any) -> dict[str, Any]:
     """Seed, number and list of each world, name -> [n]; ``seed`` is one for all worlds, or [n]."""
     number = state.clock[:, NUMBER].astype(np.int64)
     listed = number <= LISTED
-    own = np.where(listed, LISTED - number, number)
-    return {"world_seed": np.full(state.n, seed), "world": own, "world_listed": listed}
+    named = np.where(listed, LISTED - number, number)
+    return {"world_seed": np.full(state.n, seed), "world": named, "world_listed": listed}
 
 
 def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str, Any]:

@@ -7,10 +7,10 @@ from typing import Any
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.infos import dictionaries
 from ethbrake_marl.episode.state import ENDED, State
-from ethbrake_marl.episode.step import TRUNCATED, Step, last_step
+from ethbrake_marl.episode.step import TRUNCATED, Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.rendering import Renderer, make_renderer
-from ethbrake_marl.faces.stream import Stream, chosen_seed
+from ethbrake_marl.faces.stream import Stream
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -35,16 +35,7 @@ class Face:
         if not len(self.game.rules.learners):
             raise InvalidInput(f"scenario {self.scenario.name!r} has no learner; pass learners=['vehicle_2']")
 
-    def _longest(self) -> int:
-        """Return the largest number of steps of an episode in the scenario's worlds."""
-        latencies = self.scenario.bounds("latency_s")
-        first_s = min(latencies[i - 1][0] for i in self.game.deciders.tolist())
-        longest = int(last_step(first_s, self.scenario.time_step_s, self.scenario.horizon_s))
-        return longest if self._most_steps is None else min(longest, self._most_steps)
-
     def _begin(self, n: int, seed: Any, options: Any) -> State:
-        if seed is not None and not self.begins_again:
-            chosen_seed(seed)  # a list of seeds is for many worlds
         self.episode = self.stream.reset(n, seed, options)
         self.renderer.began(self.episode)
         return self.episode

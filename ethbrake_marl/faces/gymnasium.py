@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import last_step
 from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import Metadata
 from ethbrake_marl.faces.spaces import feature_box, reward_box
+from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.scenario import plain
@@ -34,13 +36,13 @@ class OneLearner(Face):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        if spec is not None:
-            known = {"learners": [self.name], "observation": self.scenario.observation}  # a set or iterator was given
-            kwargs = {
-                name: plain(value if value is None else known.get(name, value)) for name, value in spec.kwargs.items()
-            }
-            spec = replace(spec, kwargs=kwargs, max_episode_steps=self._longest())
-        self._spec = spec
+        self._spec = spec and replace(spec, kwargs=plain(spec.kwargs), max_episode_steps=self._longest())
+
+    def _longest(self) -> int:
+        """Return the largest number of steps of an episode in the scenario's worlds."""
+        first_s = min(self.scenario.bounds("latency_s")[i - 1][0] for i in self.game.deciders)
+        longest = int(last_step(first_s, self.scenario.time_step_s, self.scenario.horizon_s))
+        return longest if self._most_steps is None else min(longest, self._most_steps)
 
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
@@ -91,7 +93,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self.observation_space, self.action_space = self._open_one(game, render_mode, actions, None)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
-        state = self._begin(1, seed, options)
+        state = self._begin(1, None if seed is None else chosen_seed(seed), options)
         super().reset(seed=self.stream.seed if seed is not None else None)
         return self._observe(state)[0], self._infos(state, None)[0]
 

@@ -17,6 +17,7 @@ from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import Metadata
 from ethbrake_marl.faces.spaces import feature_box, reward_box
+from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
@@ -57,6 +58,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
     """
 
+    np_random = np.random.default_rng()  # for wrappers that draw
     metadata: Any = Metadata(name="ethbrake_v1", is_parallelizable=True)
 
     def __init__(
@@ -76,7 +78,6 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
             raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
         if agents == "learners" or actions is not None:
             self._need_learner()
-        self.np_random = np.random.default_rng()  # for wrappers that draw
         names, learning = self.scenario.vehicle_names, self.game.rules.learners
         self.actions, self.bodies = actions, np.arange(1, len(names) + 1) if agents == "all" else learning
         self.possible_agents = [names[i - 1] for i in self.bodies]
@@ -114,9 +115,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
         Options: ``{"initial_state": ...}``, or ``{"listed_world": {"seed": 7, "number": 3}}`` of an evaluation list.
         """
-        state = self._begin(1, seed, options)
-        if seed is not None:
-            self.np_random = np.random.default_rng(seed)
+        state = self._begin(1, None if seed is None else chosen_seed(seed), options)
+        self.np_random = np.random.default_rng([self.stream.seed, self.stream.next])
         return self._observations(state), self._by_agent(self._infos(state, None))
 
     def step(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 from ethbrake_marl.episode.state import State
@@ -28,12 +27,9 @@ class Renderer:
     def close(self) -> None:
         """Close windows and files."""
 
-    @staticmethod
-    def check(many: bool) -> None:
-        """Raise ``InvalidInput`` or ``MissingExtra`` if one world, or ``many``, cannot be drawn on this machine."""
 
-
-MakeRenderer = Callable[[Any], Any]  # environment -> object with the methods of Renderer; it may have a `check`
+# environment -> object with the methods of Renderer; a function `check` of it raises an error where it cannot draw
+MakeRenderer = Callable[[Any], Any]
 
 
 def register_renderer(mode: str, make: MakeRenderer) -> None:
@@ -44,19 +40,18 @@ def register_renderer(mode: str, make: MakeRenderer) -> None:
 RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", register_renderer)
 
 
-def check_mode(mode: str, *, many: bool) -> None:
-    """Raise an error of this package if a render mode cannot be used on this machine."""
-    getattr(RENDERERS[mode], "check", Renderer.check)(many)
+def why_not(mode: str) -> str | None:
+    """Return why a render mode cannot be used on this machine, or None."""
+    try:
+        getattr(RENDERERS[mode], "check", Renderer)()
+    except EthBrakeError as error:
+        return str(error)
+    return None
 
 
-def render_metadata(*, many: bool) -> dict[str, Any]:
+def render_metadata() -> dict[str, Any]:
     """Return the entries of an environment's ``metadata`` about pictures, with the modes that work on this machine."""
-    modes = []
-    for mode in RENDERERS:
-        with suppress(EthBrakeError):
-            check_mode(mode, many=many)
-            modes.append(mode)
-    return {"render_modes": modes, "render_fps": FRAMES_PER_SECOND}
+    return {"render_modes": [m for m in RENDERERS if why_not(m) is None], "render_fps": FRAMES_PER_SECOND}
 
 
 class Metadata:
@@ -66,7 +61,7 @@ class Metadata:
         self.other = other
 
     def __get__(self, environment: Any, owner: Any) -> dict[str, Any]:
-        return {**self.other, **render_metadata(many=False)}
+        return {**self.other, **render_metadata()}
 
 
 def make_renderer(environment: Any, mode: str | None) -> Any:

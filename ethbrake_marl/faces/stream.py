@@ -42,9 +42,12 @@ class Stream:
         option, and then changes nothing; warns of unknown options.
         """
         chosen, first = self.seed, self.next
-        if seed is not None or chosen is None:
-            several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
-            chosen, first = chosen_seeds(n, seed) if several else (chosen_seed(seed), 0)
+        if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+            if len(seed) != n:
+                raise InvalidInput(f"reset: seed has {len(seed)} entries; must be one seed, or a list of {n} seeds")
+            chosen, first = [chosen_seed(each) for each in seed], np.zeros(n, np.int64)
+        elif seed is not None or chosen is None:
+            chosen, first = chosen_seed(seed), 0
         given = self._asked_for(n, options)
         worlds, after = self._draw(np.arange(n), chosen, first) if given is None else (given[0].worlds, first)
         state = self.game.reset(worlds)
@@ -69,12 +72,11 @@ class Stream:
         """Return the seed of each running world, [n], or of all; -1 for a world that the caller made."""
         if self.given is None:
             return self.seed
-        own, given = np.full(state.n, self.seed).tolist(), (state.clock[:, NUMBER] < 0.0).tolist()
-        return exact([self.given[1] if known else seed for known, seed in zip(given, own, strict=True)])
+        return np.where(state.clock[:, NUMBER] < 0.0, self.given[1], self.seed)
 
     def describe(self, state: State) -> dict[str, Any]:
         """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
-        numbers, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed)
+        numbers, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed, object)
         place, parts = np.arange(state.n), [] if self.given is None else [self.given[0]]
         of_stream = np.flatnonzero(numbers >= 0)
         place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
@@ -114,18 +116,6 @@ class Stream:
         drawn = self.scenario.draw(n, wanted["seed"], first=wanted["number"])
         drawn.worlds.clock[:, NUMBER] = LISTED - drawn.worlds.clock[:, NUMBER]
         return drawn, int(wanted["seed"])
-
-
-def chosen_seeds(n: int, seeds: Any) -> tuple[Ints, Ints]:
-    """Return the seed of each row, and the number of its next world. Raises ``InvalidInput`` for a bad list."""
-    if len(seeds) != n:
-        raise InvalidInput(f"reset: seed has {len(seeds)} entries; must be one seed, or a list of {n} seeds")
-    return exact([chosen_seed(seed) for seed in seeds]), np.zeros(n, np.int64)
-
-
-def exact(seeds: list[int]) -> Ints:
-    """Return seeds as an array: of objects if one exceeds 63 bits, because numpy would round it."""
-    return np.array(seeds, np.int64 if max(seeds) < 2**63 else object)
 
 
 def chosen_seed(seed: int | None) -> int:

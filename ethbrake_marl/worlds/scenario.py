@@ -356,10 +356,8 @@ def plain(value: Any) -> Any:
         return list(value.names)
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    if isinstance(value, PurePath):
-        return str(value)
-    if isinstance(value, Enum):
-        return value.value
+    if isinstance(value, PurePath | Enum):
+        return str(value) if isinstance(value, PurePath) else value.value
     if isinstance(value, Mapping):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):

@@ -68,21 +68,36 @@ class Words(Viewer):
         return scene.text()
 
 
+def import_pygame() -> Any:
+    """Import the module pygame of the package pygame-ce.
+
+    Raises ``MissingExtra`` without a module, and ``InvalidInput`` if the package pygame has put its module there.
+    """
+    need("pygame")
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the package pygame uses what Python will remove
+        import pygame
+    if not hasattr(pygame, "Window"):
+        raise InvalidInput(
+            f"render_mode = 'human': the module pygame {pygame.version.ver} has no Window, because it belongs to the"
+            " package pygame, not to pygame-ce; uninstall both packages, then install pygame-ce; or use gymnasium.make,"
+            " which opens a window with either of them"
+        )
+    return pygame
+
+
 class Window(Viewer):
     """Viewer of the mode ``human``: a window that shows every step in real time. The user may close it."""
+
+    check = staticmethod(import_pygame)
 
     def __init__(self, environment: Any) -> None:
         super().__init__(environment)
         if self.many:
-            self.check(many=True)
+            raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
         self.window: Any = None
         self.closed = False
-
-    @staticmethod
-    def check(many: bool) -> None:
-        if many:
-            raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
-        import_pygame()
 
     def began(self, state: State) -> None:
         super().began(state)
@@ -123,26 +138,6 @@ class Window(Viewer):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "window": None}
-
-
-def import_pygame() -> Any:
-    """Import the module pygame of the package pygame-ce.
-
-    Raises ``MissingExtra`` without a module, and ``InvalidInput`` if the package pygame has put its module there.
-    """
-    need("pygame")
-    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the package pygame uses what Python will remove
-        import pygame
-    if not hasattr(pygame, "Window"):
-        raise InvalidInput(
-            "render_mode = 'human': needs a module pygame that has Window, as of the package pygame-ce; the installed"
-            f" one, {pygame.__name__} {getattr(pygame, '__version__', '')}, has none, as of the package pygame;"
-            " uninstall both packages and install pygame-ce again, or use gymnasium.make, whose window takes either,"
-            " or 'rgb_array'"
-        )
-    return pygame
 
 
 def _open(pygame: Any, size: tuple[int, int]) -> Any:
