@@ -12,7 +12,8 @@ world_total_harm          the same over all impacts
 collided                  whether the world has had an impact
 cost                      harm of the line in the last step, in the reward's count, m2/s2
 reward_NAME               term NAME of the reward or of ``report`` in the last step, without its weight
-world_seed, world         seed and number of the world; the number is -1 for a world made by the caller
+world_seed, world         seed and number of the world; -1 and -1 for a world made by the caller
+world_listed              whether the world is in the evaluation list of the seed, not among its training worlds
 shield_NAME               values that a shield reports
 ========================  ==========================================================================================
 """
@@ -25,7 +26,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import COUNTS, amount_so_far
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import NUMBER, TIME, State, split_world
+from ethbrake_marl.episode.state import LISTED, NUMBER, TIME, State, split_world
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import BRAKING, COUNT, DRIVING, FIRST, FORCE, MASS, TOTAL, Floats, Ints
@@ -72,10 +73,18 @@ def numbers(state: State, bodies: Ints) -> Floats:
     return out
 
 
-def of_step(game: Game, state: State, step: Step | None, seed: int) -> dict[str, Any]:
+def names_of_worlds(state: State, seed: Any) -> dict[str, Any]:
+    """Seed, number and list of each world, name -> [n]; ``seed`` is one for all worlds, or [n]."""
+    number = state.clock[:, NUMBER].astype(np.int64)
+    listed = number <= LISTED
+    named = np.where(listed, LISTED - number, number)
+    return {"world_seed": np.full(state.n, seed), "world": named, "world_listed": listed}
+
+
+def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str, Any]:
     """Cost, seed, world number and reward terms: name -> [n] or [n, N]. ``step`` is None after a reset."""
     reported = game.rewarding.reported
-    worlds = {"world_seed": np.full(state.n, seed), "world": state.clock[:, NUMBER].astype(np.int64)}
+    worlds = names_of_worlds(state, seed)
     if step is None:
         nothing = np.zeros(state.n)
         return {"cost": nothing, **worlds, **{f"reward_{name}": nothing for name in reported}}

@@ -286,10 +286,15 @@ def first_decision(
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
     state = advanced(alert, first)
     state.clock[:, FIRST_DECISION] = first
-    steps = np.ceil((horizon_s - first) / time_step_s - ROUNDING)
+    steps = last_step(first, time_step_s, horizon_s)
     state.clock[:, LAST] = np.minimum(steps, most_steps)
     state.clock[:, END] = np.where(steps <= most_steps, horizon_s, first + most_steps * time_step_s)
     return state
+
+
+def last_step(first_s: Any, time_step_s: float, horizon_s: float) -> Any:
+    """Number of the step that ends at the horizon, if the first decision is at ``first_s``."""
+    return np.ceil((horizon_s - first_s) / time_step_s - ROUNDING)
 
 
 def step(

@@ -12,18 +12,17 @@ from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.motion.layout import Floats
 
 
-class Indices(Discrete):
-    """Discrete space whose indices stand for actions evenly spaced from -1 to 1."""
-
-    evenly_spaced = True
-
-
 def action_space(count: int | None) -> Any:
-    """Return one learner's action space: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices."""
+    """Return one learner's action space: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices.
+
+    Indices stand for evenly spaced actions, as the attribute ``evenly_spaced`` of their space says.
+    """
     if count is None:
         return Box(-1.0, 1.0, (1,), np.float32)
     check_whole_number("actions", count, 2)
-    return Indices(int(count))
+    space = Discrete(int(count))
+    space.evenly_spaced = True  # type: ignore[attr-defined]  # saved with a model
+    return space
 
 
 def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:

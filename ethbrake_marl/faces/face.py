@@ -10,7 +10,7 @@ from ethbrake_marl.episode.infos import dictionaries
 from ethbrake_marl.episode.state import ENDED, State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.faces.rendering import make_renderer
+from ethbrake_marl.faces.rendering import Renderer, make_renderer
 from ethbrake_marl.faces.stream import Stream
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.worlds.scenario import Scenario
@@ -22,6 +22,7 @@ class Face:
     bodies: Ints
     episode: State = None  # type: ignore[assignment]  # until the first reset
     begins_again = False  # whether the next episode starts by itself when one has ended
+    renderer: Any = Renderer()  # until it is opened
 
     def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
         """Set the game of this environment. An episode is truncated after ``most_steps``; None: only at the horizon."""
@@ -62,7 +63,7 @@ class Face:
         return rewards
 
     def _infos(self, stream: Stream, state: State, step: Step | None) -> list[dict[str, Any]]:
-        return dictionaries(self.game, state, step, stream.seed or 0, self.bodies)
+        return dictionaries(self.game, state, step, stream.seeds_of(state), self.bodies)
 
     def describe_worlds(self) -> dict[str, Any]:
         """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""

@@ -3,24 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import last_step
 from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
-from ethbrake_marl.faces.rendering import render_metadata
-from ethbrake_marl.faces.spaces import FeatureBox, reward_box
+from ethbrake_marl.faces.rendering import Metadata
+from ethbrake_marl.faces.spaces import feature_box, reward_box
+from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
+from ethbrake_marl.worlds.scenario import plain
 
 
 class OneLearner(Face):
     """A game with one learner, for Gymnasium's single and vector environments."""
+
+    _spec: EnvSpec | None = None
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How Gymnasium made this environment, in plain data, and the largest number of steps of an episode."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec and replace(spec, kwargs=plain(spec.kwargs), max_episode_steps=self._longest())
+
+    def _longest(self) -> int:
+        """Return the largest number of steps of an episode in the scenario's worlds."""
+        first_s = min(self.scenario.bounds("latency_s")[i - 1][0] for i in self.game.deciders)
+        longest = last_step(first_s, self.scenario.time_step_s, self.scenario.horizon_s)
+        return int(min(longest, self.game.rules.most_steps))
 
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
@@ -33,7 +55,7 @@ class OneLearner(Face):
         (self.name,) = names
         if components := self.game.rewarding.components:  # as MO-Gymnasium has it
             self.reward_space, self.reward_dim = reward_box(components), len(components)
-        return FeatureBox(self.game.views[self.bodies[0]].features), action_space(actions)
+        return feature_box(self.game.views[self.bodies[0]].features), action_space(actions)
 
     def _observe(self, state: State) -> Observations:
         seen: Observations = self.game.observe_alike(state, self.bodies)[:, 0]
@@ -55,7 +77,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
     (0.0, False, False)
     """
 
-    metadata: dict[str, Any] = render_metadata()  # as Gymnasium declares it
+    metadata: Any = Metadata()
 
     def __init__(
         self,
@@ -73,7 +95,7 @@ class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
         self.observation_space, self.action_space = self._open_one(game, render_mode, actions, max_cycles)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
-        stream, state = self.stream.reset(1, seed, options)
+        stream, state = self.stream.reset(1, None if seed is None else chosen_seed(seed), options)
         answer = self._observe(state)[0], self._infos(stream, state, None)[0]
         self._keep(stream, state, self.renderer.began)
         super().reset(seed=stream.seed if seed is not None else None)

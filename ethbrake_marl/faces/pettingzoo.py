@@ -15,8 +15,9 @@ from ethbrake_marl.episode.state import ENDED, State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
-from ethbrake_marl.faces.rendering import render_metadata
-from ethbrake_marl.faces.spaces import FeatureBox, reward_box
+from ethbrake_marl.faces.rendering import Metadata
+from ethbrake_marl.faces.spaces import feature_box, reward_box
+from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
@@ -59,7 +60,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
     """
 
-    metadata: dict[str, Any] = {"name": "ethbrake_v1", "is_parallelizable": True, **render_metadata()}  # noqa: RUF012
+    np_random = np.random.default_rng()  # for wrappers that draw
+    metadata: Any = Metadata(name="ethbrake_v1", is_parallelizable=True)
 
     def __init__(
         self,
@@ -85,9 +87,9 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         self._learners = {names[i - 1]: c for c, i in enumerate(learning)}
         views = [self.game.views[i] for i in self.bodies]
         self._alike = len(set(views)) == 1
-        self.observation_spaces = dict(zip(self.possible_agents, (FeatureBox(v.features) for v in views), strict=True))
+        self.observation_spaces = dict(zip(self.possible_agents, (feature_box(v.features) for v in views), strict=True))
         self.action_spaces = {a: action_space(actions if a in self._learners else None) for a in self.possible_agents}
-        self.state_space = FeatureBox(state_features(len(names), *self._of_state))
+        self.state_space = feature_box(state_features(len(names), *self._of_state))
         if components := self.game.rewarding.components:  # as MOMAland has it
             self.reward_spaces = {agent: reward_box(components) for agent in self.possible_agents}
 
@@ -116,9 +118,10 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
         Options: ``{"initial_state": ...}``, or ``{"listed_world": {"seed": 7, "number": 3}}`` of an evaluation list.
         """
-        stream, state = self.stream.reset(1, seed, options)
+        stream, state = self.stream.reset(1, None if seed is None else chosen_seed(seed), options)
         answer = self._observations(state), self._by_agent(self._infos(stream, state, None))
         self._keep(stream, state, self.renderer.began)
+        self.np_random = np.random.default_rng([stream.seed, stream.next])
         return answer
 
     def step(

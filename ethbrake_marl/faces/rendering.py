@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import EthBrakeError, InvalidInput
 from ethbrake_marl.registry import Registry
 
 FRAMES_PER_SECOND = 10
@@ -28,7 +28,8 @@ class Renderer:
         """Close windows and files."""
 
 
-MakeRenderer = Callable[[Any], Any]  # environment -> object with the methods of Renderer
+# environment -> object with the methods of Renderer; a function `check` of it raises an error where it cannot draw
+MakeRenderer = Callable[[Any], Any]
 
 
 def register_renderer(mode: str, make: MakeRenderer) -> None:
@@ -39,9 +40,28 @@ def register_renderer(mode: str, make: MakeRenderer) -> None:
 RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", register_renderer)
 
 
+def why_not(mode: str) -> str | None:
+    """Return why a render mode cannot be used on this machine, or None."""
+    try:
+        getattr(RENDERERS[mode], "check", Renderer)()
+    except EthBrakeError as error:
+        return str(error)
+    return None
+
+
 def render_metadata() -> dict[str, Any]:
-    """Return the entries of an environment's ``metadata`` about pictures."""
-    return {"render_modes": [*RENDERERS], "render_fps": FRAMES_PER_SECOND}
+    """Return the entries of an environment's ``metadata`` about pictures, with the modes that work on this machine."""
+    return {"render_modes": [m for m in RENDERERS if why_not(m) is None], "render_fps": FRAMES_PER_SECOND}
+
+
+class Metadata:
+    """The attribute ``metadata`` of an environment's class. Packages that draw are imported when it is first read."""
+
+    def __init__(self, **other: Any) -> None:
+        self.other = other
+
+    def __get__(self, environment: Any, owner: Any) -> dict[str, Any]:
+        return {**self.other, **render_metadata()}
 
 
 def make_renderer(environment: Any, mode: str | None) -> Any:

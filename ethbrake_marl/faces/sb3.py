@@ -19,7 +19,7 @@ from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
-from ethbrake_marl.faces.spaces import FeatureBox
+from ethbrake_marl.faces.spaces import feature_box
 from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.motion.layout import Bools
 from ethbrake_marl.names import open_game
@@ -108,7 +108,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         self._need_learner()
         self._first: State | None = None  # each running episode at its first decision
         self._return, self._steps = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
-        super().__init__(self.num_envs, FeatureBox(self._features()), action_space(actions))
+        super().__init__(self.num_envs, feature_box(self._features()), action_space(actions))
         self.seed(seed)
 
     def _features(self) -> tuple[Feature, ...]:
@@ -169,7 +169,7 @@ class EthBrakeVecEnv(Face, VecEnv):
             for row, info, observation in last:
                 episode = {"r": returns[row].item(), "l": steps[row].item(), "t": 0.0}
                 infos[row] = {**info, "terminal_observation": observation, "episode": episode}
-            stream, new = stream.next_episodes(len(ended))
+            stream, new = stream.next_episodes(ended)
             seen[rows], returns[rows], steps[rows] = self._observe(new), 0.0, 0
             state, first = (put(each, ended, new, donate=self.render_mode is None) for each in (state, first))
         self._keep(stream, state, self.renderer.stepped)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import NUMBER, State
+from ethbrake_marl.episode.infos import names_of_worlds
+from ethbrake_marl.episode.state import LISTED, NUMBER, State
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.sampling import Drawn, merged
@@ -31,40 +33,62 @@ class Stream(NamedTuple):
 
     scenario: Scenario
     game: Game
-    seed: int | None = None
-    next: int = 0  # number of the next world
-    given: Drawn | None = None  # the worlds that the last reset asked for
+    seed: Any = None  # of all rows, or of each row, [n]
+    next: Any = 0  # number of the next world, of all rows or of each row
+    given: tuple[Drawn, int] | None = None  # the worlds that the last reset asked for, and their seed or -1
 
-    def reset(self, n: int, seed: int | None, options: Any = None) -> tuple[Stream, State]:
+    def reset(self, n: int, seed: Any, options: Any = None) -> tuple[Stream, State]:
         """Return new episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
 
-        The first reset without a seed draws a random one. ``options`` may specify the worlds instead. Raises
-        ``InvalidInput`` for a bad seed or option; warns of unknown options.
+        A list has the seed of each row, which begins with the first world of its own seed. The first reset without a
+        seed draws a random one. ``options`` may specify the worlds instead. Raises ``InvalidInput`` for a bad seed or
+        option; warns of unknown options.
         """
-        first = self.next if seed is None else 0
-        seed = chosen_seed(self.seed if seed is None else seed)
+        chosen, first = self.seed, self.next
+        if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
+            if len(seed) != n:
+                raise InvalidInput(f"reset: seed has {len(seed)} entries; must be one seed, or a list of {n} seeds")
+            chosen, first = [chosen_seed(each) for each in seed], np.zeros(n, np.int64)
+        elif seed is not None or chosen is None:
+            chosen, first = chosen_seed(seed), 0
         given = self._asked_for(n, options)
-        state = self.game.reset(self.game.draw(n, seed, first) if given is None else given.worlds)
-        return self._replace(seed=seed, next=first + (n if given is None else 0), given=given), state
+        worlds, after = self._draw(np.arange(n), chosen, first) if given is None else (given[0].worlds, first)
+        return self._replace(seed=chosen, next=after, given=given), self.game.reset(worlds)
 
-    def next_episodes(self, n: int) -> tuple[Stream, State]:
-        """Return new episodes in the next n worlds. They share no memory with other episodes."""
-        assert self.seed is not None
-        return self._replace(next=self.next + n), self.game.reset(self.game.draw(n, self.seed, self.next))
+    def next_episodes(self, rows: Ints) -> tuple[Stream, State]:
+        """Return new episodes in the next world of each row. They share no memory with other episodes."""
+        worlds, after = self._draw(rows, self.seed, self.next)
+        return self._replace(next=after), self.game.reset(worlds)
+
+    def _draw(self, rows: Ints, seed: Any, first: Any) -> tuple[State, Any]:
+        """Return the next world of each row, and ``next`` after it."""
+        if isinstance(seed, int):
+            return self.game.draw(len(rows), seed, first), first + len(rows)
+        drawn = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), channel="training") for k in rows]
+        return State.join(drawn), first + np.isin(np.arange(len(first)), rows)
+
+    def seeds_of(self, state: State, rows: Any = slice(None)) -> Any:
+        """Return the seed of each world of ``rows``, whose episodes are ``state``, or of all.
+
+        It is -1 for a world that the caller made.
+        """
+        seed = self.seed if isinstance(self.seed, int) else np.asarray(self.seed)[rows]
+        return seed if self.given is None else np.where(state.clock[:, NUMBER] < 0.0, self.given[1], seed)
 
     def describe(self, state: State) -> dict[str, Any]:
         """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
-        numbers, seed = state.clock[:, NUMBER].astype(np.int64), self.seed or 0
-        place, parts = np.arange(state.n), [] if self.given is None else [self.given]
+        numbers, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed, object)
+        place, parts = np.arange(state.n), [] if self.given is None else [self.given[0]]
         of_stream = np.flatnonzero(numbers >= 0)
         place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
-        parts += [self.scenario.draw(1, seed, first=int(k), channel="training") for k in numbers[of_stream]]
+        parts += [self.scenario.draw(1, int(seeds[k]), first=int(numbers[k]), channel="training") for k in of_stream]
         drawn = merged(parts, np.arange(sum(part.worlds.n for part in parts)))
         columns = {name: column[place] for name, column in columns_of(drawn).items()}
-        return {**columns, "world_seed": np.full(state.n, seed), "world": numbers}
+        names = names_of_worlds(state, self.seeds_of(state))
+        return {**columns, "world_seed": names["world_seed"], "world": names["world"]}
 
-    def _asked_for(self, n: int, options: Any) -> Drawn | None:
-        """Return the worlds that ``options`` of a reset specify, or None."""
+    def _asked_for(self, n: int, options: Any) -> tuple[Drawn, int] | None:
+        """Return the worlds that ``options`` of a reset specify, and their seed or -1; or None."""
         if options is None:
             return None
         if not isinstance(options, Mapping):
@@ -81,7 +105,7 @@ class Stream(NamedTuple):
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
             one = worlds_from_state(self.scenario, options["initial_state"])
-            return Drawn.given(one.take(np.zeros(n, np.int64)))
+            return Drawn.given(one.take(np.zeros(n, np.int64))), -1
         if "listed_world" not in options:
             return None
         wanted = options["listed_world"]
@@ -91,8 +115,8 @@ class Stream(NamedTuple):
                 " instance {'seed': 7, 'number': 3}"
             )
         drawn = self.scenario.draw(n, wanted["seed"], first=wanted["number"])
-        drawn.worlds.clock[:, NUMBER] = -1.0
-        return drawn
+        drawn.worlds.clock[:, NUMBER] = LISTED - drawn.worlds.clock[:, NUMBER]
+        return drawn, int(wanted["seed"])
 
 
 def chosen_seed(seed: int | None) -> int:

@@ -72,11 +72,17 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         self.single_observation_space, self.single_action_space = spaces
         self.observation_space, self.action_space = (batch_space(space, self.num_envs) for space in spaces)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Observations, Any]:
+        """Start an episode in every world.
+
+        With an int, row k begins with world k of the seed. With a list of seeds, row k has the episodes of
+        ``EthBrakeEnv`` with the k-th seed. Options: ``initial_state`` is the same world in every row; with
+        ``{"listed_world": {"seed": 7, "number": 3}}`` row k has world 3 + k of the list.
+        """
         stream, state = self.stream.reset(self.num_envs, seed, options)
         answer = self._observe(state), masked(self._columns(stream, state, None), np.ones(self.num_envs, np.bool_))
         self._keep(stream, state, self.renderer.began)
-        super().reset(seed=stream.seed if seed is not None else None)
+        super().reset(seed=None if seed is None else int(np.ravel(stream.seed)[0]))
         return answer
 
     def step(self, actions: Any) -> tuple[Observations, Floats, Bools, Bools, dict[str, Any]]:
@@ -94,9 +100,9 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
             infos = {"final_obs": final, "_final_obs": renewed}
             infos |= {"final_info": masked(columns, renewed), "_final_info": renewed.copy()}
         if renewed.any():
-            stream, new = stream.next_episodes(int(renewed.sum()))
+            stream, new = stream.next_episodes(np.flatnonzero(renewed))
             seen[renewed] = self._observe(new)
-            columns = put(columns, renewed, self._columns(stream, new, None))
+            columns = put(columns, renewed, self._columns(stream, new, None, renewed))
             state = state.put(renewed, new, donate=self.render_mode is None)
         infos |= masked(columns, np.ones(self.num_envs, np.bool_))
         self._keep(stream, state, self.renderer.stepped)
@@ -106,8 +112,8 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         pictures = super().render()
         return None if pictures is None else tuple(pictures)
 
-    def _columns(self, stream: Stream, state: State, step: Step | None) -> dict[str, Any]:
-        return arrays(self.game, state, step, stream.seed or 0, self.bodies[0])
+    def _columns(self, stream: Stream, state: State, step: Step | None, rows: Any = slice(None)) -> dict[str, Any]:
+        return arrays(self.game, state, step, stream.seeds_of(state, rows), self.bodies[0])
 
 
 def masked(columns: dict[str, Any], rows: Bools) -> dict[str, Any]:

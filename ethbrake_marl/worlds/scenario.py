@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from enum import Enum
 from functools import cached_property
 from operator import not_
+from pathlib import PurePath
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -347,13 +349,15 @@ class Scenario(Part):
 
 
 def plain(value: Any) -> Any:
-    """Plain dicts, lists and numbers from a mapping, sequence, array, model or View."""
+    """Plain dicts, lists, numbers and texts from a mapping, sequence, array, model, View, path or enumeration."""
     if isinstance(value, BaseModel):
         return value.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     if isinstance(value, View):
         return list(value.names)
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
+    if isinstance(value, PurePath | Enum):
+        return str(value) if isinstance(value, PurePath) else value.value
     if isinstance(value, Mapping):
         return {key: plain(entry) for key, entry in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
+from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from tests.contract.interfaces import SCENARIOS, actions
 from tests.refused import refused
@@ -85,9 +86,87 @@ def test_description__of_worlds_of_a_list_and_of_those_that_follow() -> None:
     while not over.any():
         over = np.logical_or(*env.step(np.full((3, 1), -1.0))[2:4])
     worlds, first = env.describe_worlds(), env.scenario.draw(1, 2, channel="training")
-    assert worlds["world"].tolist() == np.where(over, np.cumsum(over) - 1, -1).tolist() and not over.all()
+    assert worlds["world"].tolist() == np.where(over, np.cumsum(over) - 1, [3, 4, 5]).tolist() and not over.all()
+    assert worlds["world_seed"].tolist() == np.where(over, 2, 7).tolist()
     assert worlds["friction"][over][0] == first.friction[0] and worlds["gap_1_m"][over][0] == first.worlds.gaps_m[0, 0]
     assert worlds["friction"][~over].tolist() == drawn.friction[~over].tolist()
+
+
+NAMES = ("world_seed", "world", "world_listed")
+
+
+def names(infos: dict[str, Any]) -> list[list[Any]]:
+    return [infos[name].tolist() for name in NAMES]
+
+
+def test_infos__name_the_worlds_that_options_specify() -> None:
+    env = EthBrakeVectorEnv(3, max_episode_steps=2)
+    listed = env.reset(seed=2, options={"listed_world": {"seed": 7, "number": 3}})[1]
+    assert names(listed) == [[7, 7, 7], [3, 4, 5], [True, True, True]]
+    assert names(env.step(np.zeros((3, 1)))[4]) == names(listed)
+    env.step(np.zeros((3, 1)))
+    assert names(env.step(np.zeros((3, 1)))[4]) == [[2, 2, 2], [0, 1, 2], [False] * 3]  # the next episodes
+    given = env.reset(options={"initial_state": {"gaps_m": [7, 7], "speeds_mps": [20, 18, 20]}})[1]
+    assert names(given) == [[-1] * 3, [-1] * 3, [False] * 3]
+    assert names(env.reset(seed=0, options={"listed_world": {"seed": 0, "number": 0}})[1])[1:] == [
+        [0, 1, 2],
+        [True] * 3,
+    ]
+    one = make_sb3_vec_env("paper-random", 2, seed=5, step_infos=True)
+    one.set_options({"listed_world": {"seed": 9, "number": 4}})
+    one.reset()
+    assert [[info[name] for name in NAMES] for info in one.reset_infos] == [[9, 4, True], [9, 5, True]]
+    for _ in range(80):
+        dones, infos = one.step(np.array([[-1.0], [-0.6]]))[2:]
+        if dones.any():
+            break
+    assert not dones.all() and [[info[name] for name in NAMES] for info in infos] == [[9, 4, True], [9, 5, True]]
+
+
+@pytest.mark.parametrize("scenario", ["mixture-delays", "cooperation-2-five"])
+@pytest.mark.parametrize("seeds", [[3, 11, 3], (0, 2**62, 5), np.array([8, 8, 1])], ids=str)
+def test_seeds__one_for_each_row_give_the_episodes_of_single_environments(scenario: str, seeds: Any) -> None:
+    many, singles = EthBrakeVectorEnv(3, scenario, autoreset_mode="SameStep"), [EthBrakeEnv(scenario) for _ in range(3)]
+    observations, infos = many.reset(seed=seeds)
+    begun = [env.reset(seed=int(seed)) for env, seed in zip(singles, seeds, strict=True)]
+    assert observations.tolist() == [seen.tolist() for seen, _ in begun]
+    assert infos["world_seed"].tolist() == [*seeds] and infos["world"].tolist() == [0, 0, 0]
+    for given in actions(3, 90, 3) * 0.1 - 0.9:
+        observations, rewards, terminated, truncated, infos = many.step(given)
+        for row, env in enumerate(singles):
+            seen, reward, *ends, info = env.step(given[row])
+            assert [terminated[row], truncated[row]] == ends and rewards[row] == reward
+            if any(ends):
+                seen, info = env.reset()
+            assert observations[row].tolist() == seen.tolist()
+            assert [infos[name][row] for name in NAMES] == [info[name] for name in NAMES]
+    worlds = many.describe_worlds()
+    assert [worlds["gap_1_m"][row] for row in range(3)] == [env.describe_world()["gap_1_m"] for env in singles]
+    assert min(infos["world"]) > 0
+    again = EthBrakeVectorEnv(3, scenario)
+    again.reset(seed=1)
+    assert again.reset(seed=seeds)[1]["world"].tolist() == [0, 0, 0]
+    assert again.reset()[1]["world"].tolist() == [1, 1, 1]
+    assert again.reset(seed=4)[1]["world"].tolist() == [0, 1, 2]
+
+
+def test_seeds__none_in_a_list_is_drawn_and_bad_lists_are_refused() -> None:
+    env = EthBrakeVectorEnv(2)
+    infos = env.reset(seed=[None, 4])[1]
+    assert infos["world_seed"][1] == 4 and infos["world"].tolist() == [0, 0]
+    assert env.reset(seed=[None, 4])[1]["world_seed"][0] != infos["world_seed"][0]
+    expected = env.reset()[1]["world_seed"].tolist()
+    for seeds, right in (
+        ([1], "a list of 2 seeds"),
+        ([1, 2, 3], "2 seeds"),
+        ([1, -2], "at least 0"),
+        ([1, "2"], "whole"),
+    ):
+        with refused(right):
+            env.reset(seed=seeds)
+    assert env.reset()[1]["world_seed"].tolist() == expected
+    with refused("reset: seed = [1]: must be None or a whole number"):
+        EthBrakeEnv().reset(seed=[1])  # type: ignore[arg-type]
 
 
 def test_settings__are_checked() -> None:

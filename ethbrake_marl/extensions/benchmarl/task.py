@@ -17,7 +17,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.shield import NOBODY, guarded
-from ethbrake_marl.faces.spaces import FeatureBox
+from ethbrake_marl.faces.spaces import feature_box
 from ethbrake_marl.faces.stream import Stream, chosen_seed
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -78,8 +78,8 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         self.game = game
         self.stream = Stream(loaded, self.game, chosen_seed(seed))
         rows = n, len(self.learners)
-        seen = _bound(FeatureBox(views.pop().features), rows)
-        whole = _bound(FeatureBox(state_features(loaded.vehicles, *self.of_state)), (n,))
+        seen = _bound(feature_box(views.pop().features), rows)
+        whole = _bound(feature_box(state_features(loaded.vehicles, *self.of_state)), (n,))
         self.observation_spec = Composite(
             {GROUP: Composite({"observation": seen}, shape=rows), "state": whole}, shape=(n,)
         )
@@ -96,7 +96,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         """Start new episodes in all worlds or, if ``tensordict`` has a mask ``_reset``, where it is True."""
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = np.arange(self.batch_size[0]) if mask is None else np.flatnonzero(mask.numpy().reshape(-1))
-        stream, new = self.stream.next_episodes(len(rows))
+        stream, new = self.stream.next_episodes(rows)
         state = new if mask is None else self.episode.put(rows, new)
         content = self._observe(state)
         self.stream, self.episode = stream, state

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from typing import Any
 
 import numpy as np
@@ -67,14 +68,34 @@ class Words(Viewer):
         return scene.text()
 
 
+def import_pygame() -> Any:
+    """Import the module pygame of the package pygame-ce.
+
+    Raises ``MissingExtra`` without a module, and ``InvalidInput`` if the package pygame has put its module there.
+    """
+    need("pygame")
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the package pygame uses what Python will remove
+        import pygame
+    if not hasattr(pygame, "Window"):
+        raise InvalidInput(
+            f"render_mode = 'human': the module pygame {pygame.version.ver} has no Window, because it belongs to the"
+            " package pygame, not to pygame-ce; uninstall both packages, then install pygame-ce; or use gymnasium.make,"
+            " which opens a window with either of them"
+        )
+    return pygame
+
+
 class Window(Viewer):
     """Viewer of the mode ``human``: a window that shows every step in real time. The user may close it."""
+
+    check = staticmethod(import_pygame)
 
     def __init__(self, environment: Any) -> None:
         super().__init__(environment)
         if self.many:
             raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
-        need("pygame")
         self.window: Any = None
         self.closed = False
 
@@ -91,9 +112,7 @@ class Window(Viewer):
         """Do nothing: the window shows every step by itself."""
 
     def _play(self) -> None:
-        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        import pygame
-
+        pygame = import_pygame()
         clock = pygame.time.Clock()
         for frame in [] if self.closed else self.step_frames():
             size = frame.shape[1::-1]

@@ -2,17 +2,22 @@
 
 import copy
 import sys
+import warnings
 from hashlib import sha256
 from importlib.metadata import version
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
+from pettingzoo.test import render_test
 
+from ethbrake_marl.cli.doctor import diagnose
 from ethbrake_marl.errors import InvalidInput, MissingExtra
 from ethbrake_marl.extensions.rendering.scene import BODY_M
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
-from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
+from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.motion.layout import GAP
@@ -167,7 +172,46 @@ def test_human__shows_each_step_in_real_time(monkeypatch: pytest.MonkeyPatch) ->
         EthBrakeParallelEnv(render_mode="human").reset(seed=0)
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(MissingExtra, match=r"pip install 'ethbrake-marl\[render\]'"):
-        EthBrakeParallelEnv(render_mode="human")
+        EthBrakeParallelEnv(render_mode="human").reset(seed=0)
+
+
+@pytest.fixture(params=["no pygame", "the package pygame", "pygame-ce"])
+def modes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Put the module of a package in place of pygame; return the render modes that then work."""
+    if request.param == "no pygame":
+        monkeypatch.setitem(sys.modules, "pygame", None)
+    elif request.param == "the package pygame":
+        monkeypatch.delattr(pytest.importorskip("pygame"), "Window")
+    else:
+        pytest.importorskip("pygame")
+        monkeypatch.setattr("ethbrake_marl.extensions.rendering.viewer.SMOOTH_FPS", 1000)  # no waiting
+        return ["ansi", "human", "rgb_array"]
+    return ["ansi", "rgb_array"]
+
+
+def test_render_modes__are_those_that_work_here_and_the_checkers_of_libraries_pass(modes: list[str]) -> None:
+    made = gymnasium.make("EthBrake-v1")
+    assert sorted(made.metadata["render_modes"]) == modes
+    assert sorted(EthBrakeParallelEnv.metadata["render_modes"]) == sorted(raw_env().metadata["render_modes"]) == modes
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*not within.*")
+        check_env(made.unwrapped)
+    render_test(raw_env)
+
+
+def test_human__with_the_module_of_another_package_names_both_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(pytest.importorskip("pygame"), "Window")
+    for environment in (EthBrakeEnv(render_mode="human"), raw_env(render_mode="human")):
+        with refused("has no Window, because it belongs to the package pygame, not to pygame-ce"):
+            environment.reset(seed=0)
+        environment.close()
+    line = next(check for check in diagnose() if check.name == "pygame-ce")
+    assert not line.ok and "install pygame-ce" in line.detail
+    with pytest.warns(UserWarning, match="HumanRendering wrapper"):
+        shown = gymnasium.make("EthBrake-v1", render_mode="human")
+    shown.reset(seed=0)
+    assert shown.step(np.zeros(1, np.float32))[1] == 0.0 and shown.render() is None
+    shown.close()
 
 
 def test_refusals() -> None:
