@@ -2,12 +2,14 @@
 
 import json
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.extensions.report.episodes import shown_worlds, worst_rows
@@ -114,6 +116,24 @@ def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Compared, sear
     assert worst_rows(unknown, "ppo").tolist() == worst_rows(honest, "ppo").tolist()
     section = " ".join(map(str, worst_section(unknown, "ppo", ()).body))
     assert "by honest cost." in section and section.count("Honest cost") == 1
+
+
+@pytest.mark.parametrize("count", ["total", "honest"])
+@pytest.mark.parametrize("known", [False, True])
+def test_worlds__to_watch_are_those_of_the_cost_that_the_agents_minimise(
+    count: str, known: bool, compared: Compared, searched: Compared
+) -> None:
+    """They are the worlds of the first-impact harm if this had the values of the cost."""
+    mine = (searched if known else compared)._replace(harm_count=count)
+    renamed = {
+        agent: {**own, "first_impact_harm": own[COLUMN[count]], "best_known_first": own.get(f"best_known_{count}", 0.0)}
+        for agent, own in mine.result.columns.items()
+    }
+    other = mine._replace(result=replace(mine.result, columns=renamed), harm_count="first")
+    for focus in ("ppo", FOCUS, "full_brake"):
+        chosen = shown_worlds(mine, focus)
+        assert chosen == shown_worlds(other, focus)
+        assert chosen != shown_worlds(mine._replace(harm_count="first"), focus)
 
 
 def test_worst_worlds__can_be_watched(searched: Compared) -> None:
