@@ -80,12 +80,18 @@ class Team(NamedTuple):
     def game(self, game: Game) -> Game:
         """Return ``game`` with this team's shield.
 
-        Raises ``InvalidInput`` unless the team drives exactly the learners, or if the game already has another shield.
+        Raises ``InvalidInput`` unless the team drives exactly the learners, for a shield without learners, and if the
+        game already has another shield.
         """
         driven, wanted = sorted(self.drivers), sorted(game.rules.learners.tolist())
         if driven != wanted:
             theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
             raise InvalidInput(f"team {self.name!r}: drives {theirs}; must drive exactly {right}")
+        if self.shield is not None and not wanted:
+            raise InvalidInput(
+                f"team {self.name!r}: the scenario has no learner that its shield could guard; leave out the shield, or"
+                " make a vehicle a learner: scenario.with_learners(['vehicle_2'])"
+            )
         if game.shield not in (None, self.shield):
             raise InvalidInput(f"team {self.name!r}: the game has a shield of its own; put it around the team instead")
         for body, agent in self.drivers.items():

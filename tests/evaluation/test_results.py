@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ethbrake_marl.errors import AlreadyExists
+from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.compare import compare_results
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.results import read_result, write_results, write_rows
@@ -68,6 +68,45 @@ def test_files__are_not_overwritten_unless_forced(tmp_path: Path) -> None:
     assert path.read_bytes() != before and read_result(path).about["episodes"] == 3
     with refused("must end in .csv or .parquet"):
         write_rows(tmp_path / "w.txt", result)
+
+
+THERE: dict[str, tuple[str, Any]] = {  # name of the file that is there already, and rows to write beside it
+    "results, then with rows": ("results.json", "csv"),
+    "results, then with other rows": ("results.json", "parquet"),
+    "results of another name": ("mine.json", "csv"),
+    "results alone": ("results.json", None),
+}
+
+
+def content(folder: Path) -> dict[str, Any]:
+    return {path.name: path.is_file() and path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("case", THERE)
+@pytest.mark.parametrize("kind", ["file", "link", "folder"])
+def test_refused_results__leave_every_file_as_it_was(case: str, kind: str, tmp_path: Path) -> None:
+    name, rows = THERE[case]
+    result = evaluated(PAIR, 2)
+    if kind == "file":
+        written(tmp_path, result, None, name=name)
+    elif kind == "link":
+        (tmp_path / name).symlink_to("elsewhere.json")
+    else:
+        (tmp_path / name).mkdir()
+    before = content(tmp_path)
+    with pytest.raises(AlreadyExists if kind == "file" else InvalidInput, match=rf"{name}: (already exists|is a )"):
+        written(tmp_path, evaluated(PAIR, 3), rows, name=name)
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("rows", ["csv", "parquet"])
+def test_refused_rows__leave_no_results_beside_them(rows: str, tmp_path: Path) -> None:
+    if rows == "parquet":
+        pytest.importorskip("pyarrow")
+    (tmp_path / f"worlds.{rows}").write_text("mine")
+    with refused(f"worlds.{rows}: already exists", AlreadyExists):
+        written(tmp_path, evaluated(PAIR, 2), rows)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
 EDITS: dict[str, Callable[[dict[str, Any]], Any]] = {

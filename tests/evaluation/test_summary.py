@@ -233,6 +233,27 @@ def test_lists__stand_below_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
     ]  # fmt: skip
 
 
+def test_lists__of_worlds_that_differ_show_the_worst_impact_and_the_mean_harm() -> None:
+    result = evaluated("paper-random", 20)
+    collided = result["full_brake"]["collided"]
+    one = result.take(np.append(np.flatnonzero(collided)[:1], np.flatnonzero(~collided)[:3]))
+    results = {"twenty": result, "one of four collides": one}
+    sheet = summarise_lists({name: summarise(each) for name, each in results.items()}, results)
+    rows = iter(sheet.rows)
+    for name, each in results.items():
+        assert next(rows) == name
+        for agent, own in each.columns.items():
+            assert next(rows) == (
+                agent,
+                "failed" if own["collided"].any() else "passed",
+                pytest.approx(own["collided"].mean()),
+                pytest.approx(3.6 * max(own["hardest_impact_mps"].tolist())),
+                pytest.approx(own["first_impact_harm"].mean()),
+                pytest.approx(own["total_harm"].mean()),
+            )
+    assert one["full_brake"]["collided"].tolist() == [True, False, False, False]
+
+
 def test_summary__of_one_scenario_of_a_mixture_has_no_range_of_what_is_not_there() -> None:
     tables = eb.summarise_by(eb.evaluate("mixture-universal", "coast", episodes=8), "scenario")
     assert any("obstacle_gap_m" not in table.parameters for table in tables.values())

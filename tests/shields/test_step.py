@@ -190,6 +190,26 @@ def test_one_bad_proposal_does_not_spoil_a_good_one() -> None:
     assert (alone > 0).all()
 
 
+@pytest.mark.parametrize("name", ["pair", "all", "five"])
+def test_proposals_that_are_rejected_together_are_tried_one_by_one_to_the_last_learner(name: str) -> None:
+    game, state = opened(name)
+    rng, learners = np.random.default_rng(4), len(game.rules.learners)
+    rejected, accepted = np.zeros((2, learners), np.int64)
+    for _ in range(12):
+        proposed, before = rng.uniform(-1.0, 1.0, (20, learners)), state
+        state, _ = game.step(state, proposed)
+        memory = state.memories["shield"]
+        bad = memory.reason == ShieldReason.NO_CERTIFICATE
+        accepted += (~bad & bad.any(axis=1, keepdims=True)).sum(axis=0)
+        for column in range(learners):
+            rows = np.flatnonzero(bad[:, column:].all(axis=1))  # this trial was of the plan that stands
+            plans = memory.plan[rows].copy()
+            plans[np.arange(len(rows)), before.steps[rows], column] = proposed[rows, column]
+            assert (price(game, before.take(rows), plans, "first") > memory.price[rows]).all()
+            rejected[column] += len(rows)
+    assert (rejected > 0).all() and (accepted > 0).all()
+
+
 # ------------------------------------------------------------------------------------------------ its own agents
 
 

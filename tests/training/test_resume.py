@@ -150,6 +150,8 @@ def test_resume__after_an_error_and_a_kill_while_policies_are_replaced(
     with monkeypatch.context() as patch:
         patch.setattr(Path, "rename", fatal)
         killed(go_on, run)
+    status = json.loads((run / "run.json").read_text())
+    assert (status["status"], status["reason"], status["updates"]) == ("running", None, 5)
     go_on(run)
     assert kept(run) == whole("ppo")
     assert not list(run.glob("**/.ethbrake-*"))
@@ -178,6 +180,8 @@ DAMAGE = {
     "other data": lambda path: torch.save({"training": 1}, path),
     "a list": lambda path: torch.save([1], path),
     "a link": lambda path: (path.unlink(), path.symlink_to("/dev/zero")),
+    "a link to a sound one": lambda path: path.symlink_to(path.rename(path.parent.parent / "elsewhere.pt")),
+    "a link to the one before": lambda path: (path.unlink(), path.symlink_to(checkpoint.files_in(path.parent)[-1])),
 }
 
 

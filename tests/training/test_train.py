@@ -25,7 +25,7 @@ from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.names import make_agent, open_game, team_of
-from ethbrake_marl.policies.bundle import load_policy
+from ethbrake_marl.policies.bundle import load_drivers, load_policy
 from ethbrake_marl.progress import Progress
 from ethbrake_marl.training import train as train_module
 from ethbrake_marl.training.algorithm import Algorithm
@@ -101,6 +101,33 @@ def test_train__is_the_same_twice_and_leaves_the_global_generators(tmp_path: Pat
     assert kept(tmp_path / "one") == kept(tmp_path / "two")
     other = begin("ppo", tmp_path / "other", seed=1, measure=None).last_policy.manifest
     assert load_policy(tmp_path / "one/policy-last").manifest.weights_sha256 != other.weights_sha256
+
+
+REMAINDERS: dict[str, tuple[str, dict[str, Any], list[int], list[int]]] = {  # training, change, measured, rows
+    "one update more": ("ppo", {"total_steps": 7 * UPDATE}, [0, 3, 6, 7], [*range(8)]),
+    "a part of an update": ("ppo", {"total_steps": 3 * UPDATE + 1}, [0, 3, 4], [*range(5)]),
+    "less than one update": ("ppo", {"total_steps": 1}, [0, 1], [0, 1]),
+    "two learners": ("independent", {"total_steps": 2 * 5 * UPDATE}, [0, 3, 5], [*range(6)]),
+    "rows are rarer": ("sac", {"total_steps": 37 * 8}, [0, 30, 37], [0, 10, 20, 30, 37]),
+    "between two rows": ("sac", {"total_steps": 9 * 8 + 1}, [0, 10], [0, 10]),
+}
+
+
+@pytest.mark.parametrize("case", REMAINDERS)
+def test_train__an_end_between_two_measurements_or_rows_is_measured_and_stored(case: str, tmp_path: Path) -> None:
+    name, change, measured, rows = REMAINDERS[case]
+    recipe, scenario = TRAININGS[name]
+    run, other = tmp_path / "run", tmp_path / "not measured"
+    result = train(recipe.replace(**change), scenario, run, on_progress=None)
+    assert result.updates == measured[-1] == status_of(run)["updates"]
+    assert [each["updates"] for each in result.evaluations] == measured
+    update = result.steps // result.updates
+    assert [int(row["steps"]) for row in kept(run)["rows"]] == [update * each for each in rows]
+    train(recipe.replace(**change), scenario, other, measure=None, on_progress=None)
+    last, same = (load_drivers(folder / "policy-last") for folder in (run, other))
+    for vehicle, policy in result.last_policies.items():
+        assert policy.manifest.steps == last[vehicle].manifest.steps == same[vehicle].manifest.steps == result.steps
+        assert policy.manifest.weights_sha256 == same[vehicle].manifest.weights_sha256
 
 
 @pytest.mark.parametrize(("count", "best"), [("first", 3), ("total", 6)])
@@ -293,6 +320,35 @@ def test_algorithm__of_a_user_trains_resumes_to_the_bit_and_drives(a2c: dict[str
     go_on(tmp_path / "run")
     assert kept(tmp_path / "run") == kept(tmp_path / "whole")
     assert load_policy(tmp_path / "run").manifest.algorithm == "a2c" and whole.updates == 9
+
+
+class Gambling(A2c):
+    """Moves a weight, after every update, by random numbers of all generators that a user may have used."""
+
+    def build(self, training: Any, environment: Any) -> A2C:
+        """Return the model."""
+        model = super().build(training, environment)
+        learn = model.train
+
+        def gamble() -> None:
+            learn()
+            with torch.no_grad():
+                model.policy.action_net.bias += random.random() + np.random.rand() + torch.rand(1)  # noqa: NPY002, S311
+
+        model.train = gamble  # type: ignore[method-assign]
+        return model
+
+
+def test_algorithm__that_draws_from_any_generator_resumes_to_the_bit(
+    a2c: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(VARIANTS.loaded, "a2c.casino", Gambling)
+    settings = {"device": "casino", "measure": None}
+    train(a2c, "paper-random", tmp_path / "whole", on_progress=None, **settings)
+    killed(train, a2c, "paper-random", tmp_path / "run", on_progress=dying_after(5), **settings)
+    random.seed(1)
+    go_on(tmp_path / "run", measure=None)
+    assert kept(tmp_path / "run") == kept(tmp_path / "whole")
 
 
 def test_algorithm__that_normalises_by_itself_is_refused(a2c: dict[str, Any], tmp_path: Path) -> None:

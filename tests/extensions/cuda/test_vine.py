@@ -17,6 +17,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.extensions.cuda.graphs import Graphed
 from ethbrake_marl.extensions.cuda.vine import CudaVine
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
+from ethbrake_marl.extensions.learners.vine import Branches
 from ethbrake_marl.training.recipe import VARIANTS, load_recipe
 from ethbrake_marl.training.train import resume, train
 from tests.extensions.learners.tiny import EXPERTS, PAIR, PAPER, VINE, new_model
@@ -66,6 +67,26 @@ def test_decisions_and_gradients__are_those_of_the_processor(scenario: Any) -> N
         off = (tried.gradient - expected.gradient).abs() > 1e-4 * (1.0 + expected.gradient.abs())
         assert off.sum() <= 1
     assert {*cpu.logger.name_to_value} == {*twin.logger.name_to_value}
+
+
+@pytest.mark.parametrize("reward", [{"harm": 1.0}, {"harm": 0.3, "harm_count": "honest", "terminal": 0.5}])
+@pytest.mark.parametrize("scenario", [PAPER, PAIR])
+def test_returns__are_those_of_the_processor_to_the_last_bit(scenario: Any, reward: dict[str, Any]) -> None:
+    """Every action is exact in single precision: the output of the network is its bias, moved by powers of 2."""
+    cpu, twin = both(SMALL.replace(reward=reward), scenario)
+    for model in (cpu, twin):
+        torch.nn.init.zeros_(model.policy.learning[-1].weight)
+        torch.nn.init.constant_(model.policy.learning[-1].bias, -0.5)
+    for _ in range(3):
+        (_, states), _ = cpu.collect(NOTHING), twin.collect(NOTHING)
+        world, size = np.arange(192), np.tile([0.125, -0.25, 0.75, -0.75], 48)
+        branches = Branches(world, world % cpu.learners, size, np.tile([1, 2, 4], 64))
+        gained, moved = cpu.play(states, branches, cpu.policy)
+        with torch.no_grad():
+            here = twin.played(*(torch.from_numpy(column) for column in branches))
+        twin.branches.check()
+        np.testing.assert_array_equal(here.numpy(), [gained, moved])
+    assert len(np.unique(gained)) > 20 and len(np.unique(moved)) > 8
 
 
 def test_update__moves_the_weights_as_on_the_processor() -> None:

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import advance_worlds
 from ethbrake_marl.extensions.proofs.avoidability import PROVEN_FOR, avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.motion.layout import COUNT, GAP, LATENCY, SPEED, scratch_for
+from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, GAP, LATENCY, RELEASE_RATE, SPEED, scratch_for
 from tests.extensions.proofs.worlds import opening, paper_line, play, random_commands, wide_worlds, worlds
 from tests.reference.avoidability_lp import avoidable_by_lp
 from tests.refused import refused
@@ -205,8 +206,9 @@ def test_later_states__give_the_same_verdict_and_a_witness_from_there():
 
 
 def changed(array, row, body, value):
-    state = worlds([9, 9], [9, 9, 9], 5, [0, 0.5, 0.8])
-    getattr(state, array)[0, row, body] = value
+    """Return three worlds, of which only the second has another value."""
+    state = worlds([9, 9], [9, 9, 9], 5, [0, 0.5, 0.8]).take([0, 0, 0])
+    getattr(state, array)[1, row, body] = value
     return state
 
 
@@ -234,19 +236,18 @@ REFUSED = {
     "avoidability: vehicle_1 of 3 vehicles is controlled, but the proof covers only": lambda: avoidability(
         paper_line([9, 9], [9, 9, 9], [0, 0.5, 0.8]), 1
     ),
-    "world 0 has a vehicle_1 that may brake only after the controlled vehicle": lambda: avoidability(
+    "world 1 has a vehicle_1 that may brake only after the controlled vehicle": lambda: avoidability(
         changed("car", LATENCY, 1, 0.6)
     ),
-    "world 0 has a vehicle that moves backward": lambda: avoidability(changed("line", SPEED, 3, -1)),
-    "world 0 has an obstacle that vehicle_1 reaches although it brakes": lambda: avoidability(
+    "world 1 has a vehicle that moves backward": lambda: avoidability(changed("line", SPEED, 3, -1)),
+    "world 1 has an obstacle that vehicle_1 reaches although it brakes": lambda: avoidability(
         changed("line", GAP, 0, 8.0)
     ),
-    "world 0 has an obstacle ahead of the controlled vehicle_1": lambda: avoidability(
-        worlds(5, [9, 9], 5, obstacle=90), 1
+    "world 1 has an obstacle ahead of the controlled vehicle_1": lambda: avoidability(
+        State.join([worlds(5, [9, 9], 5), worlds(5, [9, 9], 5, obstacle=90)]), 1
     ),
-    "world 0 has brakes that build up": lambda: avoidability(
-        eb.load_scenario("paper-random").replace(brake_rate_mps3=9).sample(2, 7)
-    ),
+    "world 1 has brakes that build up": lambda: avoidability(changed("car", BRAKE_RATE, 3, 9.0)),
+    "world 1 has brakes that build up, which": lambda: avoidability(changed("car", RELEASE_RATE, 1, 9.0)),
 }
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert
 from ethbrake_marl.extensions.proofs import line as row
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
@@ -16,7 +17,7 @@ from ethbrake_marl.extensions.proofs.followers import after, after_rear, held_by
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, REAR_FIRST
 from ethbrake_marl.extensions.proofs.lower_bound import front_first, lower_bound, rear_first, rounding
 from ethbrake_marl.extensions.proofs.meetings import gentlest, gentlest_front, meet_front, meet_rear
-from ethbrake_marl.motion.layout import HIT, SPEED
+from ethbrake_marl.motion.layout import FAR_M, HIT, SPEED
 from tests.extensions.proofs.worlds import opening, play, searched_harm, wide_worlds, worlds
 from tests.motion.lines import lines
 from tests.refused import refused
@@ -360,9 +361,17 @@ def test_setting__is_refused(message):
         lower_bound(THREE, **REFUSED[message])
 
 
-def test_obstacle__is_refused():
-    with refused("lower_bound: world 0 has an obstacle ahead; the bound is proven without an obstacle"):
-        lower_bound(worlds([7, 7], [20, 18, 20], [6, 7, 6], [0, 0.5, 0.8], obstacle=90))
+def test_one_bad_world__is_enough_to_refuse():
+    later, obstacle = (
+        worlds([7, 7], [20, 18, 20], [6, 7, 6], [0, latency, 0.8], obstacle=ahead)
+        for latency, ahead in ((0.9, FAR_M), (0.5, 90))
+    )
+    with refused("lower_bound: world 1 has an obstacle ahead; the bound is proven without an obstacle"):
+        lower_bound(State.join([THREE, obstacle, THREE]))
+    for states in ([THREE, later], [later, THREE, THREE]):
+        with refused("lower_bound: horizon_s = 0.7: must be a finite number of at least 0.9 (s)"):
+            lower_bound(State.join(states), horizon_s=0.7)
+        assert (lower_bound(State.join(states), horizon_s=0.9).harm >= 0.0).all()
     assert THREE.line[0, SPEED, 1] == 20  # worlds are not changed
 
 

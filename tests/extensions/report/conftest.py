@@ -16,7 +16,7 @@ from ethbrake_marl.names import teams_of
 AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
 
 
-def compared_by(scenario: str, agents: object, episodes: int = 60, count: str = "first") -> Compared:
+def compared_by(scenario: str | eb.Scenario, agents: object, episodes: int = 60, count: str = "first") -> Compared:
     loaded = eb.load_scenario(scenario)
     teams = teams_of(agents, loaded, harm_count=count)
     return Compared.of(loaded, teams, episodes=episodes, seed=7, harm_count=count)

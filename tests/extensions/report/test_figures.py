@@ -18,6 +18,7 @@ from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
 from ethbrake_marl.extensions.report.style import label_text, new_figure, picture_bytes, series_style
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.names import teams_of
+from tests.evaluation.lines import recorded
 from tests.extensions.report.conftest import compared_by
 
 
@@ -127,6 +128,23 @@ def test_harm_against_total_gap__means_and_bands_are_those_of_the_groups(compare
     *_, cost = harm_against_total_gap(honest).axes
     assert cost.get_title(loc="left") == "Honest cost (m²/s²)"
     assert cost.lines[1].get_ydata() == pytest.approx(honest["coast"]["honest_cost"])
+
+
+def test_intervals__are_by_recording_wherever_worlds_come_from_recordings() -> None:
+    recordings = compared_by(recorded(8), "full_brake,constant:4.5")
+    result, by = recordings.result, recordings.result.clusters
+    gap = result.worlds["gap_1_m"] + result.worlds["gap_2_m"]
+    group = gap >= np.linspace(gap.min(), gap.max(), BINS + 1)[-2]
+    for agent, own in enumerate(result.columns.values()):
+        bars = harm_by_agent(recordings, {}).axes[0].collections[agent].get_segments()[0][:, 0]
+        assert bars == pytest.approx(mean(own["first_impact_harm"], by).ends)
+        assert np.ptp(bars) > 1.3 * np.ptp(mean(own["first_impact_harm"]).ends)  # worlds of a recording are alike
+        for axes, harm in zip(harm_against_total_gap(result).axes, ("first_impact_harm", "total_harm"), strict=True):
+            corners = axes.collections[agent].get_paths()[0].vertices
+            ends = corners[np.isclose(corners[:, 0], gap[group].mean()), 1]
+            expected = mean(own[harm][group], by[group]).ends
+            assert (ends.min(), ends.max()) == pytest.approx(expected)
+            assert expected != mean(own[harm][group]).ends
 
 
 def test_curves__are_means_with_bands_and_lines() -> None:

@@ -2,19 +2,24 @@
 
 import json
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import ethbrake_marl as eb
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.extensions.report.episodes import shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.first_sentence import first_sentence
+from ethbrake_marl.extensions.report.learners import learners_sheets
 from ethbrake_marl.extensions.report.player import SAMPLE_S, episode_data, pieces_of, replaced_at_s
 from ethbrake_marl.extensions.report.report import Report, Test as OtherTest, avoidable_section, worst_section
 from ethbrake_marl.names import teams_of
+from ethbrake_marl.training.experiment import TEAM, without
+from tests.evaluation.lines import recorded
 from tests.extensions.report.conftest import AGENTS, compared_by, with_best_known
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
 
@@ -116,6 +121,24 @@ def test_worlds__are_ranked_by_what_the_agents_minimise(compared: Compared, sear
     assert "by honest cost." in section and section.count("Honest cost") == 1
 
 
+@pytest.mark.parametrize("count", ["total", "honest"])
+@pytest.mark.parametrize("known", [False, True])
+def test_worlds__to_watch_are_those_of_the_cost_that_the_agents_minimise(
+    count: str, known: bool, compared: Compared, searched: Compared
+) -> None:
+    """They are the worlds of the first-impact harm if this had the values of the cost."""
+    mine = (searched if known else compared)._replace(harm_count=count)
+    renamed = {
+        agent: {**own, "first_impact_harm": own[COLUMN[count]], "best_known_first": own.get(f"best_known_{count}", 0.0)}
+        for agent, own in mine.result.columns.items()
+    }
+    other = mine._replace(result=replace(mine.result, columns=renamed), harm_count="first")
+    for focus in ("ppo", FOCUS, "full_brake"):
+        chosen = shown_worlds(mine, focus)
+        assert chosen == shown_worlds(other, focus)
+        assert chosen != shown_worlds(mine._replace(harm_count="first"), focus)
+
+
 def test_worst_worlds__can_be_watched(searched: Compared) -> None:
     shown = worst_rows(searched, FOCUS).tolist()[:3]
     text = str(worst_section(searched, FOCUS, shown).body[1])
@@ -134,6 +157,23 @@ def test_avoidable__splits_the_worlds_only_if_somebody_has_proven_it(compared: C
     assert f"<td>{harm[avoidable].mean():.2f} " in easy and f"<td>{harm[~avoidable].mean():.2f} " in hard
     section = avoidable_section(compared)
     assert section.title == "World by world" and len(section.body) == 1
+
+
+def test_tables__have_no_interval_that_takes_worlds_of_a_recording_for_independent() -> None:
+    agents = {TEAM: "constant:4.5", without("vehicle_2"): "coast", without("vehicle_3"): "full_brake"}
+    mine = with_best_known(compared_by(recorded(8).with_learners(["vehicle_2", "vehicle_3"]), agents))
+    result = mine.result
+    avoidable = result.worlds["gap_1_m"] + result.worlds["gap_2_m"] > 15.0
+    columns = {agent: {**own, "avoidable": avoidable} for agent, own in result.columns.items()}
+    apart = {**result.worlds, "recording": np.arange(result.n).astype(str)}
+    intervals = []
+    for worlds in (result.worlds, apart):
+        one = mine._replace(result=replace(result, columns=columns, worlds=worlds))
+        shown = re.findall(r"\[[-\d., ]+\]", " ".join(map(str, avoidable_section(one).body[:3])))
+        estimates = [each for sheet in learners_sheets(one) for row in sheet.rows for each in row[1:]]
+        intervals.append([*shown, *(each.interval for each in estimates)])
+    same = [pair for pair in zip(*intervals, strict=True) if pair[0] == pair[1]]
+    assert same == [] and len(intervals[0]) > 40
 
 
 # ---- the player
