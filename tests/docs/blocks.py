@@ -319,15 +319,19 @@ def parse_script(words: list[str]) -> None:
 
     argparse.ArgumentParser.parse_args = parse_and_stop
     try:
-        assert run_script(words) == 0, f"python {shlex.join(words)}: wrong arguments"
+        with contextlib.redirect_stderr(io.StringIO()) as told:
+            status = run_script(words)
+        assert not status, told.getvalue()
     finally:
         argparse.ArgumentParser.parse_args = whole
 
 
 def check_target(words: list[str]) -> None:
     """Check targets of the Makefile, and a programme: its options, and that it has cases."""
-    told = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True, check=False)
-    assert not told.returncode, told.stderr
+    targets = re.findall(r"(?m)^([a-z]+):", (ROOT / "Makefile").read_text("utf-8"))
+    unknown = [word for word in words if "=" not in word and word not in targets]
+    assert not unknown, f"make {shlex.join(words)}: no target {', '.join(unknown)}"
+    told = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True, check=True)
     if words[0] == "programme":
         listed = io.StringIO()
         with contextlib.redirect_stdout(listed):
