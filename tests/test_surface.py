@@ -55,6 +55,13 @@ def test_examples__every_public_class_has_one_and_it_is_run() -> None:
     assert {value.__name__ for value in CLASSES.values()} - run == set()
 
 
+def test_examples__none_is_left_out() -> None:
+    texts = [path.read_text("utf-8") for path in (ROOT / "ethbrake_marl").rglob("*.py")]
+    prompts = sum(len(re.findall(r"(?m)^ *>>> ", text)) for text in texts)
+    assert prompts == sum(len(param.values[0].examples) for param in examples())
+    assert [text[:80] for text in texts if re.search(r"(?m)^ *(```|\.\. code)", text)] == []
+
+
 @pytest.mark.parametrize("example", [*examples()])
 def test_example__runs(example: doctest.DocTest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)

@@ -14,6 +14,12 @@ from tests.docs.site import DOCS
 ROOT = DOCS.parent
 BLOCK = re.compile(r"^```(\S*)[^\n]*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md")),
+    *sorted(ROOT.glob(".github/**/*.md")),
+    *sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts),
+    *sorted((ROOT / "ethbrake_marl" / "_policies").glob("*/card.md")),
+]
 COMPARED = "`make figures` compares"  # in a section of docs/results
 
 

@@ -16,7 +16,7 @@ from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
 from ethbrake_marl.worlds.explain import new_scenario_text
 from ethbrake_marl.worlds.given import worlds_from_table
-from tests.docs.printed import BLOCK, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
+from tests.docs.printed import BLOCK, PAGES, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load
 from tests.programmes.libraries import harm_of_programs
 
@@ -25,13 +25,6 @@ def test_everything_compared__is_still_on_a_page() -> None:
     assert {each.begin for each in pictures()} == PICTURES.keys()
     assert {each.begin for each in tables()} >= TABLES.keys()
     assert [each.begin for each in tables() if not each.commands] == []
-
-
-def test_error__on_the_page_of_commands_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
-    page = (DOCS / "reference" / "cli.md").read_text("utf-8")
-    shown = page.partition("$ ethbrake evaluate --agents ful_brake\n")[2].partition("```")[0]
-    assert run_command(["evaluate", "--agents", "ful_brake"]) == 2
-    assert capsys.readouterr().err == shown
 
 
 @pytest.mark.slow
@@ -70,28 +63,6 @@ def test_missing_figures__are_those_that_nothing_rounds_to(table: str, printed: 
     assert missing_figures(table, printed) == missing
 
 
-PROGRAM_PAGES = (
-    *("cooperation", "environments", "evaluate", "internals/reading", "shield", "reference/README"),
-    pytest.param("../README", marks=pytest.mark.slow),
-)
-
-
-PROGRAM = re.compile(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", re.DOTALL)
-
-
-@pytest.mark.parametrize("page", PROGRAM_PAGES)
-def test_programs__of_a_page_run_and_print_what_stands_below_them(
-    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {"__name__": "my_file"}
-    programs = PROGRAM.findall((DOCS / f"{page}.md").read_text("utf-8"))
-    assert programs
-    for code, printed in programs:
-        exec(compile(code, f"{page}.md", "exec"), names)
-        assert capsys.readouterr().out == printed or not printed
-
-
 def test_codes_of_the_shield__stand_in_its_page() -> None:
     page = (DOCS / "shield.md").read_text("utf-8")
     assert [each.name for each in eb.ShieldReason if f"| {each.value} | `{each.name}` |" not in page] == []
@@ -120,13 +91,6 @@ def test_notebook__is_committed_with_its_outputs(notebook: Path) -> None:
 
 
 # ---------------------------------------------------------------- pages
-
-PAGES = [
-    ROOT / "README.md",
-    *sorted(ROOT.glob(".github/*.md")),
-    *sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts),
-    *sorted((ROOT / "ethbrake_marl" / "_policies").glob("*/card.md")),
-]
 
 
 def anchors(page: Path) -> set[str]:

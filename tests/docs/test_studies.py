@@ -2,9 +2,7 @@
 
 import dataclasses
 import json
-import re
 from concurrent.futures import Future
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -157,18 +155,3 @@ def test_morl_front__its_numbers_agree_with_each_other_and_with_full_braking() -
             assert measured["full_braking"] == full.round(4).tolist()
             assert measured["hypervolume"] == pytest.approx(volume_below(full.round(4), points))
             assert measured["hypervolume_below_roof"] == pytest.approx(volume_below(np.full(3, found["roof"]), points))
-
-
-# ---------------------------------------------------------------- pages
-
-
-COOPERATION = (DOCS / "cooperation.md").read_text("utf-8")
-
-
-def test_cooperation__its_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
-    blocks = re.findall("```python\n(.*?)```", COOPERATION, re.DOTALL)
-    for block in blocks:
-        exec(block.replace("1000", "20"), names)
-    assert blocks

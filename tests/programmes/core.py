@@ -29,7 +29,7 @@ OPTIONS = {
 COPIED = (".ci", "docs", "ethbrake_marl", "scenarios", "tests", "train", "Makefile", "README.md", "pyproject.toml")
 APART = ("docs", "programmes")  # tests of the whole repository, not only of the core
 INSTALLATION = ("test_imports.py",)  # start many processes
-OF_ALL = ("extensions/test_pages.py", "extensions/test_printed.py")  # what all extensions print together
+OF_ALL = ("extensions/test_printed.py",)  # what all extensions print together
 BY_NAME = {  # uses beside imports: recipes that observe forecasts; the policy `universal`, which a search starts with
     "extensions.learners": {"extensions.forecasts"},
     "extensions.search": {"extensions.forecasts"},

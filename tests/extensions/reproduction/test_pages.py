@@ -32,14 +32,6 @@ def test_sampling__prints_the_errors_that_the_page_tells(agent: str) -> None:
     assert picture_bytes(sampling.draw([study]), "study.png").startswith(b"\x89PNG")
 
 
-def test_map__example_of_the_page_runs_and_prints_its_figures(capsys: pytest.CaptureFixture[str]) -> None:
-    (block,) = re.findall("```python\n(.*?)```", PAGE, re.DOTALL)
-    exec(block, {})
-    harm, collided = map(float, capsys.readouterr().out.split())
-    assert (f"{harm:.2f}", f"{100.0 * collided:.1f} %") == ("23.48", "85.4 %")
-    assert "23.48 m²/s² with steps of 0.1 s (85.4 %" in " ".join(PAGE.split())
-
-
 def claims_of(page: str) -> list[str]:
     """The rows of the table of claims of a page, as Markdown."""
     table = page.split("| Where | The paper | Ours, as stated | Ours, nearest reading | Why |\n")[1]

@@ -1,0 +1,96 @@
+"""Every block of every page is run, as tests/docs/blocks.py says."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.docs.blocks import Reader, blocks
+from tests.docs.printed import PAGES, ROOT
+
+WITH_BLOCKS = [page for page in PAGES if blocks(page)]
+
+
+@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_page__its_blocks_run_and_print_what_it_shows(page: Path, request: pytest.FixtureRequest) -> None:
+    reader = Reader(request.config.getoption("all"))
+    for block in blocks(page):
+        reader.read(block)
+
+
+def read(page: Path, text: str) -> None:
+    page.write_text(text)
+    reader = Reader(reads_slow=True)
+    for block in blocks(page):
+        reader.read(block)
+
+
+FAULTS = {
+    "NameError": "```python\nprint(nothing)\n```",
+    "page.md:1": "~~~python\nprint(1.25)  # 1.3\n~~~",
+    "-2": "- A list:\n\n  ```python\n  print(1)\n  ```\n\n  ```\n  2\n  ```",
+    "invalid syntax": "<!-- block: not run: needs a GPU -->\n```python\nfor\n```",
+    "No such option: --agent": "```sh\nethbrake evaluate --agent ppo\n```",
+    "No such option: --step": "<!-- block: slow; not run: takes hours -->\n```sh\nethbrake train \\\n  --step 3\n```",
+    "No such command 'lists'": "<!-- block: not run: takes hours -->\n```console\n$ ethbrake scenario lists\n```",
+    "unknown agent 'pop'": "```console\n$ ethbrake evaluate --agents pop\n```",
+    "-Harm": "```console\n$ ethbrake --version\nHarm\n```",
+    "unrecognized arguments: --fast": "<!-- block: not run: takes hours -->\n```sh\npython train/ippo.py --fast\n```",
+    "no target tests": "```sh\nmake tests\n```",
+    "has no cases": "```sh\nmake programme NAME=bounds ARGS='--only nothing'\n```",
+    "unknown extra": "```sh\npip install '.[marll]'\n```",
+    "nothing runs conda": "```sh\nconda install ethbrake\n```",
+    "gap_m: unknown key": "```yaml\ngap_m: 3\n```",
+    "gamme: unknown key": "```yaml\nname: mine\nalgorithm: ppo\ngamme: 1\n```",
+    "entry points": "```toml\n[project.entry-points.'ethbrake_marl.agent']\na = 'b:c'\n```",
+    "nothing runs a block of 'bash'": "```bash\nls\n```",
+    "nothing runs a block of '(indented)'": "Text:\n\n    x = 1",
+    "unknown mark 'later'": "<!-- block: later -->\n```python\n```",
+    "unknown mark 'not run'": "<!-- block: not run -->\n```python\n```",
+    "a mark without a block": "<!-- block: slow -->\n\nText.",
+    "7 is not in the block": "<!-- block: short 7=8 -->\n```python\nprint(1)\n```",
+    "shows output of no block": "Text.\n\n```\n1\n```",
+    "has no line gap": "```sh\nethbrake scenario new mine\n```\n<!-- block: change mine.yaml -->\n```yaml\ngap: 3\n```",
+}
+
+
+@pytest.mark.parametrize("message", FAULTS)
+def test_fault__of_a_page_is_seen(message: str, empty_folder: Path) -> None:
+    with pytest.raises(Exception) as error:
+        read(empty_folder / "page.md", FAULTS[message])
+    assert message in f"{error.typename}: {error.value}"
+
+
+def test_page__that_is_right_is_read(empty_folder: Path) -> None:
+    page = """```python
+for k in range(3):
+    print(k, 0.125)
+```
+
+```
+0 0.1...
+...
+2 0.125
+```
+
+<!-- block: write worlds.csv -->
+```
+gap_1_m,gap_2_m
+7,8
+```
+
+<!-- block: short 1000=2 -->
+```console
+$ python -m ethbrake_marl evaluate --episodes 1000 --agents coast --json
+[
+...
+]
+```
+
+<!-- block: show worlds.csv -->
+```
+gap_2_m
+8
+```
+"""
+    read(empty_folder / "page.md", page)
