@@ -172,7 +172,9 @@ def test_pythons__are_the_same_wherever_they_stand() -> None:
     ]
 
 
-@pytest.mark.parametrize(("version", "suits"), [("3, 10, 19", False), ("3, 11", True), ("3, 14, 9", True), ("3, 15", False)])
+@pytest.mark.parametrize(
+    ("version", "suits"), [("3, 10, 19", False), ("3, 11", True), ("3, 14, 9", True), ("3, 15", False)]
+)
 def test_make__takes_only_a_python_that_suits(version: str, suits: bool, tmp_path: Path) -> None:
     python = tmp_path / "python"  # this Python under another number; it makes no environment
     program = f'import sys; sys.version_info = ({version}); exec(sys.argv[2] if sys.argv[1] == "-c" else "sys.exit(3)")'

@@ -70,7 +70,7 @@ def attempt(kind: str, python: str, paths: list[str], until: float) -> Told:
         there = make_environment(kind, python)
         untried = untried_bounds(there, light) if kind.startswith("lowest") else []
         tried = run_light(there, until) if light else run_tests(there, paths, until)
-    except NotInstalled as reason:  # this Python must do; another may be missing, or a package may have no release for it
+    except NotInstalled as reason:  # another Python may be missing, or too new for a package
         return Told(False if python == sys.executable else None, f"not installed: {reason}")
     return Told(False, "; ".join([*untried, tried.text])) if untried else tried
 
