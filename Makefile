@@ -1,4 +1,4 @@
-# Everything runs in the project's own environment, .venv. This file and .ci/install make it with Python >= 3.11.
+# Everything runs in the project's own environment, .venv. This file and .ci/install make it with Python 3.11 to 3.14.
 # TORCH_INDEX: package index for torch, e.g. make run TORCH_INDEX=ADDRESS. Default: uv chooses the build.
 # PYTHON:      Python that makes the environment. Default: the first suitable one.
 # ARGS:        arguments for `ethbrake run` (make run), pytest (make test) and the programmes.
@@ -51,12 +51,12 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "== Making the environment $(VENV) ($(REASON))"
 	@found=; \
 	for candidate in $(if $(PYTHON),"$(PYTHON)",python3 python3.11 python3.12 python3.13 python3.14 python); do \
-	  if "$$candidate" -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1; then \
+	  if "$$candidate" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 15))' >/dev/null 2>&1; then \
 	    found="$$candidate"; break; \
 	  fi; \
 	done; \
 	if [ -z "$$found" ]; then \
-	  echo "error: Python 3.11 or newer is needed; $(or $(PYTHON),python3) gives: $$("$(or $(PYTHON),python3)" --version 2>&1)" >&2; \
+	  echo "error: Python 3.11 to 3.14 is needed; $(or $(PYTHON),python3) gives: $$("$(or $(PYTHON),python3)" --version 2>&1)" >&2; \
 	  echo "       Install it, or give its path: make $(firstword $(MAKECMDGOALS)) PYTHON=/path/to/python3.11" >&2; \
 	  exit 1; \
 	fi; \

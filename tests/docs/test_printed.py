@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from ethbrake_marl.worlds.explain import new_scenario_text
 from ethbrake_marl.worlds.given import worlds_from_table
 from tests.docs.printed import BLOCK, PAGES, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load
+from tests.programmes import bounds
 from tests.programmes.libraries import harm_of_programs
 
 
@@ -115,6 +118,37 @@ def test_version__is_the_same_wherever_it_stands() -> None:
     assert f"version = {{{eb.__version__}}}" in (ROOT / "README.md").read_text("utf-8")
     assert citation["license"] == project["license"]
     assert [author["name"] for author in citation["authors"]] == [author["name"] for author in project["authors"]]
+
+
+def test_pythons__are_the_same_wherever_they_stand() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    first, *_, last = bounds.PYTHONS
+    behind = f"3.{int(last.removeprefix('3.')) + 1}"
+    assert project["requires-python"] == f">={first},<{behind}"
+    named = [each.rpartition(" ")[2] for each in project["classifiers"] if ":: Python :: 3." in each]
+    assert named == [*bounds.PYTHONS]
+    for file in ("README.md", ".github/CONTRIBUTING.md", "docs/installing.md", "docs/first-ten-minutes.md", "Makefile"):
+        assert f"Python {first} to {last}" in (ROOT / file).read_text("utf-8"), file
+    jobs = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8"))["jobs"]
+    assert jobs["versions"]["strategy"]["matrix"]["include"] == [
+        {"kind": "lowest", "python": first},
+        {"kind": "highest", "python": last},
+    ]
+
+
+@pytest.mark.parametrize(
+    ("version", "suits"), [("3, 10, 19", False), ("3, 11", True), ("3, 14, 9", True), ("3, 15", False)]
+)
+def test_make__takes_only_a_python_that_suits(version: str, suits: bool, tmp_path: Path) -> None:
+    python = tmp_path / "python"  # this Python under another number; it makes no environment
+    program = f'import sys; sys.version_info = ({version}); exec(sys.argv[2] if sys.argv[1] == "-c" else "sys.exit(3)")'
+    python.write_text(f"#!/bin/sh\nexec {sys.executable} -c '{program}' \"$@\"\n")
+    python.chmod(0o755)
+    command = ["make", "-s", "venv", f"PYTHON={python}", f"VENV={tmp_path / 'environment'}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert ("cannot make a virtual environment" in done.stderr) == suits
+    assert (f"Python 3.11 to 3.14 is needed; {python} gives" in done.stderr) != suits
 
 
 @pytest.mark.parametrize(

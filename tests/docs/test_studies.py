@@ -31,6 +31,7 @@ def test_price__is_nothing_where_everything_is_known():
 drawings = load("../drawings")
 
 
+@pytest.mark.usefixtures("pinned_matplotlib")
 @pytest.mark.parametrize("name", drawings.DRAWINGS)
 def test_drawing__is_the_one_that_is_shown(name: str) -> None:
     assert f"](../figures/model-{name}.svg)" in (DOCS / "internals" / "model.md").read_text("utf-8").replace("\n", " ")

@@ -11,7 +11,7 @@ import pytest
 
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.printed import rows
-from tests.programmes import ROOT, Told, __main__ as runner, bugs, hostile, libraries
+from tests.programmes import ROOT, Told, __main__ as runner, bounds, bugs, hostile, libraries
 
 
 def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
@@ -49,6 +49,18 @@ def test_runner__lists_every_programme_and_knows_no_other(capsys):
     assert runner.main([]) == 0 and {"motion", "shields", "wheel"} <= runner.programmes().keys()
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [*runner.programmes()]
     assert runner.main(["nobody"]) == 2
+
+
+# ---------------------------------------------------------------- bounds
+
+
+@pytest.mark.parametrize(("python", "good"), [(sys.executable, False), ("3.1", None)])
+def test_versions__that_cannot_be_installed_fail_unless_that_python_is_missing(python, good, tmp_path, monkeypatch):
+    monkeypatch.setattr(bounds, "KEPT", tmp_path)
+    for variable in ("UV_OFFLINE", "UV_NO_CACHE"):
+        monkeypatch.setenv(variable, "1")
+    told = bounds.attempt("lowest-light", python, [], 0.0)
+    assert told.good is good and told.text.startswith("not installed: ")
 
 
 # ---------------------------------------------------------------- libraries

@@ -58,7 +58,8 @@ def test_watch__makes_the_picture_of_the_readme(ethbrake: Command, empty_folder:
     assert (answer.status, answer.out, answer.err) == (0, "", "pictures: now.png\n")
     now, then = (Image.open(file).convert("RGB") for file in ("now.png", DOCS / "figures" / "emergency.png"))
     assert now.size == then.size
-    assert (np.abs(np.array(now, int) - np.array(then, int)).max(axis=2) > 8).mean() < 1e-3
+    # Pillow 11.3 draws 0.1 % of the points otherwise than Pillow 13; with another agent 3 % are others.
+    assert (np.abs(np.array(now, int) - np.array(then, int)).max(axis=2) > 8).mean() < 5e-3
 
 
 def test_watch__is_refused(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
