@@ -191,18 +191,21 @@ def test_env__whose_feature_fails_stays_as_it_was(deed: str) -> None:
 
     eb.register_feature("mine", mine, unit="s", scale=1.0, low=0.0, high=9.0)
     scenario, runs = PAIR.replace(observation=["own", "mine"]), []
+
+    def called(env: Any, tensors: Any) -> Any:
+        tensors["learners", "action"] = torch.full((3, 2, 1), -0.5)
+        return env.step(tensors.clone())["next"] if deed == "step" else env.reset()
+
     for trapped in (False, True):
         env, seen = LineEnv(scenario, 3, 5), []
         tensors = env.reset()
         for _ in range(3):
-            tensors["learners", "action"] = torch.full((3, 2, 1), -0.5)
-            call = (lambda given=tensors: env.step(given.clone())["next"]) if deed == "step" else env.reset
             if trapped:
                 fails = True
                 with pytest.raises(InvalidInput, match="feature 'mine' of vehicle_2: its function fails"):
-                    call()
+                    called(env, tensors)
                 fails = False
-            tensors = call()
+            tensors = called(env, tensors)
             seen.append(tensors["learners", "observation"].tolist())
         runs.append(seen)
     assert runs[0] == runs[1]
