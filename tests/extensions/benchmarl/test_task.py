@@ -175,3 +175,37 @@ def test_qmix__trains_a_team_that_drives(tmp_path: Path) -> None:
 
     agent = eb.policy_agent(qmix, scenario=PAIR, actions=5)
     assert np.isfinite(eb.evaluate(PAIR, {"qmix": agent}, episodes=20)["qmix"]["first_impact_harm"]).all()
+
+
+@pytest.mark.parametrize("deed", ["step", "reset"])
+def test_env__whose_feature_fails_stays_as_it_was(deed: str) -> None:
+    from ethbrake_marl.extensions.benchmarl.task import LineEnv
+
+    fails = False
+
+    def mine(state: eb.State, body: int) -> Any:
+        """Time, unless it fails."""
+        if fails:
+            raise ZeroDivisionError
+        return state.time_s
+
+    eb.register_feature("mine", mine, unit="s", scale=1.0, low=0.0, high=9.0)
+    scenario, runs = PAIR.replace(observation=["own", "mine"]), []
+
+    def called(env: Any, tensors: Any) -> Any:
+        tensors["learners", "action"] = torch.full((3, 2, 1), -0.5)
+        return env.step(tensors.clone())["next"] if deed == "step" else env.reset()
+
+    for trapped in (False, True):
+        env, seen = LineEnv(scenario, 3, 5), []
+        tensors = env.reset()
+        for _ in range(3):
+            if trapped:
+                fails = True
+                with pytest.raises(InvalidInput, match="feature 'mine' of vehicle_2: its function fails"):
+                    called(env, tensors)
+                fails = False
+            tensors = called(env, tensors)
+            seen.append(tensors["learners", "observation"].tolist())
+        runs.append(seen)
+    assert runs[0] == runs[1]
