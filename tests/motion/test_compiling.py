@@ -284,6 +284,17 @@ def test_kernels__of_one_text_with_other_values_are_told_apart(tmp_path: Path, m
     assert len([*(tmp_path / "ethbrake_marl").iterdir()]) == 2
 
 
+def test_kernel__has_machine_code_for_each_type_of_its_argument(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+
+    def half(x: float) -> float:
+        return x // 2
+
+    for _ in range(2):
+        answers = [compiling.large(half)(x) for x in (7, 7.5)]
+        assert answers == [3, 3.0] and [type(each) for each in answers] == [int, float]
+
+
 # ---------------------------------------------------------------- the suite's own cache
 
 
