@@ -56,6 +56,7 @@ def test_ids__make_the_environments_of_each_library() -> None:
         assert type(pettingzoo.make(interface, "ethbrake/ethbrake-v1").unwrapped) is EthBrakeParallelEnv
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_pettingzoo_without_a_registry__runs(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("parallel_registry", "aec_registry", "register", "make"):
         monkeypatch.delattr(pettingzoo, name, raising=False)  # as in version 1.26
