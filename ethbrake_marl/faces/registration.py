@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from ethbrake_marl.errors import MissingExtra
-
 GYMNASIUM_ID = "EthBrake-v1"
 MO_GYMNASIUM_ID = "EthBrakeMO-v1"  # with vector rewards, for MO-Gymnasium
 PETTINGZOO_ID = "ethbrake/ethbrake-v1"
@@ -16,7 +14,7 @@ ENTRIES: dict[str, Any] = {
 
 
 def register_environments() -> None:
-    """Register all ids that are not yet registered. Raises ``MissingExtra`` for an old PettingZoo."""
+    """Register all ids that are not yet registered; PettingZoo has a registry from version 1.27 on."""
     import gymnasium  # imported here, because the import takes time
     import pettingzoo
 
@@ -25,11 +23,6 @@ def register_environments() -> None:
     for id_, settings in {GYMNASIUM_ID: dict[str, Any](), MO_GYMNASIUM_ID: of_vectors}.items():
         if id_ not in gymnasium.registry:
             gymnasium.register(id_, **ENTRIES, **settings)
-    if not hasattr(pettingzoo, "parallel_registry"):
-        raise MissingExtra(
-            f"needs pettingzoo 1.27 or newer; {getattr(pettingzoo, '__version__', 'an older one')} is installed"
-        )
-    if PETTINGZOO_ID not in pettingzoo.parallel_registry:
-        pettingzoo.register("parallel", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v1:parallel_env")
-    if PETTINGZOO_ID not in pettingzoo.aec_registry:
-        pettingzoo.register("aec", PETTINGZOO_ID, "ethbrake_marl.ethbrake_v1:env")
+    for interface, name in (("parallel", "parallel_env"), ("aec", "env")):
+        if PETTINGZOO_ID not in getattr(pettingzoo, f"{interface}_registry", {PETTINGZOO_ID}):
+            pettingzoo.register(interface, PETTINGZOO_ID, f"ethbrake_marl.ethbrake_v1:{name}")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from decimal import Decimal
+from numbers import Real
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -44,16 +47,17 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
 def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """Worlds from columns of equal length n: ``{"gap_1_m": [7, 8], "speed_1_mps": [20, 19], ...}``.
 
-    ``columns`` may also be a pandas or polars data frame, or a pyarrow table; rows are matched by position. A missing
-    column (``given_columns``) takes the scenario's value, which must be fixed. Raises ``InvalidInput`` with column and
-    row (from 0).
+    ``columns`` may also be a pandas or polars data frame, a pyarrow table or a structured array of numpy; rows are
+    matched by position. A missing column (``given_columns``) takes the scenario's value, which must be fixed. Raises
+    ``InvalidInput`` with column and row (from 0).
     """
     scenario, where = load_scenario(scenario), "initial states"
-    names = getattr(columns, "column_names", None) or getattr(columns, "columns", columns)  # of pyarrow, or a frame
-    if not hasattr(columns, "__getitem__") or isinstance(columns, str | Sequence):
+    columns = columns.collect() if hasattr(columns, "collect") else columns  # a LazyFrame of polars
+    names = columns if isinstance(columns, Mapping) else _column_names(columns)
+    if names is None:
         raise InvalidInput(
-            f"{where} = {columns!r:.60}: must be a mapping from columns to lists of numbers, a data frame or a pyarrow"
-            " table"
+            f"{where}: type {type(columns).__name__}: must be a mapping from columns to lists of numbers, a pandas or"
+            " polars frame, a pyarrow table, or a structured array of numpy"
         )
     series = [columns[name] for name in names if hasattr(columns[name], "iloc")]
     if not all(one.index.equals(series[0].index) for one in series):
@@ -70,8 +74,18 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     return _worlds(scenario, dict(zip(entries, arrays, strict=True)), where, lambda row: f", row {row}")
 
 
+def _column_names(table: Any) -> Sequence[Any] | None:
+    """Return the names of the columns of a structured array, a pyarrow table or a frame; None for anything else."""
+    if isinstance(table, np.ndarray):
+        return None if isinstance(table, np.ma.MaskedArray) else table.dtype.names
+    names = getattr(table, "column_names", getattr(table, "columns", None))
+    return names if hasattr(table, "__getitem__") and hasattr(names, "__len__") else None
+
+
 def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
     """Worlds from a CSV file with the columns of ``worlds_from_table``. Errors name file, line and column."""
+    if not isinstance(path, str | Path):
+        raise InvalidInput(f"path = {_shown(path)}: must be the path of a CSV file; worlds_from_table reads a table")
     scenario, file = load_scenario(scenario), CsvFile.read(Path(path).expanduser())
     entries = _entries(file.header, scenario, f"{file.path}, line 1")
     table = np.array(file.cells(file.header), np.float64)
@@ -160,15 +174,34 @@ def _worlds(
     return state_of(scenario, whole, no_chance, scenario.unheard(), np.full(n, -1))
 
 
+def _shown(value: Any) -> str:
+    """Return a value for a message; of an array, a column or a table only its type."""
+    if isinstance(value, str | float | int | list | tuple | None):
+        return f"{value!r:.60}"
+    kind = getattr(value, "dtype", getattr(value, "type", None))
+    return type(value).__name__ + (f" of {kind}" if kind is not None else "")
+
+
 def _numbers(what: str, value: Any) -> Floats:
-    """Array of numbers. Refuses booleans, masks and texts, which numpy would convert."""
+    """Array of numbers; a missing one is NaN. Refuses booleans, masks and texts, which numpy would convert."""
     try:
         cells = np.asarray(value)
+        if cells.dtype.kind == "O":
+            cells = np.array([_number(cell) for cell in cells.flat], np.float64).reshape(cells.shape)
         kinds = {type(cell) for cell in np.asarray(value, object).flat} if isinstance(value, list | tuple) else set()
-    except (TypeError, ValueError, RuntimeError) as error:  # ragged lists, tensors with gradients or on a GPU
-        raise InvalidInput(f"{what} = {value!r:.60}: must be a number or a list of numbers: {error}") from None
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:  # ragged lists, tensors on a GPU, texts
+        raise InvalidInput(f"{what} = {_shown(value)}: must be a number or a list of numbers: {error}") from None
     if cells.dtype.kind not in "fiu" or isinstance(value, np.ma.MaskedArray) or kinds & {bool, np.bool_}:
         raise InvalidInput(
-            f"{what} = {value!r:.60}: must be a number or a list of numbers; no booleans, texts or masks"
+            f"{what} = {_shown(value)}: must be a number or a list of numbers; no booleans, texts or masks"
         )
     return cells.astype(np.float64)
+
+
+def _number(cell: Any) -> float:
+    """Return one object as a number. pandas marks a missing one by an ``NAType``."""
+    if cell is None or type(cell).__name__ == "NAType":
+        return math.nan
+    if isinstance(cell, bool) or not isinstance(cell, Real | Decimal):
+        raise TypeError(f"it contains {cell!r:.60}")
+    return float(cell)

@@ -1,5 +1,6 @@
 """Worlds that the user gives."""
 
+from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,83 @@ def test_table__may_be_a_data_frame() -> None:
     other = {**COLUMNS, "gap_1_m": frame["gap_1_m"], "gap_2_m": frame["gap_2_m"].sort_index()}
     with refused("initial states: columns have different pandas indexes; give them the same"):
         worlds_from_table(PAPER, other)
+
+
+NUMBERS = {
+    "object": lambda pandas, frame: frame.astype(object),
+    "Int64": lambda pandas, frame: frame.astype("Int64"),
+    "Float64": lambda pandas, frame: frame.astype("Float64"),
+    "pyarrow": lambda pandas, frame: frame.astype("float64[pyarrow]"),
+    "decimal": lambda pandas, frame: frame.map(Decimal),
+    "category": lambda pandas, frame: frame.assign(gap_1_m=pandas.Categorical(frame["gap_1_m"])),
+    "records": lambda pandas, frame: frame.to_records(index=False),
+    "structured": lambda pandas, frame: np.array([(7,) * 5, (8,) * 5], [(name, float) for name in COLUMNS]),
+    "whole": lambda pandas, frame: np.array([(7,) * 5, (8,) * 5], [(name, np.uint8) for name in COLUMNS]),
+    "objects": lambda pandas, frame: {name: np.array([7, 8.0], object) for name in COLUMNS},
+    "range": lambda pandas, frame: dict.fromkeys(COLUMNS, range(7, 9)),
+}
+
+
+@pytest.mark.parametrize("kind", NUMBERS)
+def test_table__may_have_numbers_of_any_type(kind: str) -> None:
+    pandas = pytest.importorskip("pandas")
+    table = NUMBERS[kind](pandas, pandas.DataFrame(COLUMNS))
+    assert bits(worlds_from_table(PAPER, table)) == bits(worlds_from_table(PAPER, COLUMNS))
+
+
+def test_table__may_be_of_polars() -> None:
+    polars = pytest.importorskip("polars")
+    for kind in (polars.DataFrame, polars.LazyFrame):
+        assert bits(worlds_from_table(PAPER, kind(COLUMNS))) == bits(worlds_from_table(PAPER, COLUMNS))
+    with refused("initial states, row 1, column gap_1_m = nan: must be finite"):
+        worlds_from_table(PAPER, polars.LazyFrame({**COLUMNS, "gap_1_m": [7, None]}))
+    with refused("initial states: type Series: must be a mapping from columns"):
+        worlds_from_table(PAPER, polars.Series([7.0]))
+
+
+@pytest.mark.parametrize(
+    ("cells", "message"),
+    [
+        (lambda pandas: [7, None], ", row 1, column gap_1_m = nan: must be finite"),
+        (lambda pandas: pandas.array([7, None], dtype="Int64"), ", row 1, column gap_1_m = nan: must be finite"),
+        (lambda pandas: pandas.Series([7.0, pandas.NA], dtype=object), ", row 1, column gap_1_m = nan: must be finite"),
+        (lambda pandas: pandas.Series([7.0, "8"], dtype=object), ": gap_1_m = Series of object: must be a number or a"),
+        (
+            lambda pandas: pandas.Series([7.0, True], dtype=object),
+            ": gap_1_m = Series of object: must be a number or a",
+        ),
+        (lambda pandas: pandas.array([True, None], dtype="boolean"), ": gap_1_m = BooleanArray of boolean: must be a"),
+        (lambda pandas: pandas.to_datetime(["2020-01-01"] * 2), ": gap_1_m = DatetimeIndex of datetime64["),
+        (lambda pandas: np.array([7, 10**400], object), ": gap_1_m = ndarray of object: must be a number or a list"),
+        (lambda pandas: {0: 7, 1: 8}, ": gap_1_m = dict: must be a number or a list of numbers"),
+    ],
+)
+def test_column__of_other_cells_is_refused_without_the_table(cells: Any, message: str) -> None:
+    with refused(f"initial states{message}"):
+        worlds_from_table(PAPER, {**COLUMNS, "gap_1_m": cells(pytest.importorskip("pandas"))})
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        None,
+        3,
+        "worlds.csv",
+        [COLUMNS],
+        np.ones((2, 5)),
+        np.ma.array([(7.0,)], dtype=[("gap_1_m", float)]),
+        {1},
+        iter([]),
+    ],
+    ids=lambda table: type(table).__name__,
+)
+def test_what_is_no_table__is_refused_by_its_type(table: Any) -> None:
+    accepted = "must be a mapping from columns to lists of numbers, a pandas or polars frame, a pyarrow table, or"
+    with refused(f"initial states: type {type(table).__name__}: {accepted}"):
+        worlds_from_table(PAPER, table)
+    if not isinstance(table, str):
+        with refused("must be the path of a CSV file; worlds_from_table reads a table"):
+            read_worlds(PAPER, table)
 
 
 def test_file__may_hold_any_quantity_in_any_order(empty_folder: Path) -> None:

@@ -137,7 +137,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "initial_state: latency_s[1] = 0.5: vehicle_2 may not be able to act until 8.5 s": lambda: worlds_from_state(
         PAPER.replace(v2x={"preset": "sensors-only", "sensing_s": [1, 1]}), STATE | {"latency_s": [7.5, 0.5, 0.8]}
     ),
-    "initial states = 3: must be a mapping from columns to lists of numbers, a data frame or a": lambda: (
+    "initial states: type int: must be a mapping from columns to lists of numbers, a pandas or polars": lambda: (
         worlds_from_table(PAPER, 3)
     ),
     "number of worlds = 0: must be a whole number in 1..10000000": lambda: PAPER.sample(n=0, seed=1),
