@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.motion.layout import Floats
 
+Indices = Discrete  # the name of the class in models that were saved by 1.0.0
+
 
 def action_space(count: int | None) -> Any:
     """Return one learner's action space: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices.

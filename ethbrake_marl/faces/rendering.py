@@ -28,7 +28,8 @@ class Renderer:
         """Close windows and files."""
 
 
-# environment -> object with the methods of Renderer; a function `check` of it raises an error where it cannot draw
+# environment -> object with the methods of Renderer; its function `check(many)`, if it has one, raises an error if it
+# cannot draw one world, or many, on this machine
 MakeRenderer = Callable[[Any], Any]
 
 
@@ -40,18 +41,21 @@ def register_renderer(mode: str, make: MakeRenderer) -> None:
 RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", register_renderer)
 
 
-def why_not(mode: str) -> str | None:
-    """Return why a render mode cannot be used on this machine, or None."""
+def why_not(mode: str, many: bool = False) -> str | None:
+    """Return why a render mode cannot draw one world, or ``many``, on this machine; or None."""
     try:
-        getattr(RENDERERS[mode], "check", Renderer)()
+        getattr(RENDERERS[mode], "check", bool)(many)
     except EthBrakeError as error:
         return str(error)
     return None
 
 
-def render_metadata() -> dict[str, Any]:
+def render_metadata(many: bool = False) -> dict[str, Any]:
     """Return the entries of an environment's ``metadata`` about pictures, with the modes that work on this machine."""
-    return {"render_modes": [m for m in RENDERERS if why_not(m) is None], "render_fps": FRAMES_PER_SECOND}
+    return {
+        "render_modes": [mode for mode in RENDERERS if why_not(mode, many) is None],
+        "render_fps": FRAMES_PER_SECOND,
+    }
 
 
 class Metadata:

@@ -66,7 +66,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         if autoreset_mode not in ("NextStep", "SameStep", AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP):
             raise InvalidInput(f"autoreset_mode = {autoreset_mode!r}: must be 'NextStep' or 'SameStep'")
         self.num_envs, self.autoreset_mode = int(num_envs), AutoresetMode(autoreset_mode)
-        self.metadata = {**render_metadata(), "autoreset_mode": self.autoreset_mode}
+        self.metadata = {**render_metadata(many=True), "autoreset_mode": self.autoreset_mode}
         game = scenario, learners, reward, observation, reward_vector, report
         spaces = self._open_one(game, render_mode, actions, max_episode_steps)
         self.single_observation_space, self.single_action_space = spaces

@@ -1,20 +1,48 @@
 """The libraries find and accept the environments: their ids, their own checks, their wrappers."""
 
+import copy
+import gc
+import json
+import pickle
 import warnings
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pettingzoo
 import pytest
-from gymnasium.utils.env_checker import check_env
+import supersuit
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box, Dict, Discrete, Tuple
+from gymnasium.spaces.utils import flatdim, flatten, flatten_space, unflatten
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from gymnasium.vector.utils import (
+    batch_differing_spaces,
+    batch_space,
+    concatenate,
+    create_empty_array,
+    create_shared_memory,
+    iterate,
+    read_from_shared_memory,
+    write_to_shared_memory,
+)
+from gymnasium.wrappers import TimeAwareObservation
 from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test, seed_test
 from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
+from ethbrake_marl.episode.observe import View
+from ethbrake_marl.episode.reward import RewardParams
+from ethbrake_marl.errors import InvalidInput, MissingExtra
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.registration import register_environments
+from ethbrake_marl.faces.sb3 import EthBrakeVecEnv, make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
+from ethbrake_marl.worlds.catalogue import load_scenario
 
 SETTINGS: list[dict[str, Any]] = [
     {"scenario": "paper-random-obstacle", "agents": "learners"}, {"actions": 5, "reward": "paper"},
@@ -62,3 +90,192 @@ def test_pettingzoo_without_a_registry__runs(monkeypatch: pytest.MonkeyPatch) ->
         monkeypatch.delattr(pettingzoo, name, raising=False)  # as in version 1.26
     register_environments()
     parallel_api_test(EthBrakeParallelEnv(), num_cycles=5)
+
+
+CONTENT = load_scenario("paper-random").declared()
+ARGUMENTS: dict[str, dict[str, Any]] = {
+    "scenario": {"scenario": load_scenario("paper-random-obstacle")},
+    "mixture": {"scenario": load_scenario("mixture-trucks")},
+    "table": {"scenario": load_scenario("engineering-measured-triples")},
+    "path": {"scenario": Path("mine.yaml")},
+    "content": {"scenario": {**CONTENT, "mass_t": np.array([1.0, 2.0, 3.0]), "gaps_m": {"choice": (7, np.float32(8))}}},
+    "reward": {"reward": {"harm": np.float32(0.3), "jerk": np.float64(1e-5), "objective": ("own", "own", "own")}},
+    "params": {"reward": RewardParams(harm=0.5, collision=0.1, k_energy=(1.0, 2.0))},
+    "names": {"reward": np.str_("paper"), "learners": np.array(["vehicle_3"])},
+    "view": {"observation": {"vehicle_2": View(["own", "rear_1.gap"])}, "learners": ("vehicle_2",)},
+    "features": {"observation": ("own", "front_1")},
+    "numbers": {"actions": np.int64(9), "reward_vector": ("harm_1", "harm_2")},
+}
+
+
+def played(env: Any, n: int | None = None) -> list[Any]:
+    """Everything that an episode returns, with braking of about one half."""
+    seen = [env.reset(seed=5)[0].tolist()]
+    while len(seen) < 100:
+        action = np.float32([-0.5]) if isinstance(env.unwrapped.action_space, Box) else 3
+        parts = env.step(action if n is None else np.array([action] * n))[:4]
+        seen.append([np.asarray(part).tolist() for part in parts])
+        if n is None and (parts[2] or parts[3]):
+            break
+    return seen
+
+
+@pytest.mark.filterwarnings("ignore:.*The reward returned by.*:UserWarning")  # vectors, as MO-Gymnasium has them
+@pytest.mark.parametrize("given", ARGUMENTS.values(), ids=ARGUMENTS)
+def test_spec__every_argument_goes_through_json_and_makes_the_same_episode(given: Any, empty_folder: Path) -> None:
+    empty_folder.joinpath("mine.yaml").write_text(json.dumps({**CONTENT, "name": "mine", "horizon_s": 5.0}))
+    single = gymnasium.make("EthBrake-v1", **given)
+    many = gymnasium.make_vec("EthBrake-v1", 2, autoreset_mode=AutoresetMode.SAME_STEP, **given)
+    same = gymnasium.make(EnvSpec.from_json(single.spec.to_json()))
+    alike = gymnasium.make_vec(EnvSpec.from_json(many.spec.to_json()))
+    first, rows = played(single), played(many, 2)
+    assert played(same) == first and played(alike, 2) == rows
+    assert same.spec.to_json() == single.spec.to_json()
+    assert same.spec.max_episode_steps == alike.spec.max_episode_steps == many.spec.max_episode_steps >= len(first) - 1
+
+
+@pytest.mark.parametrize(
+    ("scenario", "learner", "steps", "least"),
+    [("paper-random", "vehicle_2", 75, 75), ("paper-random", "vehicle_3", 72, 72),
+     ("mixture-delays", "vehicle_2", 79, 77), ("engineering-stop-and-go", "vehicle_2", 75, 60),
+     ("paper-random-obstacle", "vehicle_1", 80, 80)],
+)  # fmt: skip
+def test_spec__states_the_longest_episode_in_steps(scenario: str, learner: str, steps: int, least: int) -> None:
+    env = gymnasium.make("EthBrake-v1", scenario=scenario, learners=[learner])
+    assert env.spec.max_episode_steps == env.unwrapped.spec.max_episode_steps == steps
+    taken, driving = [], np.ones(1, np.float32)
+    for seed in range(8):
+        env.reset(seed=seed)
+        taken.append(next(k for k in range(1, 400) if np.any(env.step(driving)[2:4])))
+    assert least <= max(taken) <= steps
+    timed = TimeAwareObservation(env)
+    assert timed.reset(seed=1)[0] in timed.observation_space
+    for limit in (3, steps):
+        limited = gymnasium.make("EthBrake-v1", max_episode_steps=limit)
+        vector = gymnasium.make_vec("EthBrake-v1", num_envs=2, max_episode_steps=limit)
+        assert limited.spec.max_episode_steps == limit and vector.spec.max_episode_steps == min(limit, 75)
+    assert EthBrakeEnv().spec is None and "TimeLimit" not in str(env)
+
+
+def spaces() -> list[Any]:
+    indices, vectors = EthBrakeEnv(actions=5), EthBrakeEnv(reward_vector="vehicles")
+    agents, many = EthBrakeParallelEnv(reward_vector="vehicles"), EthBrakeVectorEnv(3, actions=3)
+    rows = make_sb3_vec_env("paper-random", 2, appended="number")
+    return [
+        indices.observation_space, indices.action_space, vectors.action_space, vectors.reward_space,
+        agents.state_space, agents.observation_space("vehicle_2"), agents.reward_space("vehicle_2"),
+        many.observation_space, many.action_space, many.single_action_space, rows.observation_space,
+    ]  # fmt: skip
+
+
+def test_spaces__are_taken_by_every_function_of_gymnasium_on_spaces() -> None:
+    for alone in spaces():
+        for space in (alone, Dict({"a": alone, "b": Discrete(3)}), Tuple((alone, alone))):
+            samples = [space.sample() for _ in range(3)]
+            together = concatenate(space, samples, create_empty_array(space, 3))
+            shared = create_shared_memory(space, 3)
+            for row, sample in enumerate(samples):
+                write_to_shared_memory(space, row, sample, shared)
+            for batch in (batch_space(space, 3), batch_differing_spaces([space] * 3)):
+                for read in (together, read_from_shared_memory(space, shared, 3)):
+                    rows = [*iterate(batch, read)]
+                    assert len(rows) == 3 and all(map(data_equivalence, rows, samples)), space
+            flat = flatten(space, samples[0])
+            assert flat in flatten_space(space) and flat.shape == (flatdim(space),)
+            assert data_equivalence(unflatten(space, flat), samples[0])
+            assert copy.deepcopy(space) == pickle.loads(pickle.dumps(space)) == space
+        same = pickle.loads(pickle.dumps(alone))
+        for name in ("features", "evenly_spaced"):
+            assert getattr(same, name, None) == getattr(alone, name, None)
+
+
+def test_spaces__in_models_that_1_0_0_saved_are_read() -> None:
+    env = EthBrakeEnv(actions=5)
+    now = b"gymnasium.spaces.box\nBox", b"gymnasium.spaces.discrete\nDiscrete"
+    then = b"ethbrake_marl.faces.spaces\nFeatureBox", b"ethbrake_marl.faces.actions\nIndices"
+    for space, name, old_name in zip((env.observation_space, env.action_space), now, then, strict=True):
+        saved = pickle.dumps(space, 0)
+        assert name in saved
+        read = pickle.loads(saved.replace(name, old_name))
+        assert read == space and vars(read).keys() == vars(space).keys()
+
+
+@pytest.mark.parametrize("vector", [SyncVectorEnv, pytest.param(AsyncVectorEnv, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("mode", ["same", "different"])
+@pytest.mark.parametrize("settings", [{}, {"actions": 5}], ids=str)
+def test_vectors_of_gymnasium__take_single_environments(vector: Any, mode: str, settings: dict[str, Any]) -> None:
+    env = vector([partial(EthBrakeEnv, **settings)] * 2, observation_mode=mode)
+    observations = env.reset(seed=[3, 4])[0]
+    assert observations.tolist() == EthBrakeVectorEnv(2).reset(seed=[3, 4])[0].tolist()
+    env.step(env.action_space.sample())
+    env.close()
+
+
+SUPERSUIT: list[Callable[[Any], Any]] = [
+    lambda env: supersuit.frame_skip_v0(env, 2), lambda env: supersuit.frame_stack_v1(env, 3),
+    lambda env: supersuit.frame_stack_v2(env, 3), lambda env: supersuit.sticky_actions_v0(env, 0.3),
+    lambda env: supersuit.delay_observations_v0(env, 2), lambda env: supersuit.max_observation_v0(env, 2),
+    lambda env: supersuit.clip_reward_v0(env), lambda env: supersuit.dtype_v0(env, np.float64),
+    lambda env: supersuit.flatten_v0(env), lambda env: supersuit.agent_indicator_v0(env),
+    lambda env: supersuit.pad_observations_v0(env), lambda env: supersuit.pad_action_space_v0(env),
+    lambda env: supersuit.nan_zeros_v0(env), lambda env: supersuit.clip_actions_v0(env),
+    lambda env: supersuit.scale_actions_v0(env, 0.5), lambda env: supersuit.normalize_obs_v0(env),
+    lambda env: supersuit.nan_random_v0(env),
+]  # fmt: skip  # without black_death_v3, for which an episode ends only if it is terminated and truncated
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_supersuit__wraps_both_forms() -> None:
+    chosen = {"scenario": "cooperation-3-pair", "agents": "learners"}
+    for wrap in SUPERSUIT:
+        env = wrap(EthBrakeParallelEnv(**chosen))
+        env.reset(seed=1)
+        while env.agents:
+            env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        turns = wrap(raw_env(**chosen))
+        turns.reset(seed=1)
+        for agent in turns.agent_iter():
+            over = np.any(turns.last()[2:4])
+            turns.step(None if over else turns.action_space(agent).sample())
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_supersuit__a_seed_repeats_the_numbers_of_skipped_frames() -> None:
+    def times(seed: int) -> list[float]:
+        env = supersuit.frame_skip_v0(EthBrakeParallelEnv(agents="learners"), (2, 5))
+        env.reset(seed=seed)
+        taken = []
+        while env.agents:
+            taken.append(env.step({"vehicle_2": np.zeros(1, np.float32)})[4]["vehicle_2"]["time_s"])
+        return taken
+
+    assert times(3) == times(3) != times(4)
+    assert EthBrakeParallelEnv().np_random.random() < 1.0  # before a reset
+
+
+REFUSED: list[Callable[[], Any]] = [
+    lambda: EthBrakeVectorEnv(4, scenario="nope"), lambda: EthBrakeVectorEnv(0),
+    lambda: EthBrakeVectorEnv(2, render_mode="human"), lambda: EthBrakeVectorEnv(2, actions=1),
+    lambda: EthBrakeEnv("nope"), lambda: EthBrakeParallelEnv("nope"), lambda: raw_env("nope"),
+    lambda: gymnasium.make_vec("EthBrake-v1", 2, scenario="nope"), lambda: make_sb3_vec_env("nope", 2),
+]  # fmt: skip
+
+
+def test_close__of_what_was_never_opened_does_nothing() -> None:
+    for make in REFUSED:
+        with pytest.raises(InvalidInput):
+            make()
+    gc.collect()  # an error in __del__ would be a warning, and so a failure
+
+
+@pytest.mark.parametrize("kind", [EthBrakeEnv, EthBrakeParallelEnv, EthBrakeVectorEnv, EthBrakeVecEnv])
+def test_close__before_the_constructor_and_twice_does_nothing(kind: Any) -> None:
+    unopened = kind.__new__(kind)
+    unopened.close()
+    unopened.close()
+
+
+def test_an_old_pettingzoo__is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(pettingzoo, "parallel_registry")
+    with pytest.raises(MissingExtra, match=r"needs pettingzoo 1.27 or newer; 1\..* is installed"):
+        register_environments()

@@ -68,11 +68,13 @@ class Words(Viewer):
         return scene.text()
 
 
-def import_pygame() -> Any:
-    """Import the module pygame of the package pygame-ce.
+def import_pygame(many: bool = False) -> Any:
+    """Import the module pygame of the package pygame-ce, which draws the window of one world.
 
-    Raises ``MissingExtra`` without a module, and ``InvalidInput`` if the package pygame has put its module there.
+    Raises ``MissingExtra``, or ``InvalidInput`` for ``many`` worlds and if the package pygame has put its module there.
     """
+    if many:
+        raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
     need("pygame")
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     with warnings.catch_warnings():
@@ -95,7 +97,7 @@ class Window(Viewer):
     def __init__(self, environment: Any) -> None:
         super().__init__(environment)
         if self.many:
-            raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
+            self.check(many=True)
         self.window: Any = None
         self.closed = False
 

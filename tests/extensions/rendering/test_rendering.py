@@ -192,6 +192,7 @@ def modes(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> li
 def test_render_modes__are_those_that_work_here_and_the_checkers_of_libraries_pass(modes: list[str]) -> None:
     made = gymnasium.make("EthBrake-v1")
     assert sorted(made.metadata["render_modes"]) == modes
+    assert sorted(EthBrakeVectorEnv(2).metadata["render_modes"]) == ["ansi", "rgb_array"]  # not human
     assert sorted(EthBrakeParallelEnv.metadata["render_modes"]) == sorted(raw_env().metadata["render_modes"]) == modes
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*not within.*")
