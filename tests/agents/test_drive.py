@@ -11,10 +11,12 @@ import pytest
 from ethbrake_marl.agents.drive import Team, drive, play, propose, to_action, to_command
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.errors import AgentFailed, InvalidInput
+from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
+from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
-from ethbrake_marl.names import open_game, register_agent
+from ethbrake_marl.names import make_agent, open_game, register_agent
 from ethbrake_marl.shields.step import StepShield
 from tests.refused import refused
 
@@ -98,6 +100,22 @@ def test_a_team__is_made_of_agents(drivers: Any, message: str) -> None:
     assert list(team.drivers) == [2, 3] and drive(PAIR[1], PAIR[0].sample(2, 7), team).ended.all()
 
 
+SCRIPTED = PAPER.replace(roles=dict.fromkeys(PAPER.vehicle_names, "full_brake"))
+
+
+@pytest.mark.parametrize("name", ["coast+step", "full_brake+step", "ppo+step"])
+def test_a_shield__without_a_learner_is_refused(name: str) -> None:
+    scenario, game = open_game(SCRIPTED)
+    for team in (make_agent(name, scenario=scenario), shield(Held("coast"), scenario=scenario)):
+        with refused("the scenario has no learner that its shield could guard; leave out the shield"):
+            drive(game, scenario.sample(2, 7), team)
+    assert drive(game, scenario.sample(2, 7), team._replace(shield=None)).ended.all()
+    with refused("mode 'episode' needs the policy of exactly one learner, not of 0"):
+        make_agent("coast+episode", scenario=scenario)
+    with refused("scenario 'paper-random' has no learner that the agents could drive"):
+        evaluate(SCRIPTED, name, episodes=2)
+
+
 def test_a_shield_of_the_game__is_never_dropped() -> None:
     game = GAME._replace(shield=StepShield())
     with refused("the game has a shield of its own; put it around the team instead"):
@@ -137,6 +155,41 @@ def test_what_an_agent_must_not_do__is_refused_with_its_name_and_vehicle(message
     with refused(message) as caught:
         drive(GAME, PAPER.sample(2, 7), Team("mine", {2: Gives(BAD[message])}))
     assert str(caught.value).startswith("agent 'gives', ")
+
+
+FAULTS: dict[str, Any] = {  # what the message says after the vehicle: what the agent answers
+    ": act returned 'nothing'": lambda state: "nothing",
+    ": act fails: ZeroDivisionError": lambda state: 1 / 0,
+    ": its commands are array(": lambda state: (np.zeros(1), None),
+    ": its memory is array(": lambda state: (np.zeros(state.n), np.zeros(1)),
+    " at 0.10 s: command 99 m/s2": lambda state: (np.where(np.arange(state.n) == 1, 99.0, 0.0), None),
+}
+
+
+@pytest.mark.parametrize("body", [1, 2, 3])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_error__names_the_vehicle_and_the_world_whatever_the_others_do(fault: str, body: int) -> None:
+    scenario, game = open_game("cooperation-4-all")
+    scenario, game = open_game(scenario.replace(latency_s=0.1))
+    drivers = {each: Gives(FAULTS[fault]) if each == body else Held("coast") for each in (1, 2, 3)}
+    where = f"world 6, vehicle_{body}" if "command " in fault else f"vehicle_{body}"
+    with refused(f"agent 'gives', {where}{fault}", AgentFailed):
+        drive(game, scenario.sample(3, 7, first=5), Team("mine", drivers))
+
+
+class Breaks(Gives):
+    """Fails at the alert."""
+
+    def begin(self, alert: State, body: int) -> None:
+        raise LookupError("mine")
+
+
+@pytest.mark.parametrize("body", [1, 3])
+def test_error_at_the_alert__names_the_vehicle(body: int) -> None:
+    scenario, game = open_game("cooperation-4-all")
+    drivers = {each: Breaks(None) if each == body else Held("coast") for each in (1, 2, 3)}
+    with refused(f"agent 'gives', vehicle_{body}: begin fails: LookupError: mine", AgentFailed):
+        drive(game, scenario.sample(3, 7), Team("mine", drivers))
 
 
 @pytest.mark.parametrize("role", ["constant:20", "constant:-20"])

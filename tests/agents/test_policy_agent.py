@@ -25,6 +25,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from ethbrake_marl.agents.drive import Agent, Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent, policy_agent
+from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
@@ -404,6 +405,31 @@ BEYOND: dict[str, Any] = {
 def test_answer_out_of_range__is_refused_with_world_and_time(message: str) -> None:
     with refused(f"agent 'mine', world 3, vehicle_2 at 0.50 s: {message}", AgentFailed):
         harms(policy_agent(lambda seen: np.where(np.arange(len(seen)) == 3, BEYOND[message], 0.0), name="mine"))
+
+
+ANSWERS: dict[str, Any] = {  # what the message says after the vehicle: what the policy answers
+    ": returned 'nothing', <U7 of shape ()": lambda seen: "nothing",
+    ": returned array([[0., 0.],": lambda seen: np.zeros((len(seen), 2)),
+    " at 0.50 s: action 7; must be a number": lambda seen: np.where(np.arange(len(seen)) == 1, 7.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("body", [2, 3])
+@pytest.mark.parametrize("message", ANSWERS)
+def test_answer__that_is_refused_names_the_vehicle_whatever_the_others_do(message: str, body: int) -> None:
+    scenario, game = open_game(open_game("cooperation-3-pair")[0].replace(latency_s=0.5))
+    good, bad = policy_agent(lambda seen: np.zeros(len(seen)), name="good"), policy_agent(ANSWERS[message], name="bad")
+    where = f"world 6, vehicle_{body}" if "action " in message else f"vehicle_{body}"
+    with refused(f"agent 'bad', {where}{message}", AgentFailed):
+        drive(game, scenario.sample(3, 7, first=5), Team("mine", {2: good, 3: good} | {body: bad}))
+
+
+@pytest.mark.parametrize("body", [2, 3])
+def test_answer__of_a_policy_with_a_state_names_the_vehicle(body: int) -> None:
+    scenario, game = open_game("cooperation-3-pair")
+    bad = policy_agent(lambda seen, state: seen[:, 0], initial_state=lambda n: np.zeros((n, 1)), name="bad")
+    with refused(f"agent 'bad', vehicle_{body}: returned array(", AgentFailed):
+        drive(game, scenario.sample(3, 7), Team("mine", {2: Held("coast"), 3: Held("coast")} | {body: bad}))
 
 
 @pytest.mark.parametrize(("index", "message"), [(5, "action 5"), (-1, "action -1"), (1.0, "float64 of shape (12,)")])

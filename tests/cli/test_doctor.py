@@ -1,15 +1,18 @@
 """``ethbrake doctor``: what it finds wrong, what it compiles."""
 
+import sys
 from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
 
 from ethbrake_marl import kernel_store
+import ethbrake_marl
 from ethbrake_marl.agents import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
 from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import drive_worlds
 from ethbrake_marl.worlds import catalogue
 from tests.fixtures.commands import Command, told_json
 
@@ -27,6 +30,23 @@ def test_doctor__a_sound_installation_is_ok(ethbrake: Command) -> None:
     assert [line.split()[1] for line in lines] == [check["name"].split()[0] for check in checks]
     names = {check["name"] for check in checks}
     assert names >= {"python", "numpy", "torch", "physics", "baseline", "scenarios", "kernel cache"}
+
+
+def test_doctor__names_the_folders_that_are_used() -> None:
+    (own,) = ethbrake_marl.__path__
+    assert found("ethbrake_marl")[1] == f"{ethbrake_marl.__version__} in {own}"
+    assert found("python")[1].endswith(f" at {sys.executable}")
+    assert Path(found("kernel cache")[1]) in Path(drive_worlds.stats.cache_path).parents
+    shipped = [entry.path.parent.parent for entry in catalogue.list_scenarios() if entry.shipped]
+    assert found("scenarios")[1] == f"{len(shipped)} in {shipped[0]}" and len({*shipped}) == 1
+
+
+@pytest.mark.usefixtures("empty_folder")
+def test_compiling__leaves_nothing_in_the_current_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "_DOORS", [("scenario", "new", "mine")])
+    monkeypatch.setattr(doctor, "_IN_PYTHON", "open('worlds.csv', 'w').close()")
+    done, told = doctor.compile_ahead(training=False)
+    assert done and told.startswith("all kernels compiled in ") and [*Path().iterdir()] == []
 
 
 @pytest.mark.parametrize("form", [[], ["--json"]])

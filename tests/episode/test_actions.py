@@ -39,8 +39,9 @@ def test_action__is_a_share_of_the_capacity_of_its_side(action: tuple[float, flo
 
 
 def test_action__further_beyond_is_refused() -> None:
-    with pytest.raises(InvalidInput, match=r"action of vehicle_1 = 1\.0000003"):
-        stepped(1.0000003, 0.0)
+    for body, action in (("vehicle_1", (1.0000003, 0.0)), ("vehicle_2", (0.0, 1.0000003))):
+        with pytest.raises(InvalidInput, match=rf"action of {body} = 1\.0000003"):
+            stepped(*action)
 
 
 @pytest.mark.parametrize(

@@ -163,6 +163,10 @@ def test_features__are_the_functions_scaled_and_clipped_and_unknown_where_nobody
     ("later", "message"),
     [
         (lambda after: np.array([0.0, 0.0, np.nan]), "its value is nan in row 2 at 0.6 s; must be finite"),
+        (
+            lambda after: np.array([[0.0] * 3, [0.0, 0.0, np.inf], [0.0] * 3]),
+            "its value is inf for vehicle_3 in row 1 at 0.6 s; must be finite",
+        ),
         (lambda after: after.speed_mps, r"its function fails: AttributeError: .*test_extending.py, line \d+"),
         (lambda after: after.line.fill(0.0), "its function fails: ValueError: .*read-only"),
         (lambda after: np.zeros((3, 4)), r"its function returned float64 of shape \(3, 4\); must return numbers"),

@@ -301,6 +301,7 @@ BAD = [
     ({"allowance": "1"}, "allowance = '1'"),
     ({"cap": "own"}, "cap = 'own'"),
     ({"drivers": {2: 4}}, "policy of vehicle_2 = 4"),
+    ({"drivers": {2: Held("coast"), 3: 4}}, "policy of vehicle_3 = 4"),
 ]
 
 

@@ -242,6 +242,10 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "uncertainty = 0.1: must be a text": lambda: RobustShield(uncertainty=0.1),
     "the first decision may be as late as 1000.5 s": lambda: first(PAPER, uncertainty="latency_s.vehicle_2=1000"),
+    "vehicle_3 of world 1 is to accelerate with -5.5 m/s2, which may be beyond its capacity": lambda: members(
+        "braking_capacity_mps2.vehicle_3=10%", State.join([
+            PAPER.replace(roles={"vehicle_3": role}).sample(1, 7) for role in ("constant:5", "constant:5.5")])
+    ),
     "vehicle_1 of world 0 is to accelerate with -5.9 m/s2, which may be beyond its capacity": lambda: members(
         "braking_capacity_mps2=10%", PAPER.replace(roles={"vehicle_1": "constant:5.9"}).sample(1, 7)
     ),

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 
+import jsonschema
 import numpy as np
 import pytest
 
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.explain import sentences
+from ethbrake_marl.worlds.explain import scenario_json_schema, sentences
 from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.extensions.messages.line import LINE
@@ -64,6 +65,31 @@ REFUSED = {
 def test_what_cannot_be__is_refused(message: str) -> None:
     with refused(message):
         REFUSED[message]()
+
+
+def one(pieces: object) -> object:
+    return {"vehicle_2": pieces}
+
+
+LISTS: list[tuple[object, bool]] = [
+    ([], True), (["mass"], True), (["place", "mass"], True), (["mass", "mass"], False), (["mass", "place", "mass"], False),
+    (["plce"], False), ("mass", False), ([["mass"]], False), ({}, False), (None, False),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("form", [lambda pieces: pieces, one], ids=["for all vehicles", "by name"])
+@pytest.mark.parametrize(("pieces", "right"), LISTS, ids=str)
+def test_schema__accepts_the_lists_of_contents_that_the_reader_accepts(
+    pieces: object, right: bool, form: Callable[[object], object]
+) -> None:
+    editor = jsonschema.Draft202012Validator(scenario_json_schema())
+    v2x = {**PERIODIC, "tells": form(pieces)}
+    assert editor.is_valid({"name": "x", "v2x": v2x}) == right
+    if right:
+        PAPER.replace(v2x=v2x)
+    else:
+        with refused("v2x.tells"):
+            PAPER.replace(v2x=v2x)
 
 
 def test_scenario__says_what_is_declared_and_can_be_made_of_it() -> None:

@@ -108,7 +108,12 @@ def wrong(ends: slice, scale: float) -> Callable[[], object]:
     return lambda: problem.follow(Profiles(profiles.ends[ends], scale * np.abs(profiles.commands_mps2)))
 
 
-def of(bodies: Any, name: str = "paper-random", objective: str = "total") -> Callable[[], object]:
+def reacting(vehicle: str) -> eb.Scenario:
+    roles = {"vehicle_2": "learner", vehicle: "ppo"}
+    return eb.load_scenario("paper-random").replace(early_impacts="keep", roles=roles)
+
+
+def of(bodies: Any, name: str | eb.Scenario = "paper-random", objective: str = "total") -> Callable[[], object]:
     scenario, game = eb.open_game(name)
     return lambda: problem_of(game, scenario.sample(2, 7), bodies, objective=objective)
 
@@ -118,6 +123,11 @@ REFUSED: dict[str, Callable[[], object]] = {
     "command 99 m/s2 of vehicle_2 in row 0; must be in [-7, 7] m/s2": lambda: of([2])().follow(
         of([2])().constant(np.full((2, 1, 1), 99.0))
     ),
+    "command 9 m/s2 of vehicle_3 in row 1; must be in [-6, 6] m/s2": lambda: of([2, 3])().follow(
+        of([2, 3])().constant(np.array([[[0.0, 0.0]], [[0.0, 9.0]]]))
+    ),
+    "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": of([2], reacting("vehicle_3")),
+    "vehicle_1 is driven by 'ppo', whose commands are not known at the alert": of([2], reacting("vehicle_1")),
     "profiles: ends must not decrease": lambda: of([2])().follow(Profiles(np.array([[9, 3]] * 2), np.zeros((2, 2, 1)))),
     "vehicles [4]: must be one or more of 1 to 3, each once": of([4]),
     "vehicles []: must be one or more of 1 to 3, each once": of([]),
