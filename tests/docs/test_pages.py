@@ -10,9 +10,13 @@ from tests.docs.printed import PAGES, ROOT
 WITH_BLOCKS = [page for page in PAGES if blocks(page)]
 
 
-@pytest.mark.usefixtures("empty_folder")
+@pytest.mark.filterwarnings("ignore::UserWarning:minari")
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda path: path.relative_to(ROOT).as_posix())
-def test_page__its_blocks_run_and_print_what_it_shows(page: Path, request: pytest.FixtureRequest) -> None:
+def test_page__its_blocks_run_and_print_what_it_shows(
+    page: Path, empty_folder: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> None:
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(empty_folder))
     reader = Reader(request.config.getoption("all"))
     for block in blocks(page):
         reader.read(block)
