@@ -6,8 +6,8 @@ from unittest.mock import Mock
 
 import pytest
 
-from ethbrake_marl import kernel_store
 import ethbrake_marl
+from ethbrake_marl import kernel_store
 from ethbrake_marl.agents import pairwise
 from ethbrake_marl.cli import doctor
 from ethbrake_marl.cli.doctor import Check, diagnose
