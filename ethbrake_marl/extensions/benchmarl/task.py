@@ -103,16 +103,12 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         else:
             rows = np.flatnonzero(mask.numpy().reshape(-1))
             self.episode = self.episode.put(rows, self.stream.next_episodes(len(rows)), donate=True)
-        if self.renderer is not None:
-            self.renderer.stepped(self.episode.take([0]))
         return TensorDict(self._observe(), batch_size=self.batch_size)
 
     def _step(self, tensordict: Any) -> Any:
         shape = self.batch_size[0], len(self.learners)
         actions = checked_actions(tensordict[GROUP, "action"].numpy(), shape, "the learners", self.actions)
         self.episode, step = self.game.step(self.episode, actions, donate=True)
-        if self.renderer is not None:
-            self.renderer.stepped(self.episode.take([0]))
         terminated, truncated = step.terminated, step.truncated
         if self.horizon_is_end:
             terminated, truncated = terminated | truncated, np.zeros_like(truncated)
@@ -134,6 +130,8 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
             self.stream.seed, self.stream.next = chosen_seed(seed), 0
 
     def _observe(self) -> dict[str, Any]:
+        if self.renderer is not None:
+            self.renderer.stepped(self.episode.take([0]))
         seen = torch.from_numpy(self.game.observe_alike(self.episode, self.learners))
         own = TensorDict({"observation": seen}, batch_size=seen.shape[:2])
         return {GROUP: own, "state": torch.from_numpy(full_state(self.episode, *self.of_state))}
@@ -148,8 +146,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
     @property
     def scenario(self) -> Scenario:
         """The scenario of ``config``, which may be changed to another one, its name, or the path of its file."""
-        self.config["scenario"] = load_scenario(self.config["scenario"])
-        return self.config["scenario"]
+        return load_scenario(self.config["scenario"])
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """Return a function that creates a ``LineEnv``. ``device`` is unused.
