@@ -104,7 +104,6 @@ def test_train__is_the_same_twice_and_leaves_the_global_generators(tmp_path: Pat
     assert load_policy(tmp_path / "one/policy-last").manifest.weights_sha256 != other.weights_sha256
 
 
-<<<<<<< HEAD
 REMAINDERS: dict[str, tuple[str, dict[str, Any], list[int], list[int]]] = {  # training, change, measured, rows
     "one update more": ("ppo", {"total_steps": 7 * UPDATE}, [0, 3, 6, 7], [*range(8)]),
     "a part of an update": ("ppo", {"total_steps": 3 * UPDATE + 1}, [0, 3, 4], [*range(5)]),
@@ -130,7 +129,8 @@ def test_train__an_end_between_two_measurements_or_rows_is_measured_and_stored(c
     for vehicle, policy in result.last_policies.items():
         assert policy.manifest.steps == last[vehicle].manifest.steps == same[vehicle].manifest.steps == result.steps
         assert policy.manifest.weights_sha256 == same[vehicle].manifest.weights_sha256
-=======
+
+
 @pytest.mark.parametrize("default", [torch.float64, torch.float16, torch.bfloat16, "meta", "inside"], ids=str)
 @pytest.mark.parametrize("recipe", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
 def test_train__has_the_same_bits_whatever_torchs_defaults_are(
@@ -155,7 +155,6 @@ def test_train__has_the_same_bits_whatever_torchs_defaults_are(
     finally:
         torch.set_default_dtype(torch.float32)
         torch.set_default_device(None)
->>>>>>> h-cli
 
 
 @pytest.mark.parametrize(("count", "best"), [("first", 3), ("total", 6)])

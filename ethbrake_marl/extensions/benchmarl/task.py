@@ -129,15 +129,10 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         if seed is not None:
             self.stream = self.stream._replace(seed=chosen_seed(seed), next=0)
 
-<<<<<<< HEAD
     def _observe(self, state: State) -> dict[str, Any]:
-        seen = torch.from_numpy(self.game.observe_alike(state, self.learners))
-=======
-    def _observe(self) -> dict[str, Any]:
         if self.renderer is not None:
-            self.renderer.stepped(self.episode.take([0]))
-        seen = torch.from_numpy(self.game.observe_alike(self.episode, self.learners))
->>>>>>> h-cli
+            self.renderer.stepped(state.take([0]))
+        seen = torch.from_numpy(self.game.observe_alike(state, self.learners))
         own = TensorDict({"observation": seen}, batch_size=seen.shape[:2])
         return {GROUP: own, "state": torch.from_numpy(full_state(state, *self.of_state))}
 
