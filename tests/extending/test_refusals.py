@@ -120,7 +120,9 @@ def test_feature__gives_a_finite_number_per_world(given: Any, message: str) -> N
 
 @pytest.mark.parametrize("body", [2, 3])
 def test_feature_or_objective__that_is_wrong_for_one_vehicle_names_it(body: int) -> None:
-    eb.register_feature("mine", gives(lambda state, other: np.full(state.n, np.nan if other == body else 0.0)), **SCALED)
+    eb.register_feature(
+        "mine", gives(lambda state, other: np.full(state.n, np.nan if other == body else 0.0)), **SCALED
+    )
     with refused(f"feature 'mine' of vehicle_{body}: its value is nan in row 0 at 0.5 s"):
         eb.parallel_env(scenario=PAPER, observation=["mine"]).reset(seed=1)
     eb.register_objective("mine", gives(lambda harm, place: harm.whole * (np.nan if place == body - 1 else 1.0)))

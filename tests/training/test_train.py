@@ -333,7 +333,7 @@ class Gambling(A2c):
         def gamble() -> None:
             learn()
             with torch.no_grad():
-                model.policy.action_net.bias += random.random() + np.random.rand() + torch.rand(1)  # noqa: NPY002, S311
+                model.policy.action_net.bias += random.random() + np.random.rand() + torch.rand(1)  # noqa: NPY002
 
         model.train = gamble  # type: ignore[method-assign]
         return model

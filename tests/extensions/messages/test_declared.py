@@ -72,7 +72,8 @@ def one(pieces: object) -> object:
 
 
 LISTS: list[tuple[object, bool]] = [
-    ([], True), (["mass"], True), (["place", "mass"], True), (["mass", "mass"], False), (["mass", "place", "mass"], False),
+    ([], True), (["mass"], True), (["place", "mass"], True), (["mass", "mass"], False),
+    (["mass", "place", "mass"], False),
     (["plce"], False), ("mass", False), ([["mass"]], False), ({}, False), (None, False),
 ]  # fmt: skip
 
