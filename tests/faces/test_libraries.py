@@ -36,7 +36,7 @@ from stable_baselines3.common.env_checker import check_env as check_for_sb3
 
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import RewardParams
-from ethbrake_marl.errors import InvalidInput, MissingExtra
+from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env
 from ethbrake_marl.faces.registration import register_environments
@@ -279,9 +279,3 @@ def test_close__before_the_constructor_and_twice_does_nothing(kind: Any) -> None
     unopened = kind.__new__(kind)
     unopened.close()
     unopened.close()
-
-
-def test_an_old_pettingzoo__is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(pettingzoo, "parallel_registry")
-    with pytest.raises(MissingExtra, match=r"needs pettingzoo 1.27 or newer; 1\..* is installed"):
-        register_environments()

@@ -84,8 +84,8 @@ def import_pygame(many: bool = False) -> Any:
     if not hasattr(getattr(pygame, "Window", None), "get_surface"):
         raise InvalidInput(
             f"render_mode = 'human': the module pygame {pygame.version.ver} has no Window: the package pygame has none,"
-            " the package pygame-ce has one; uninstall both, then install pygame-ce; or use gymnasium.make, which opens a"
-            " window with either"
+            " the package pygame-ce has one; uninstall both, then install pygame-ce; or use gymnasium.make, which opens"
+            " a window with either"
         )
     return pygame
 
