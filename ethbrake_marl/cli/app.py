@@ -91,11 +91,10 @@ def run_command(arguments: Sequence[str]) -> int:
         return _refuse(f"{message} (see: {where} --help)")
     except EthBrakeError as error:
         return _refuse(str(error))
-    except BrokenPipeError:
-        abandon_output()
-        return 1
     except OSError as error:
         abandon_output()
+        if isinstance(error, BrokenPipeError):
+            return 1
         return _refuse(f"{error.filename or 'output'!s:.200}: {error.strerror or error}")
     except MemoryError as error:
         return _refuse(f"not enough memory{f' ({error})' if str(error) else ''}; use fewer worlds at once")

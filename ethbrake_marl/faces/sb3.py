@@ -165,10 +165,11 @@ class EthBrakeVecEnv(Face, VecEnv):
             infos = [{} for _ in range(self.num_envs)]
         if len(ended):
             rows = (ended[:, np.newaxis] * len(self.bodies) + np.arange(len(self.bodies))).reshape(-1)
-            last = zip(rows.tolist(), self._last_infos(state, step, ended), seen[rows], strict=True)
-            for row, info, observation in last:
-                episode = {"r": returns[row].item(), "l": steps[row].item(), "t": 0.0}
-                infos[row] = {**info, "terminal_observation": observation, "episode": episode}
+            sums = returns[rows].tolist(), steps[rows].tolist()
+            last = zip(rows.tolist(), self._last_infos(state, step, ended), seen[rows], *sums, strict=True)
+            for row, info, observation, gained, length in last:
+                info["terminal_observation"], info["episode"] = observation, {"r": gained, "l": length, "t": 0.0}
+                infos[row] = info
             stream, new = stream.next_episodes(ended)
             seen[rows], returns[rows], steps[rows] = self._observe(new), 0.0, 0
             state, first = (put(each, ended, new, donate=self.render_mode is None) for each in (state, first))
@@ -183,7 +184,9 @@ class EthBrakeVecEnv(Face, VecEnv):
         step = step._replace(reward=step.reward[ended], out=step.out[:, ended], terms=terms)
         cut = (step.truncated & (not self.horizon_is_end)).repeat(len(self.bodies)).tolist()
         infos = self._infos(self.stream, state.take(ended), step)
-        return [{**info, "TimeLimit.truncated": truncated} for info, truncated in zip(infos, cut, strict=True)]
+        for info, truncated in zip(infos, cut, strict=True):
+            info["TimeLimit.truncated"] = truncated
+        return infos
 
     @property
     def reset_infos(self) -> list[dict[str, Any]]:

@@ -29,7 +29,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
 
     Args:
         num_envs: number of worlds.
-        scenario: as in ``EthBrakeParallelEnv``; so are ``learners``, ``reward``, ``observation``, ``actions`` and
+        scenario: as in ``EthBrakeParallelEnv``; so are ``learners``, ``reward``, ``observation``, ``actions``,
             ``reward_vector`` and ``report``.
         render_mode: a mode of ``metadata["render_modes"]``; ``render`` returns one picture per world.
         autoreset_mode: Gymnasium's ``NextStep`` (the step after the last one of an episode starts the next episode,
@@ -92,19 +92,19 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         numbers[renewed] = 0.0  # the action of a row that begins again is ignored
         state, step = self._advance(numbers)
         stream, seen, columns = self.stream, self._observe(state), self._columns(self.stream, state, step)
-        infos = dict[str, Any]()
+        infos = masked(columns, np.ones(self.num_envs, np.bool_))
         if same and state.ended.any():
             renewed, final = state.ended, np.full(self.num_envs, None, dtype=object)
             for row, last in zip(np.flatnonzero(renewed), seen[renewed], strict=True):
                 final[row] = last
-            infos = {"final_obs": final, "_final_obs": renewed}
+            infos |= {"final_obs": final, "_final_obs": renewed}
             infos |= {"final_info": masked(columns, renewed), "_final_info": renewed.copy()}
         if renewed.any():
             stream, new = stream.next_episodes(np.flatnonzero(renewed))
             seen[renewed] = self._observe(new)
-            columns = put(columns, renewed, self._columns(stream, new, None, renewed))
+            fresh = self._columns(stream, new, None, renewed)
+            put({name: infos[name] for name in fresh}, renewed, fresh, donate=True)
             state = state.put(renewed, new, donate=self.render_mode is None)
-        infos |= masked(columns, np.ones(self.num_envs, np.bool_))
         self._keep(stream, state, self.renderer.stepped)
         return seen, self._rewards(step)[:, 0], step.terminated, step.truncated, infos
 

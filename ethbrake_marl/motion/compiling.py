@@ -87,7 +87,7 @@ class _Cache(NullCache):  # type: ignore[misc]
         return load(name, lambda data: CompileResult._rebuild(target_context, *pickle.loads(data)))  # noqa: S301
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        if not data.library.has_dynamic_globals:  # addresses in this process
+        if not data.library.has_dynamic_globals and " at 0x" not in repr(sig):  # addresses in this process
             save(self._name(sig, data.codegen), dumps(data._reduce()))
 
 

@@ -53,8 +53,11 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     """
     scenario, where = load_scenario(scenario), "initial states"
     columns = columns.collect() if hasattr(columns, "collect") else columns  # a LazyFrame of polars
-    names = columns if isinstance(columns, Mapping) else _column_names(columns)
-    if names is None:
+    names: Any = columns  # or the attribute of pyarrow, of a frame, or of a structured array
+    if not isinstance(columns, Mapping):
+        of_array = getattr(getattr(columns, "dtype", None), "names", None)
+        names = getattr(columns, "column_names", getattr(columns, "columns", of_array))
+    if not hasattr(names, "__len__"):
         raise InvalidInput(
             f"{where}: type {type(columns).__name__}: must be a mapping from columns to lists of numbers, a pandas or"
             " polars frame, a pyarrow table, or a structured array of numpy"
@@ -74,18 +77,12 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     return _worlds(scenario, dict(zip(entries, arrays, strict=True)), where, lambda row: f", row {row}")
 
 
-def _column_names(table: Any) -> Sequence[Any] | None:
-    """Return the names of the columns of a structured array, a pyarrow table or a frame; None for anything else."""
-    if isinstance(table, np.ndarray):
-        return None if isinstance(table, np.ma.MaskedArray) else table.dtype.names
-    names = getattr(table, "column_names", getattr(table, "columns", None))
-    return names if hasattr(table, "__getitem__") and hasattr(names, "__len__") else None
-
-
 def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
     """Worlds from a CSV file with the columns of ``worlds_from_table``. Errors name file, line and column."""
     if not isinstance(path, str | Path):
-        raise InvalidInput(f"path = {_shown(path)}: must be the path of a CSV file; worlds_from_table reads a table")
+        raise InvalidInput(
+            f"path: type {type(path).__name__}: must be the path of a CSV file; worlds_from_table reads a table"
+        )
     scenario, file = load_scenario(scenario), CsvFile.read(Path(path).expanduser())
     entries = _entries(file.header, scenario, f"{file.path}, line 1")
     table = np.array(file.cells(file.header), np.float64)
@@ -175,11 +172,9 @@ def _worlds(
 
 
 def _shown(value: Any) -> str:
-    """Return a value for a message; of an array, a column or a table only its type."""
-    if isinstance(value, str | float | int | list | tuple | None):
-        return f"{value!r:.60}"
+    """Return a value for a message; of an array or a column only its type."""
     kind = getattr(value, "dtype", getattr(value, "type", None))
-    return type(value).__name__ + (f" of {kind}" if kind is not None else "")
+    return f"{value!r:.60}" if kind is None else f"{type(value).__name__} of {kind}"
 
 
 def _numbers(what: str, value: Any) -> Floats:

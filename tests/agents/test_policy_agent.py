@@ -132,6 +132,13 @@ def test_torch_module__drives_without_gradients() -> None:
     assert harms(policy_agent(still)) == harms(policy_agent(still))
 
 
+@pytest.mark.parametrize("kind", [torch.float64, torch.float16, torch.bfloat16], ids=str)
+def test_torch_module__of_another_type_drives(kind: torch.dtype) -> None:
+    net = small_net()
+    expected = harms(policy_agent(net))
+    assert harms(policy_agent(net.to(kind))) == pytest.approx(expected, rel=0.2, abs=5.0)
+
+
 def test_model__drives_as_in_its_own_librarys_rollout() -> None:
     model = stable.PPO("MlpPolicy", rows(4), n_steps=8, batch_size=16, seed=1).learn(64)
     env = EthBrakeEnv()

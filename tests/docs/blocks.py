@@ -331,7 +331,8 @@ def check_target(words: list[str]) -> None:
     targets = re.findall(r"(?m)^([a-z]+):", (ROOT / "Makefile").read_text("utf-8"))
     unknown = [word for word in words if "=" not in word and word not in targets]
     assert not unknown, f"make {shlex.join(words)}: no target {', '.join(unknown)}"
-    told = subprocess.run(["make", "-n", *words], cwd=ROOT, capture_output=True, text=True, check=True)
+    asked = ["make", "-n", "--no-print-directory", *words]
+    told = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=True)
     if words[0] == "programme":
         listed = io.StringIO()
         with contextlib.redirect_stdout(listed):

@@ -16,7 +16,7 @@ from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.evaluation.compare import compare_results
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.results import read_result, write_results, write_rows
-from ethbrake_marl.evaluation.statistics import difference
+from ethbrake_marl.evaluation.statistics import difference, mean, unpaired
 from ethbrake_marl.evaluation.summary import summarise
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Foreteller, evaluated, recorded
@@ -169,6 +169,24 @@ def test_comparison__is_paired_by_world_where_both_have_rows(tmp_path: Path) -> 
     assert found == compare_results(one, other)
     notes = " ".join(found.notes())
     assert "paired by world." in notes and "Only in the first result: coast." in notes
+
+
+@pytest.mark.parametrize("stored", [False, True])
+@pytest.mark.parametrize("rows", ["csv", None])
+def test_comparison__is_of_each_agent_with_itself_in_whatever_order(rows: Any, stored: bool, tmp_path: Path) -> None:
+    one = evaluated("paper-random", 40, [FULL_BRAKE, COAST, GENTLE])
+    full, coast, gentle = one.columns.values()
+    other = replace(one, columns={"constant:4.0": coast, "full_brake": full, "coast": gentle})
+    pair = [read_result(written(tmp_path / name, each, rows)) for name, each in (("1", one), ("2", other))]
+    found = compare_results(*(pair if stored or rows is None else (one, other)))
+    assert [*found.differences] == [*one.columns] and found.left_over == ((), ())
+    for agent, harms in found.differences.items():
+        for harm, estimate in harms.items():
+            after, before = other[agent][harm], one[agent][harm]
+            expected = difference(after, before) if rows else unpaired(mean(after), mean(before))
+            assert estimate.value == pytest.approx(expected.value) and estimate.interval == expected.interval
+    values = [harms["total_harm"].value for harms in found.differences.values()]
+    assert values[0] == 0.0 and values[1] < -10.0 and values[2] > 10.0
 
 
 def test_comparison__is_by_recording(tmp_path: Path) -> None:

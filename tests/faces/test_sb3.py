@@ -117,7 +117,7 @@ def test_settings__are_checked() -> None:
         make_sb3_vec_env("cooperation-3-pair", 1, observation={"vehicle_2": ["own"]})
     with refused("has no learner; pass learners=['vehicle_2']"):
         make_sb3_vec_env(CRASH.replace(roles={"vehicle_1": "coast", "vehicle_2": "coast"}), 1)
+    env = make_sb3_vec_env("paper-random", 4)
+    env.reset()
     with refused("action of the learners: has shape (3,); must have shape (4, 1)"):
-        env = make_sb3_vec_env("paper-random", 4)
-        env.reset()
         env.step([0.0] * 3)

@@ -176,7 +176,7 @@ def test_settings__are_checked() -> None:
         EthBrakeVectorEnv(0)
     with refused("has 2 learners (vehicle_2, vehicle_3); this environment needs exactly one learner"):
         EthBrakeVectorEnv(2, "cooperation-3-pair")
+    env = EthBrakeVectorEnv(3)
+    env.reset()
     with refused("action of the learners: has shape (2,); must have shape (3, 1)"):
-        env = EthBrakeVectorEnv(3)
-        env.reset()
         env.step([0.0, 0.0])

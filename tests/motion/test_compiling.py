@@ -295,6 +295,21 @@ def test_kernel__has_machine_code_for_each_type_of_its_argument(tmp_path: Path, 
         assert answers == [3, 3.0] and [type(each) for each in answers] == [int, float]
 
 
+def test_kernel__of_another_kernel_as_an_argument_is_not_stored(tmp_path: Path, monkeypatch) -> None:
+    """The name of such a type is an address in this process, at which the next one may have another kernel."""
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+
+    def called(one: Callable[[float], float], x: float) -> float:
+        return one(x)
+
+    assert compiling.large(called)(compiling.large(abs_of), -3.0) == 3.0
+    assert [path.name.partition("-")[0] for path in (tmp_path / "ethbrake_marl").iterdir()] == ["abs_of"]
+
+
+def abs_of(x: float) -> float:
+    return max(x, -x)
+
+
 # ---------------------------------------------------------------- the suite's own cache
 
 

@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -128,6 +129,32 @@ def test_train__an_end_between_two_measurements_or_rows_is_measured_and_stored(c
     for vehicle, policy in result.last_policies.items():
         assert policy.manifest.steps == last[vehicle].manifest.steps == same[vehicle].manifest.steps == result.steps
         assert policy.manifest.weights_sha256 == same[vehicle].manifest.weights_sha256
+
+
+@pytest.mark.parametrize("default", [torch.float64, torch.float16, torch.bfloat16, "meta", "inside"], ids=str)
+@pytest.mark.parametrize("recipe", ["ppo", pytest.param("sac", marks=pytest.mark.slow)])
+def test_train__has_the_same_bits_whatever_torchs_defaults_are(
+    default, recipe, tiny_recipe, tiny_sac, tmp_path
+) -> None:
+    def weights(name: str) -> bytes:
+        file = {"ppo": tiny_recipe, "sac": tiny_sac}[recipe]
+        train_module.train(file, "paper-random", tmp_path / name, measure=None, on_progress=None)
+        return (tmp_path / name / "policy" / "weights.safetensors").read_bytes()
+
+    expected = weights("as usual")
+    inside = torch.device("meta") if default == "inside" else nullcontext()
+    try:
+        if default == "meta":
+            torch.set_default_device(default)
+        elif default != "inside":
+            torch.set_default_dtype(default)
+        before = torch.get_default_dtype(), torch.get_default_device()
+        with inside:
+            assert weights("otherwise") == expected
+        assert (torch.get_default_dtype(), torch.get_default_device()) == before
+    finally:
+        torch.set_default_dtype(torch.float32)
+        torch.set_default_device(None)
 
 
 @pytest.mark.parametrize(("count", "best"), [("first", 3), ("total", 6)])

@@ -16,6 +16,7 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.faces.actions import action_space, checked_actions
+from ethbrake_marl.faces.rendering import RENDERERS, make_renderer
 from ethbrake_marl.faces.shield import NOBODY, guarded
 from ethbrake_marl.faces.spaces import feature_box
 from ethbrake_marl.faces.stream import Stream, chosen_seed
@@ -52,6 +53,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
     """
 
     episode: State
+    renderer: Any = None  # of the first world; None until `render` is called
 
     def __init__(
         self,
@@ -116,11 +118,20 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         self.episode = state
         return TensorDict(content, batch_size=self.batch_size)
 
+    def render(self, mode: str = "rgb_array") -> Any:
+        """Return a picture of the first world in the form that the render mode defines."""
+        if self.renderer is None:
+            self.renderer = make_renderer(self, mode)
+            self.renderer.began(self.episode.take([0]))
+        return self.renderer.render()
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
             self.stream = self.stream._replace(seed=chosen_seed(seed), next=0)
 
     def _observe(self, state: State) -> dict[str, Any]:
+        if self.renderer is not None:
+            self.renderer.stepped(state.take([0]))
         seen = torch.from_numpy(self.game.observe_alike(state, self.learners))
         own = TensorDict({"observation": seen}, batch_size=seen.shape[:2])
         return {GROUP: own, "state": torch.from_numpy(full_state(state, *self.of_state))}
@@ -131,6 +142,11 @@ class LineTask(TaskClass):  # type: ignore[misc]
 
     def __init__(self, name: str, config: dict[str, Any]) -> None:
         super().__init__(name, {**config, "scenario": load_scenario(config["scenario"])})
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario of ``config``, which may be changed to another one, its name, or the path of its file."""
+        return load_scenario(self.config["scenario"])
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
         """Return a function that creates a ``LineEnv``. ``device`` is unused.
@@ -153,15 +169,13 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return self.config.get("actions") is not None
 
     def max_steps(self, env: Any) -> int:
-        scenario: Scenario = self.config["scenario"]
-        return round(scenario.horizon_s / scenario.time_step_s) + 1
+        return round(self.scenario.horizon_s / self.scenario.time_step_s) + 1
 
     def has_render(self, env: Any) -> bool:
-        return False
+        return "rgb_array" in RENDERERS
 
     def group_map(self, env: Any) -> dict[str, list[str]]:
-        scenario: Scenario = self.config["scenario"]
-        return {GROUP: [scenario.vehicle_names[body - 1] for body in scenario.learners]}
+        return {GROUP: [self.scenario.vehicle_names[body - 1] for body in self.scenario.learners]}
 
     def observation_spec(self, env: Any) -> Any:
         spec = env.full_observation_spec_unbatched.clone()

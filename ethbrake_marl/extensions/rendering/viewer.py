@@ -71,7 +71,8 @@ class Words(Viewer):
 def import_pygame(many: bool = False) -> Any:
     """Import the module pygame of the package pygame-ce, which draws the window of one world.
 
-    Raises ``MissingExtra``, or ``InvalidInput`` for ``many`` worlds and if the package pygame has put its module there.
+    Raises ``MissingExtra``, or ``InvalidInput`` for ``many`` worlds, for an old pygame-ce, and if the package pygame
+    has put its module there.
     """
     if many:
         raise InvalidInput("render_mode = 'human': must be 'rgb_array' or 'ansi' for many worlds")
@@ -80,11 +81,11 @@ def import_pygame(many: bool = False) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the package pygame uses what Python will remove
         import pygame
-    if not hasattr(pygame, "Window"):
+    if not hasattr(getattr(pygame, "Window", None), "get_surface"):
         raise InvalidInput(
-            f"render_mode = 'human': the module pygame {pygame.version.ver} has no Window, because it belongs to the"
-            " package pygame, not to pygame-ce; uninstall both packages, then install pygame-ce; or use gymnasium.make,"
-            " which opens a window with either of them"
+            f"render_mode = 'human': the module pygame {pygame.version.ver} has no Window: the package pygame has none,"
+            " the package pygame-ce has one; uninstall both, then install pygame-ce; or use gymnasium.make, which opens"
+            " a window with either"
         )
     return pygame
 

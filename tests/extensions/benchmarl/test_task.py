@@ -9,6 +9,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.worlds.catalogue import scenario_path
 
 pytest.importorskip("benchmarl", reason="needs the extra marl")
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::UserWarning", "ignore::FutureWarning")
@@ -135,6 +136,66 @@ def test_task__with_actions_is_discrete_and_else_continuous() -> None:
         assert task.group_map(None) == {"learners": ["vehicle_2", "vehicle_3"]} and task.max_steps(None) == 81
         with pytest.raises(InvalidInput, match=f"task pair: continuous_actions = .* contradicts actions = {actions};"):
             task.get_env_fun(2, actions is not None, 0, "cpu")
+
+
+def test_task__takes_another_scenario_by_name_path_or_content(empty_folder: Path) -> None:
+    from ethbrake_marl.extensions.benchmarl.tasks import EthBrakeTask
+
+    four = eb.load_scenario("cooperation-4-all")
+    Path("cooperation-4-all.yaml").write_bytes(scenario_path("cooperation-4-all").read_bytes())
+    for scenario in ("cooperation-4-all", "./cooperation-4-all.yaml", Path("cooperation-4-all.yaml").resolve(), four):
+        task = EthBrakeTask.COOPERATION_3_PAIR.get_from_yaml()
+        task.config["scenario"] = scenario
+        names = [four.vehicle_names[body - 1] for body in four.learners]
+        assert task.group_map(None) == {"learners": names} and len(names) > 2
+        env = task.get_env_fun(2, True, 5, "cpu")()
+        assert env.reset()["learners", "observation"].shape[:2] == (2, len(names))
+        assert task.max_steps(env) == round(four.horizon_s / four.time_step_s) + 1
+    task.config["scenario"] = "cooperation-4-al"
+    with pytest.raises(InvalidInput, match="did you mean 'cooperation-4-all'"):
+        task.group_map(None)
+
+
+def test_env__draws_its_first_world() -> None:
+    from tensordict import TensorDict
+
+    from ethbrake_marl.extensions.benchmarl.task import LineEnv
+
+    env = LineEnv(PAIR, 3, 5)
+    single = eb.parallel_env(PAIR, render_mode="rgb_array", agents="learners")
+    single.reset(seed=5)
+    env.reset()
+    pictures = [(env.render(), single.render())]
+    for _ in range(3):
+        env.step(TensorDict({"learners": {"action": torch.full((3, 2, 1), -0.7)}}, [3]))
+        single.step(dict.fromkeys(single.agents, np.array([-0.7], np.float32)))
+        pictures.append((env.render(mode="rgb_array"), single.render()))
+    assert all(np.array_equal(*pair) for pair in pictures) and len({one.tobytes() for one, _ in pictures}) == 4
+    env.reset()
+    assert not any(np.array_equal(env.render(), one) for one, _ in pictures)
+    with pytest.raises(InvalidInput, match="render_mode = 'film': must be"):
+        LineEnv(PAIR, 3, 5).render("film")
+
+
+def test_experiment__writes_films(tmp_path: Path) -> None:
+    from benchmarl.algorithms import MappoConfig
+    from benchmarl.experiment import Experiment, ExperimentConfig
+    from benchmarl.models.mlp import MlpConfig
+
+    from ethbrake_marl.extensions.benchmarl.task import LineTask
+
+    config = ExperimentConfig.get_from_yaml()
+    config.max_n_iters, config.max_n_frames, config.save_folder = 1, None, str(tmp_path)
+    config.on_policy_n_envs_per_worker, config.on_policy_collected_frames_per_batch = 8, 160
+    config.on_policy_n_minibatch_iters, config.evaluation_interval, config.evaluation_episodes = 1, 160, 2
+    config.evaluation, config.render, config.loggers, config.create_json = True, True, ["csv"], False
+    task, learns = LineTask("pair", {"scenario": "cooperation-3-pair"}), MappoConfig.get_from_yaml()
+    experiment = Experiment(task, learns, MlpConfig.get_from_yaml(), 0, config, MlpConfig.get_from_yaml())
+    experiment.logger.loggers[0].experiment.video_format = "pt"  # mp4 needs a torchvision for this build of torch
+    experiment.run()
+    (film,) = [torch.load(file) for folder in tmp_path.rglob("videos") for file in folder.iterdir()]
+    assert film.dtype == torch.uint8 and film.shape[1] > 10 and film.shape[2] == 3
+    assert len({picture.numpy().tobytes() for picture in film[0]}) > 10  # it moves
 
 
 def test_tasks__are_the_scenarios_with_a_learner() -> None:

@@ -384,9 +384,9 @@ def test_measures__are_asked_for_by_name():
     soon = eb.load_scenario("paper-random").replace(horizon_s=1.5)
     near = eb.evaluate(soon, "full_brake", episodes=6, measures="proven_harm")["full_brake"]["proven_harm"]
     assert near.sum() < 0.8 * sum(RECORDED["paper-random"][2])
+    coasts = eb.load_scenario("paper-random").replace(roles={"vehicle_2": "learner", "vehicle_3": "coast"})
     with refused("avoidable, proven_harm: a vehicle that does not learn does not brake fully"):
-        coasts = eb.load_scenario("paper-random").replace(roles={"vehicle_2": "learner", "vehicle_3": "coast"})
         eb.evaluate(coasts, "full_brake", episodes=2, measures="avoidable")
+    both = eb.load_scenario("paper-random").with_learners(["vehicle_2", "vehicle_3"])
     with refused("avoidable, proven_harm: vehicle_2, vehicle_3 learn; the proofs cover one controlled vehicle"):
-        both = eb.load_scenario("paper-random").with_learners(["vehicle_2", "vehicle_3"])
         eb.evaluate(both, "full_brake", episodes=2, measures="proven_harm")

@@ -203,7 +203,7 @@ def test_render_modes__are_those_that_work_here_and_the_checkers_of_libraries_pa
 def test_human__with_the_module_of_another_package_names_both_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(pytest.importorskip("pygame"), "Window")
     for environment in (EthBrakeEnv(render_mode="human"), raw_env(render_mode="human")):
-        with refused("has no Window, because it belongs to the package pygame, not to pygame-ce"):
+        with refused("has no Window: the package pygame has none, the package pygame-ce has one"):
             environment.reset(seed=0)
         environment.close()
     line = next(check for check in diagnose() if check.name == "pygame-ce")
