@@ -27,6 +27,7 @@ import re
 import runpy
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
@@ -274,6 +275,7 @@ def run(words: list[str], fails: bool = False) -> str:
 def run_script(words: list[str]) -> int:
     """Run ``python WORDS``; return the exit status."""
     before, sys.argv = sys.argv, words[words[0] == "-m" :]
+    handler = signal.getsignal(signal.SIGINT)
     try:
         if words[0] == "-m":
             runpy.run_module(words[1], run_name="__main__", alter_sys=True)
@@ -283,6 +285,7 @@ def run_script(words: list[str]) -> int:
         return int(stop.code or 0)
     finally:
         sys.argv = before
+        signal.signal(signal.SIGINT, handler)
     return 0
 
 
