@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.forces import force_range, settle
+from ethbrake_marl.motion.forces import settle
 from ethbrake_marl.motion.layout import (
     BEFORE,
     BLOCK_HEAD,
@@ -28,19 +28,16 @@ from ethbrake_marl.motion.layout import (
     BLOCK_MASS,
     CLOSING,
     CONTACT_SPEED,
-    FORCE,
     FRONT_CHANGE,
     GAP,
     HIT,
     JERK,
-    LIMIT,
     MASS,
     NEW_COUNT,
     NEW_FIRST,
     NEW_TOTAL,
     NEXT_CLOSING,
     NEXT_TIME,
-    PART,
     PASSED,
     POOLED,
     PUSHED,
@@ -53,7 +50,6 @@ from ethbrake_marl.motion.layout import (
 
 TOUCH_MPS = 1e-5  # a contact at this closing speed or less is a touch: no impact, no harm
 PLASTIC_MPS = 0.05  # a cluster whose largest closing speed is below this does not bounce
-MOST_STRIKES = 10_000_000  # of a series of plastic impacts; a body of 1 kg between two of 100 t needs 700,000
 SAME_MPS2 = 5e-13  # touching bodies with accelerations closer than this move alike
 
 
@@ -167,46 +163,6 @@ def after_impact_of(car, scratch, first, last, body):
 
 
 @large
-def opens(line, car, scratch, first, last):
-    """Whether a contact of a cluster would open by itself: no closing speed and no force holds it."""
-    is_open, front = False, 0.0
-    for i in range(first, last + 1):
-        low, high, _, _ = force_range(line[FORCE, i], 0.0, scratch[BEFORE, i], car[LIMIT, i])
-        rear, _ = settle(low, high, 0.0, 0.0)
-        if i > first:
-            closing = scratch[CLOSING, i - 1]
-            is_open = is_open or closing < 0.0 or (closing == 0.0 and rear < front)
-        front = rear
-    return is_open
-
-
-@large
-def note_series(car, scratch, first, last):
-    """Add the harm of the impacts that a series of plastic impacts (e = 0) still has when its gaps have become 0.
-
-    Where a light body goes to and fro between two heavy ones that close, the gaps shrink faster than numbers can hold,
-    and a contact that ``opens`` becomes a part of the cluster. The pairs of the cluster then strike one after the
-    other, the one with the largest closing speed first, until none closes; they end with the cluster's speeds. So the
-    lost energy is ``sum(mu h) / 2``, with the harm h of each pair and its reduced mass mu.
-    """
-    for i in range(first, last + 1):
-        scratch[POOLED, i], scratch[PART, i] = scratch[BEFORE, i], 0.0
-    for _ in range(MOST_STRIKES):
-        p, closing = first, TOUCH_MPS
-        for q in range(first, last):
-            if scratch[POOLED, q + 1] - scratch[POOLED, q] > closing:
-                p, closing = q, scratch[POOLED, q + 1] - scratch[POOLED, q]
-        if closing == TOUCH_MPS:
-            break
-        scratch[PART, p] += closing * closing
-        common = scratch[POOLED, p] + car[MASS, p + 1] / (car[MASS, p] + car[MASS, p + 1]) * closing
-        scratch[POOLED, p] = scratch[POOLED, p + 1] = common
-    for p in range(first, last):
-        closing = max(scratch[CLOSING, p], 0.0)
-        scratch[NEW_TOTAL, p] += max(scratch[PART, p] - closing * closing, 0.0)
-
-
-@large
 def note_passed(line, car, scratch, first, last):
     """Add to the row PASSED the harm that the contacts of a cluster of three bodies or more pass on in an impact.
 
@@ -215,12 +171,7 @@ def note_passed(line, car, scratch, first, last):
     behind it. The harm that it passes on is the square of this, minus the harm of the pair's own closing speed. So
     vehicles that touch when one of them is struck are not spared what they would bear a millimetre apart.
     """
-    if last - first == 1:  # two bodies pass nothing on
-        return
-    if car[RESTITUTION, 0] == 0.0 and opens(line, car, scratch, first, last):
-        note_series(car, scratch, first, last)
-        return
-    for p in range(first, last):
+    for p in range(first, last if last - first > 1 else first):  # two bodies pass nothing on
         front = after_impact_of(car, scratch, first, p, p)
         rear = after_impact_of(car, scratch, p + 1, last, p + 1)
         closing = max(scratch[CLOSING, p], 0.0)
