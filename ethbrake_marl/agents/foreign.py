@@ -82,7 +82,8 @@ def ask_model(model: Any, seen: Observations) -> Any:
 
 def ask_torch(module: Any, seen: Observations) -> Any:
     torch = sys.modules["torch"]
-    parameter = next(iter(module.parameters()), torch.zeros(0, dtype=torch.float32, device="cpu"))
+    usual = torch.zeros(0, dtype=torch.float32, device="cpu")
+    parameter = next(filter(torch.is_floating_point, module.parameters()), usual)
     with torch.no_grad():
         answer = module(torch.from_numpy(seen).to(parameter))
         return answer.float() if getattr(answer, "dtype", None) == torch.bfloat16 else answer  # which numpy lacks

@@ -88,14 +88,15 @@ def _check(name: str, look: Callable[[], tuple[bool, str]]) -> Check:
 def _dependencies() -> Iterator[Check]:
     from packaging.requirements import Requirement
 
-    from ethbrake_marl.faces.rendering import why_not
+    from ethbrake_marl.faces.rendering import RENDERERS, why_not
 
     wanted = [Requirement(line) for line in requires("ethbrake-marl") or []]
     of = {extra: [r for r in wanted if r.marker and r.marker.evaluate({"extra": extra})] for extra in EXTRAS}
     for extra, needed in {"": [r for r in wanted if r.marker is None], **of}.items():
         for requirement in needed:
             # The package pygame has a module of the same name, and the last one installed is there.
-            if requirement.name == "pygame-ce" and find_spec("pygame") and (reason := why_not("human")):
+            is_checked = requirement.name == "pygame-ce" and "human" in RENDERERS and find_spec("pygame") is not None
+            if is_checked and (reason := why_not("human")):
                 yield Check(requirement.name, False, reason)
                 continue
             try:

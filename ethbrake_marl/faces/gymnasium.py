@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import replace
 from typing import Any
 
@@ -36,7 +36,9 @@ class OneLearner(Face):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        self._spec = spec and replace(spec, kwargs=plain(spec.kwargs), max_episode_steps=self._longest())
+        given = {} if spec is None else spec.kwargs
+        listed = {name: plain([*value] if isinstance(value, Set) else value) for name, value in given.items()}
+        self._spec = spec and replace(spec, kwargs=listed, max_episode_steps=self._longest())
 
     def _longest(self) -> int:
         """Return the largest number of steps of an episode in the scenario's worlds."""

@@ -199,9 +199,8 @@ class V2X(Part):
     def _check(self) -> None:
         """Refuse keys without effect, and a channel by which a vehicle may never learn anything."""
         extended = {EXTENSIONS[key]: key for key in self.model_extra or ()}
-        names = " and ".join(extended.values())
-        right = f"{names} belong to different extensions, whose games would replace each other; leave one out"
-        require(len(extended) < 2, (), UNSHOWN, right)
+        right = "belong to different extensions, whose games would replace each other; leave one out"
+        require(len(extended) < 2, (), UNSHOWN, f"{' and '.join(extended.values())} {right}")
         used = [key for extension in self.extensions for key in extension.uses(self)]
         unused = [key for key in OF_MESSAGES if key not in used]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)

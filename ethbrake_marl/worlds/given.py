@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
 from numbers import Real
+from os import PathLike
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -52,7 +53,7 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
     ``InvalidInput`` with column and row (from 0).
     """
     scenario, where = load_scenario(scenario), "initial states"
-    columns = columns.collect() if hasattr(columns, "collect") else columns  # a LazyFrame of polars
+    columns = columns.collect() if callable(getattr(columns, "collect", None)) else columns  # a LazyFrame of polars
     names: Any = columns  # or the attribute of pyarrow, of a frame, or of a structured array
     if not isinstance(columns, Mapping):
         of_array = getattr(getattr(columns, "dtype", None), "names", None)
@@ -79,7 +80,7 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
 
 def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
     """Worlds from a CSV file with the columns of ``worlds_from_table``. Errors name file, line and column."""
-    if not isinstance(path, str | Path):
+    if not isinstance(path, str | PathLike):
         raise InvalidInput(
             f"path: type {type(path).__name__}: must be the path of a CSV file; worlds_from_table reads a table"
         )

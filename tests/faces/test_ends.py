@@ -1,4 +1,4 @@
-"""An end after a number of steps is the end of a shorter horizon: rewards, infos, flags, shields and searches."""
+"""An end after a number of steps is the end of a shorter horizon: rewards, infos, flags and shields."""
 
 from functools import partial
 from typing import Any
@@ -8,16 +8,10 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.play import price
-from ethbrake_marl.extensions.search.best_harm import best_harm
-from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.faces.registration import register_environments
 from tests.contract.interfaces import BARE, CRASH, EPISODE, FIVE, PAPER, REST, STEP, actions
 
 PAIR = eb.load_scenario("cooperation-3-pair").replace(v2x="paper")
-NEWS = PAPER.replace(
-    v2x={"preset": "nominal", "link_latency_s": 0.25, "persistence": "periodic", "tells": ["place", "speed"]}
-)
 EVERY = {
     "harm": 1.0, "harm_count": "honest", "terminal": 3.0, "shaping": 0.5, "still_moving": 7.0, "risk": 0.1,
     "last": 11.0,
@@ -52,9 +46,8 @@ def told(env: Any, steps: int, learners: list[str]) -> list[Any]:
     return values
 
 
-@pytest.mark.parametrize("scenario", [PAPER, PAIR, NEWS, FIVE], ids=["paper", "two learners", "messages", "scripts"])
-@pytest.mark.parametrize("steps", [4, 5, 12])
-def test_most_steps__are_a_shorter_horizon_to_every_term(scenario: eb.Scenario, steps: int) -> None:
+def check_ends(scenario: eb.Scenario, steps: int) -> None:
+    """Compare all terms of episodes of so many steps with those of a shorter horizon."""
     horizon_s = first_s(scenario) + steps * scenario.time_step_s
     learners = [f"vehicle_{body}" for body in scenario.learners]
     runs = [
@@ -64,6 +57,12 @@ def test_most_steps__are_a_shorter_horizon_to_every_term(scenario: eb.Scenario, 
     assert str(runs[0]) == str(runs[1])
     ends = [value for value in runs[0] if len(value) == 4 and any(value[2].values())]
     assert len(ends) == 5 and all(end[3]["vehicle_2"]["reward_still_moving"] == -1.0 for end in ends)
+
+
+@pytest.mark.parametrize("scenario", [PAPER, PAIR, FIVE], ids=["paper", "two learners", "scripts"])
+@pytest.mark.parametrize("steps", [4, 5, 12])
+def test_most_steps__are_a_shorter_horizon_to_every_term(scenario: eb.Scenario, steps: int) -> None:
+    check_ends(scenario, steps)
 
 
 @pytest.mark.parametrize("name", [*BARE, *STEP, "episode parallel"])
@@ -121,25 +120,3 @@ def test_terminal__is_paid_by_hand_and_through_gymnasium() -> None:
     crash.reset()
     costs = [crash.step([0.0])[1] for _ in range(4)]  # coasting at 20 m/s to the end at 0.9 s; Vehicle 1 has 14.6 m/s
     assert costs == [0.0, 0.0, 0.0, pytest.approx(-(20.0**2) - 14.6**2)]
-
-
-def test_physics_of_another_kind__ends_there_too() -> None:
-    paper_map = PAPER.replace(physics="paper-map")
-    runs = [
-        told(eb.parallel_env(each, reward={"harm": 1, "terminal": 2}, max_cycles=most), 12, ["vehicle_2"])
-        for each, most in ((paper_map, 4), (paper_map.replace(horizon_s=0.5 + 4 * 0.1), None))
-    ]
-    assert str(runs[0]) == str(runs[1])
-
-
-def test_plans_and_searches__end_where_the_game_does() -> None:
-    env, worlds = eb.parallel_env(PAPER, max_cycles=9), PAPER.sample(20, seed=7)
-    shorter = PAPER.replace(horizon_s=0.5 + 9 * 0.1)
-    problems = [problem_of(env.game, worlds), problem_of(eb.open_game(shorter)[1], worlds)]
-    assert (problems[0].identity == problems[1].identity).all()
-    ends = [problem.follow(problem.coasting()) for problem in problems]
-    assert ends[0].harm("honest").tolist() == ends[1].harm("honest").tolist()
-    state = env.game.reset(worlds)
-    assert price(env.game, state, np.zeros((20, 1, 1)), "honest").tolist() == ends[0].harm("honest").tolist()
-    best = [best_harm(game, worlds, counts=["honest"], budget=50).harm for game in (env.game, eb.open_game(shorter)[1])]
-    assert best[0]["honest"].tolist() == best[1]["honest"].tolist()

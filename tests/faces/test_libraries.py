@@ -104,6 +104,8 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "names": {"reward": np.str_("paper"), "learners": np.array(["vehicle_3"])},
     "view": {"observation": {"vehicle_2": View(["own", "rear_1.gap"])}, "learners": ("vehicle_2",)},
     "features": {"observation": ("own", "front_1")},
+    "set": {"learners": {"vehicle_2"}, "render_mode": np.str_("ansi")},
+    "keys": {"learners": {"vehicle_3": 1}.keys()},
     "numbers": {"actions": np.int64(9), "reward_vector": ("harm_1", "harm_2")},
 }
 
