@@ -92,10 +92,9 @@ class DroveTowards:
         self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        until_s = first_impact_s(before, after)
-        driving = driving_s(before, after, until_s)
+        driving = driving_s(before, after)
         hard = (driving > 0.0) & (after.commands_mps2 > HARD_MPS2)
-        self.time_s += until_s - before.time_s
+        self.time_s += first_impact_s(before, after) - before.time_s
         self.driving_s += driving
         self.hard |= hard[:, self.learners - 1].any(axis=1)
 
@@ -115,7 +114,7 @@ def drove_towards(game: Game, alert: State) -> DroveTowards:
 
 def still_moving(game: Game, alert: State, last: State) -> Given:
     """Whether a vehicle of each world still moves at the end, which is then at the horizon."""
-    return last.moving
+    return ~last.at_rest
 
 
 FAR = "Share of worlds in which Vehicle 1 is pushed more than 5 m beyond the point where it would stop by itself."
