@@ -22,6 +22,7 @@ import csv
 import difflib
 import doctest
 import io
+import os
 import pkgutil
 import re
 import runpy
@@ -335,7 +336,9 @@ def check_target(words: list[str]) -> None:
     unknown = [word for word in words if "=" not in word and word not in targets]
     assert not unknown, f"make {shlex.join(words)}: no target {', '.join(unknown)}"
     asked = ["make", "-n", "--no-print-directory", *words]
-    told = subprocess.run(asked, cwd=ROOT, capture_output=True, text=True, check=True)
+    outer = ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS")  # variables of `make test ARGS=--all`
+    own = {name: value for name, value in os.environ.items() if name not in outer}
+    told = subprocess.run(asked, cwd=ROOT, env=own, capture_output=True, text=True, check=True)
     if words[0] == "programme":
         listed = io.StringIO()
         with contextlib.redirect_stdout(listed):
