@@ -336,7 +336,7 @@ def check_target(words: list[str]) -> None:
     unknown = [word for word in words if "=" not in word and word not in targets]
     assert not unknown, f"make {shlex.join(words)}: no target {', '.join(unknown)}"
     asked = ["make", "-n", "--no-print-directory", *words]
-    outer = ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS")  # variables of `make test ARGS=--all`
+    outer = ("MAKEFLAGS", "MAKEOVERRIDES", "MFLAGS", "ARGS", "NAME", "WORKERS")  # set by `make test ARGS=--all`
     own = {name: value for name, value in os.environ.items() if name not in outer}
     told = subprocess.run(asked, cwd=ROOT, env=own, capture_output=True, text=True, check=True)
     if words[0] == "programme":
