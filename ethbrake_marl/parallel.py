@@ -10,7 +10,7 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from functools import cache
 from itertools import islice
 from multiprocessing import resource_tracker
@@ -60,12 +60,8 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
     work = (delayed(_answer)(os.getpid(), _pickled(call)) for call in calls)
     batches = [work] if streams else iter(lambda: list(islice(work, PER_PROCESS * jobs)), [])
     for batch in batches:
-        resource_tracker.ensure_running()  # it starts with the signal unblocked, and would unblock it here, too
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT} if streams else ())
-        try:  # with Ctrl-C blocked in the processes that this starts
+        with _blocked_interrupt() if streams else nullcontext():
             results = parallel(batch)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         try:
             for result in results:  # noqa: UP028  # `yield from` would close `results` outside the clause below
                 yield result
@@ -76,6 +72,20 @@ def run_each(calls: Iterable[Call], jobs: int | None = None) -> Iterator[Any]:
         finally:
             with warnings.catch_warnings(action="ignore"):  # warnings about calls that are cancelled
                 getattr(results, "close", list)()
+
+
+@contextmanager
+def _blocked_interrupt() -> Iterator[None]:
+    """Block Ctrl-C, and in the processes that the block starts, until they ignore it; where the system can."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # it starts with the signal unblocked, and would unblock it here, too
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _pickled(call: Call) -> bytes:
@@ -101,7 +111,8 @@ def _become_worker() -> None:
     """Leave Ctrl-C to the parent process and to calls that listen to it; exit when the parent ends, even in a call."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
     def watch(parent: int) -> None:
         while os.getppid() == parent:

@@ -15,6 +15,7 @@ from ethbrake_marl.faces.rendering import Renderer, register_renderer
 from ethbrake_marl.names import register_agent
 from ethbrake_marl.worlds.channel import register_v2x_extension
 from tests.contract.interfaces import BARE, PAPER, STEP, Vector, actions
+from tests.fixtures.layer import Layer
 
 
 class NextStep(Vector):
@@ -84,28 +85,6 @@ class Reporting(Game):
         return {**super().own_infos(state), "mine": state.time_s}
 
 
-class Layer:
-    name, schemas = "mine", {"mine": {"description": "the user's own"}}
-
-    def read(self, key: str, value: Any) -> Any:
-        return value
-
-    def uses(self, v2x: Any) -> tuple[str, ...]:
-        return ()
-
-    def is_random(self, v2x: Any) -> bool:
-        return False
-
-    def check(self, scenario: Any) -> None:
-        """Accept all."""
-
-    def at_alert(self, scenario: Any, numbers: Any, unheard: Any, n: int) -> Any:
-        return np.zeros(n)
-
-    def game(self, game: Game) -> Game:
-        return Reporting(*game)
-
-
 def feature(state: eb.State, body: int) -> Any:
     """Time, where the trap is not set."""
     TRAP.spring()
@@ -139,7 +118,7 @@ def shown() -> tuple[eb.Scenario, dict[str, Any]]:
 
 
 def layered() -> tuple[eb.Scenario, dict[str, Any]]:
-    register_v2x_extension("mine", Layer())  # type: ignore[arg-type]
+    register_v2x_extension("mine", Layer("mine", Reporting))  # type: ignore[arg-type]
     return SHORT.replace(v2x={"mine": 1}), {}
 
 

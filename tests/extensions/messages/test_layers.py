@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import pytest
 
 import ethbrake_marl as eb
@@ -11,6 +10,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.worlds.channel import register_preset, register_v2x_extension
 from ethbrake_marl.worlds.physics import register_physics
 from tests.contract.interfaces import PAPER
+from tests.fixtures.layer import Layer
 from tests.refused import refused
 
 
@@ -21,39 +21,17 @@ class Mine(Game):
         return {**super().own_infos(state), "mine": state.time_s}
 
 
-class Layer:
-    """An extension of ``v2x``, and a physics."""
-
-    schemas = {"mine": {"description": "the user's own"}, "also_mine": {"description": "the same"}}  # noqa: RUF012
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def read(self, key: str, value: Any) -> Any:
-        return value
-
-    def uses(self, v2x: Any) -> tuple[str, ...]:
-        return ()
-
-    def is_random(self, v2x: Any) -> bool:
-        return False
-
-    def check(self, scenario: Any) -> None:
-        """Accept all."""
-
-    def at_alert(self, scenario: Any, numbers: Any, unheard: Any, n: int) -> Any:
-        return np.zeros(n)
-
-    def game(self, game: Game) -> Game:
-        return Mine(*game)
-
-
 @pytest.fixture(autouse=True)
 def _registered() -> None:
-    mine = Layer("mine")
-    for key, layer in {"mine": mine, "also_mine": mine, "other": Layer("other"), "news": Layer("messages")}.items():
+    mine = Layer("mine", Mine)
+    for key, layer in {
+        "mine": mine,
+        "also_mine": mine,
+        "other": Layer("other", Mine),
+        "news": Layer("messages", Mine),
+    }.items():
         register_v2x_extension(key, layer)  # type: ignore[arg-type]
-    register_physics("sliding", Layer("sliding"))
+    register_physics("sliding", Layer("sliding", Mine))
 
 
 def changed(v2x: dict[str, Any], **beside: Any) -> eb.Scenario:
@@ -80,10 +58,10 @@ REFUSED: dict[str, Callable[[], Any]] = {
     ),
     "v2x: is not known to physics: sliding; leave one": lambda: changed({"mine": 1}, physics="sliding"),
     "key 'kept' of v2x: the name of its memory, 'shield', is in use; choose": lambda: register_v2x_extension(
-        "kept", Layer("shield")  # type: ignore[arg-type]
+        "kept", Layer("shield", Mine)  # type: ignore[arg-type]
     ),
     "key 'kept' of v2x: the name of its memory, 'physics', is in use": lambda: register_v2x_extension(
-        "kept", Layer("physics")  # type: ignore[arg-type]
+        "kept", Layer("physics", Mine)  # type: ignore[arg-type]
     ),
 }  # fmt: skip
 
