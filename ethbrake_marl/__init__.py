@@ -1,6 +1,6 @@
 """Research environment for ethical emergency braking: exact physics of several vehicles, and a shield that bounds harm.
 
-Importing the package registers ``EthBrake-v1`` with Gymnasium and, from its version 1.27 on, ``ethbrake/ethbrake-v1``
+Importing the package registers ``EthBrake-v2`` with Gymnasium and, from its version 1.27 on, ``ethbrake/ethbrake-v2``
 with PettingZoo. A public name is imported when it is first used, so torch and matplotlib are loaded only if needed.
 """
 

@@ -2,8 +2,8 @@
 
     .venv/bin/python docs/studies/honesty.py docs/figures/honesty.png
 
-A push of s m/s costs PRICE times s (m2/s2); at a price of 0 everything is allowed. At any other price driving before
-the first impact costs 10 m2/s2 for each m/s, and a vehicle that still moves at v at the horizon v^2, as in the count of
+A push of s m/s costs PRICE times s (m2/s2); at a price of 0 everything is allowed. At any other price driving costs
+10 m2/s2 for each m/s, and a vehicle that still moves at v at the horizon v^2, as in the count of
 harm ``honest``, where a push costs 10. For each price Vehicle 2 is searched for anew: about eight CPU-minutes.
 """
 
@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.extensions.report.style import finish, in_our_style, new_panels, series_style, write_picture
-from ethbrake_marl.extensions.search.best_harm import e_v2x_bm_profiles, joined, starting_profiles
+from ethbrake_marl.extensions.search.best_harm import e_v2x_bm_profiles, starting_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of
 from ethbrake_marl.extensions.search.search import search_profiles
 from ethbrake_marl.motion.layout import DROVE, PUSHED
@@ -31,7 +31,7 @@ TESTS = {
 PRICES = (0.0, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 WORLDS, SEED, BUDGET = 1_000, 7, 20_000
 LABELLED = (0.0, 0.3, 3.0, 10.0)  # prices that the figure names
-DROVE_MPS = 0.05  # driving that adds more than this before the first impact counts
+DROVE_MPS = 0.05  # driving that gives more than this counts
 
 
 class Cost(NamedTuple):
@@ -51,7 +51,7 @@ class Cost(NamedTuple):
         drove = last.line[:, DROVE].sum(axis=1) > DROVE_MPS
         harms = (float(last.harm(count).mean()) for count in ("first", "total"))
         push = float(last.line[:, PUSHED].sum(axis=1).mean())
-        return cls(agent, price, *harms, push, float(drove.mean()), float((~last.at_rest).mean()))
+        return cls(agent, price, *harms, push, float(drove.mean()), float(last.moving.mean()))
 
 
 def with_price(problem: Problem, price: float) -> Problem:
@@ -70,8 +70,7 @@ def costs_of(test: str) -> list[Cost]:
     for price in PRICES:
         problem = with_price(asked, price)
         found.append(Cost.of("e_v2x_bm", price, problem.follow(e_v2x_bm_profiles(problem, alert))))
-        starts = joined(starting_profiles(problem, alert), problem.n)
-        best, _ = search_profiles(problem, starts, budget=BUDGET, threads=2)
+        best, _ = search_profiles(problem, starting_profiles(problem, alert), budget=BUDGET, threads=2)
         found.append(Cost.of("best known", price, problem.follow(best)))
     return found
 

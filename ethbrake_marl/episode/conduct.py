@@ -1,4 +1,4 @@
-"""Conduct that causes no harm by itself: pushing, driving before the first impact, still moving at the horizon."""
+"""Conduct that causes no harm by itself: pushing, driving, still moving at the horizon."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import TRUNCATED, Step, driven_again
-from ethbrake_marl.motion.layout import COUNT, DROVE, NEXT_TIME, PUSHED, Floats
+from ethbrake_marl.motion.layout import COUNT, DROVE, LATENCY, NEXT_TIME, PUSHED, Floats
 
 
 def push(before: State, step: Step, after: State) -> Floats:
@@ -19,9 +19,9 @@ def push(before: State, step: Step, after: State) -> Floats:
 
 
 def drove(before: State, step: Step, after: State) -> Floats:
-    """Term drove of rewards (``episode.terms``), [n, N]: minus the speed that commands ask for by driving (m/s).
+    """Term drove of rewards (``episode.terms``), [n, N]: minus the speed that the engine alone gives (m/s).
 
-    That is a positive command times its duration, until the line's first impact.
+    That is the integral of the force where it is positive (``motion.forces``).
     """
     check_exact(before, "the term drove")
     return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
@@ -30,7 +30,7 @@ def drove(before: State, step: Step, after: State) -> Floats:
 def still_moving(before: State, step: Step, after: State) -> Floats:
     """Term still_moving of rewards (``episode.terms``), [n]: -1 if a vehicle moves at the horizon, otherwise 0."""
     check_exact(before, "the term still_moving")
-    return 0.0 - step.out[TRUNCATED]
+    return 0.0 - step.out[TRUNCATED] * after.moving
 
 
 def first_impact_s(before: State, after: State) -> Floats:
@@ -45,7 +45,7 @@ def first_impact_s(before: State, after: State) -> Floats:
     return until
 
 
-def driving_s(before: State, after: State) -> Floats:
-    """Time between the states, before the line's first impact, with a positive command in force, [n, N] s."""
-    asked_mps, commands = after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1], after.commands_mps2
-    return asked_mps / np.where(commands > 0.0, commands, 1.0)
+def driving_s(before: State, after: State, until_s: Floats) -> Floats:
+    """Time from ``before`` to ``until_s`` [n] with a positive command in force, [n, N] s."""
+    begun_s = np.maximum(before.car[:, LATENCY, 1:], before.time_s[:, np.newaxis])
+    return np.where(after.commands_mps2 > 0.0, np.maximum(until_s[:, np.newaxis] - begun_s, 0.0), 0.0)

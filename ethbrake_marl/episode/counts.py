@@ -5,13 +5,13 @@ first   harm of the first impact of each pair, as in the paper
 total   harm of every impact
 honest  harm of every impact, also where a contact passes it on to another pair, plus a price of conduct without impact:
         10 m/s times the push, the closing speed that forces build up and a contact takes up; 10 m/s times the speed
-        that a vehicle asks for by driving before the line's first impact; ``v^2`` for a vehicle that still moves at v
-        at the horizon, as if it then hit a standing object
+        that a vehicle's engine gives by driving; ``v^2`` for a vehicle that still moves at v at the horizon, as if it
+        then hit a standing object
 ======  ================================================================================================================
 
 All are in m2/s2 and never fall during an episode. Without the price in ``honest``, the best braking pushes Vehicle 1
-away (docs/findings.md). The two vehicles of a pair share harm and push by their masses. Each vehicle alone bears the
-price of its own driving and motion.
+away (docs/findings.md). The two vehicles of a pair share harm by their masses. Conduct is its author's: a vehicle
+alone bears the price of its push against the vehicle ahead, of its driving and of its motion.
 """
 
 from __future__ import annotations
@@ -52,20 +52,19 @@ def other_count(count: Count) -> str:
 
 
 @kernel
+def own_amount(line, p, weights):
+    """Part of ``pair_amount`` for conduct (m2/s2), which the rear vehicle of the pair bears alone."""
+    return weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
+
+
+@kernel
 def pair_amount(line, p, weights):
     """Harm of pair ``p`` (0: with the obstacle) so far, in one world's ``line`` (``motion.layout``), m2/s2.
 
     ``weights`` [6] are a value of ``COUNTS``.
     """
     harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
-    beside = weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
-    return harm + (weights[2] * line[PASSED, p] + beside)
-
-
-@kernel
-def own_amount(line, p, weights):
-    """Part of ``pair_amount`` for driving and motion (m2/s2), which the rear vehicle of the pair bears alone."""
-    return weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
+    return harm + (weights[2] * line[PASSED, p] + own_amount(line, p, weights))
 
 
 @kernel
@@ -82,13 +81,12 @@ def pair_amounts(line: Floats, count: Count) -> Floats:
 
     ``line``: the array of a ``State``.
     """
-    first, total, passed, push, drove, moving = weights_of(count)
+    first, total, passed, *_ = weights_of(count)
     harm = first * line[:, FIRST] + total * line[:, TOTAL]
-    beside = push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING]
-    return harm + (passed * line[:, PASSED] + beside)
+    return harm + (passed * line[:, PASSED] + own_amounts(line, count))
 
 
 def own_amounts(line: Floats, count: Count) -> Floats:
-    """Part of ``pair_amounts`` for driving and motion, which the rear vehicle bears alone, [n, N + 1] m2/s2."""
-    drove, moving = weights_of(count)[4:]
-    return np.asarray(drove * line[:, DROVE] + moving * line[:, MOVING])
+    """Part of ``pair_amounts`` for conduct, which the rear vehicle bears alone, [n, N + 1] m2/s2."""
+    push, drove, moving = weights_of(count)[3:]
+    return np.asarray(push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING])

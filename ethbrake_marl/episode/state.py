@@ -119,6 +119,11 @@ class State(NamedTuple):
         return ~moves[:, 1:].any(axis=1)
 
     @property
+    def moving(self) -> Bools:
+        """Whether a vehicle moves, [n]."""
+        return np.asarray((self.line[:, SPEED, 1:] != 0.0).any(axis=1))
+
+    @property
     def speeds_mps(self) -> Floats:
         """Speeds, [n, N] m/s."""
         return self.line[:, SPEED, 1:]

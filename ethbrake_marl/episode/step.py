@@ -24,7 +24,7 @@ from ethbrake_marl.episode.state import (
 )
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, PhysicsError, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import FAILED, MET, drive
+from ethbrake_marl.motion.drive import FAILED, MET, drive, drive_worlds
 from ethbrake_marl.motion.layout import (
     BRAKING,
     COUNT,
@@ -220,15 +220,6 @@ def step_worlds(line, car, clock, wanted, actions, scratch, out, reward, learner
         for i in range(bodies - 1):
             reward[k, i] = shared
     return -1, failed
-
-
-@large
-def drive_worlds(line, car, time, until, wanted, scratch):
-    failed = -1
-    for k in range(len(until)):
-        if drive(line[k], car[k], wanted[k], scratch, time[k], until[k]) == FAILED:
-            failed = k
-    return failed
 
 
 def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wanted: Floats, scratch: Floats) -> int:

@@ -11,7 +11,7 @@ risk          minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + si
 jerk          minus the squared rate of change of the vehicle's force
 terminal      1 at the end of an episode without any impact
 push          minus the closing speed that contacts of the line take up (``motion.push``)
-drove         minus the speed that the vehicle's positive commands ask for before the line's first impact
+drove         minus the speed that the vehicle's engine alone gives (``motion.forces.driving``)
 still_moving  -1 for an end at the horizon with a vehicle in motion
 shaping       for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
               the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
@@ -94,7 +94,7 @@ BUILT_IN = {  # name -> (unit, meaning)
     "jerk": ("m2/s6", "minus the squared rate of change of the vehicle's force"),
     "terminal": ("1", "1 at the end of an episode without any impact"),
     "push": ("m/s", "minus the push of all contacts of the line"),
-    "drove": ("m/s", "minus the vehicle's driving command times the time before the line's first impact"),
+    "drove": ("m/s", "minus the speed that the vehicle's engine alone gives"),
     "still_moving": ("1", "-1 for an end at the horizon with a vehicle in motion"),
     "shaping": ("m2/s2", "discounted potential after the step minus the potential before it"),
 }

@@ -144,8 +144,8 @@ def end_s(game: Game, alert: State, last: State) -> Given:
 
 
 def ended(game: Game, alert: State, last: State) -> Given:
-    """How each episode ended. at_rest: all vehicles came to rest; horizon: the horizon came first."""
-    return np.where(last.at_rest, AT_REST, HORIZON)
+    """How each episode ended. at_rest: all vehicles stand; horizon: a vehicle still moves at the horizon."""
+    return np.where(last.moving, HORIZON, AT_REST)
 
 
 def predicted_harm(game: Game, alert: State, last: State) -> Given:

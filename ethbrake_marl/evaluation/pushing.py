@@ -92,9 +92,10 @@ class DroveTowards:
         self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
-        driving = driving_s(before, after)
+        until_s = first_impact_s(before, after)
+        driving = driving_s(before, after, until_s)
         hard = (driving > 0.0) & (after.commands_mps2 > HARD_MPS2)
-        self.time_s += first_impact_s(before, after) - before.time_s
+        self.time_s += until_s - before.time_s
         self.driving_s += driving
         self.hard |= hard[:, self.learners - 1].any(axis=1)
 
@@ -114,7 +115,7 @@ def drove_towards(game: Game, alert: State) -> DroveTowards:
 
 def still_moving(game: Game, alert: State, last: State) -> Given:
     """Whether a vehicle of each world still moves at the end, which is then at the horizon."""
-    return ~last.at_rest
+    return last.moving
 
 
 FAR = "Share of worlds in which Vehicle 1 is pushed more than 5 m beyond the point where it would stop by itself."

@@ -71,7 +71,7 @@ class EpisodeRecord:
     command_mps2: Floats  # [k, N] commanded from this time on; 0 before the latency is over
     forces_mps2: Floats  # [k, N] what brakes and engines cause
     impacts: Impacts
-    at_rest: bool  # whether the line came to rest before the horizon
+    at_rest: bool  # whether all vehicles stand at the end
 
     @property
     def initial(self) -> State:
@@ -131,7 +131,7 @@ def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> E
         team.name, game.name, tuple(team.drivers), tuple(states), time_s, line[:, GAP, 1:-1], line[:, SPEED, 1:],
         np.column_stack([front_m, front_m[:, np.newaxis] - behind_m]),
         np.where(in_force, commands, 0.0), line[:, FORCE, 1:], _impacts(times, lines, world.car, wanted),
-        bool(states[-1].at_rest[0]),
+        not states[-1].moving[0],
     )  # fmt: skip
 
 

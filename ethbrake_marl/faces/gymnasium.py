@@ -65,7 +65,7 @@ class OneLearner(Face):
 
 
 class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):
-    """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v1")``).
+    """One learner in a line whose other vehicles follow scripts (``gymnasium.make("EthBrake-v2")``).
 
     Arguments, actions, ends, infos and options of ``reset`` are the same as in ``EthBrakeParallelEnv``.
 

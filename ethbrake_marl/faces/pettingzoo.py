@@ -61,7 +61,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     """
 
     np_random = np.random.default_rng()  # for wrappers that draw
-    metadata: Any = Metadata(name="ethbrake_v1", is_parallelizable=True)
+    metadata: Any = Metadata(name="ethbrake_v2", is_parallelizable=True)
 
     def __init__(
         self,

@@ -12,7 +12,7 @@ import math
 
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.contact import contact, contact_on_cubic, first_return, gap_after
-from ethbrake_marl.motion.forces import acts, force_now, force_range, plan_force, settle
+from ethbrake_marl.motion.forces import acts, driving, force_now, force_range, plan_force, settle
 from ethbrake_marl.motion.impact import pool, resolve_impacts
 from ethbrake_marl.motion.layout import (
     ACCELERATION,
@@ -338,15 +338,17 @@ def through_interval_building(line, car, scratch, start, until, ahead):
 
 
 @kernel
-def note_driving(line, car, wanted, scratch, start, until, met, ahead):
-    """Add to the row DROVE what positive commands ask for until the line's first impact in this interval."""
-    time = until - start
-    for p in range(ahead, line.shape[1] - 1):
-        if met == MET:
-            time = min(time, scratch[NEXT_TIME, p])
+def note_driving(line, car, wanted, start, until):
+    """Add to the row DROVE what the engines do from ``start`` to ``until``; ``line`` is that of ``start``.
+
+    It depends on a vehicle's own force and command alone, so no contact and no other vehicle changes a bit of it.
+    """
     for i in range(1, line.shape[1]):
-        if wanted[i] > 0.0:
-            line[DROVE, i - 1] += wanted[i] * max(time - max(car[LATENCY, i] - start, 0.0), 0.0)
+        if wanted[i] > 0.0 or line[FORCE, i] > 0.0:
+            onset = max(car[LATENCY, i] - start, 0.0) if acts(car[LATENCY, i] - start, until - start) else until - start
+            before, force = driving(line[FORCE, i], 0.0, car[BRAKE_RATE, i], car[RELEASE_RATE, i], onset)
+            after, _ = driving(force, wanted[i], car[BRAKE_RATE, i], car[RELEASE_RATE, i], until - start - onset)
+            line[DROVE, i - 1] += before + after
 
 
 @kernel
@@ -362,13 +364,20 @@ def drive(line, car, wanted, scratch, start, until):
         scratch[COMMAND, i] = wanted[i]
         builds = builds or min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf
     scratch[NEW_FIRST, 0] = scratch[NEW_TOTAL, 0] = scratch[NEW_COUNT, 0] = 0.0
-    calm = True
-    for p in range(ahead, line.shape[1] - 1):
-        calm = calm and line[COUNT, p] == 0.0
+    note_driving(line, car, wanted, start, until)
     if builds:
-        met = through_interval_building(line, car, scratch, start, until, ahead)
-    else:
-        met = through_interval(line, car, scratch, start, until, ahead, False)
-    if calm:
-        note_driving(line, car, wanted, scratch, start, until, met, ahead)
-    return met
+        return through_interval_building(line, car, scratch, start, until, ahead)
+    return through_interval(line, car, scratch, start, until, ahead, False)
+
+
+@large
+def drive_worlds(line, car, time, until, wanted, scratch):
+    """``drive`` for n worlds from ``time`` to ``until`` [n] (s), in place; return a failed row, or -1.
+
+    ``line``, ``car`` and ``wanted`` have one more axis in front, [n, ...].
+    """
+    failed = -1
+    for k in range(len(until)):
+        if drive(line[k], car[k], wanted[k], scratch, time[k], until[k]) == FAILED:
+            failed = k
+    return failed

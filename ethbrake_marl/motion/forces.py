@@ -44,6 +44,25 @@ def force_now(force, wanted, brake_rate, release_rate):
     return wanted if math.isinf(brake_rate if wanted < force else release_rate) else force
 
 
+@large
+def driving(force, wanted, brake_rate, release_rate, duration):
+    """Speed (m/s) that the engine alone gives in ``duration`` (s), and the force (m/s2) then.
+
+    It is the integral of the force where it is positive: the force goes from ``force`` to the command ``wanted`` (m/s2)
+    at the rate (m/s3) towards it, then stays there.
+    """
+    if duration <= 0.0:
+        return 0.0, force
+    rate = -brake_rate if wanted < force else release_rate
+    ramp, after = (wanted - force) / rate, wanted
+    if ramp > duration:
+        ramp, after = duration, force + rate * duration
+    high, low, speed = max(force, after), min(force, after), max(wanted, 0.0) * (duration - ramp)
+    if high > 0.0 and ramp > 0.0:
+        speed += 0.5 * (high + low) * ramp if low >= 0.0 else 0.5 * high * high / abs(rate)
+    return speed, after
+
+
 @kernel
 def plan_force(line, car, scratch, i, builds):
     """Set how the force of body i goes on: its rate, its next goal and the time until then.

@@ -49,7 +49,7 @@ def metrics_of(training: Training, last: State) -> dict[str, float]:
     known = [count for count in counts if count != "honest" or PHYSICS not in last.memories]
     metrics = {COLUMN[count]: mean(last.harm(count)) for count in known}
     metrics["collision_rate"] = float(last.collided.mean())
-    metrics["horizon_rate"] = float((~last.at_rest).mean())
+    metrics["horizon_rate"] = float(last.moving.mean())
     objectives = objectives_of(reward.objective or scenario.objective, scenario.vehicles)
     if reward.harm > 0.0 and any(each.kind is not OBJECTIVES["total"] for each in objectives):
         harm = amounts(objectives, None, last, reward.harm_count)

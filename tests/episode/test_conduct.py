@@ -1,4 +1,4 @@
-"""Terms of conduct by hand: push, driving before the first impact, motion at the horizon."""
+"""Terms of conduct by hand: push, driving, motion at the horizon."""
 
 from __future__ import annotations
 
@@ -22,22 +22,23 @@ CLOSE = state_of([1.0, 90.0], [10.0, 10.0, 0.0], latency_s=[0.0, 0.5, 0.0])
 DRIVEN = later(CLOSE, [0.0, 2.0, 1.0], 4.0)
 
 
-def test_drove__counts_positive_commands_in_force_before_the_first_impact() -> None:
+def test_drove__counts_what_the_engine_does() -> None:
     assert first_impact_s(CLOSE, DRIVEN).tolist() == near([1.5])
-    assert driving_s(CLOSE, DRIVEN)[0].tolist() == near([0.0, 1.0, 1.5])
+    assert driving_s(CLOSE, DRIVEN, first_impact_s(CLOSE, DRIVEN))[0].tolist() == near([0.0, 1.0, 1.5])
     terms = paid({"harm": 0.0, "drove": 1.0}, CLOSE, DRIVEN).terms
-    assert terms["drove"][0].tolist() == near([0.0, -2.0, -1.5])
+    assert terms["drove"][0].tolist() == near([0.0, -7.0, -4.0])
     after = later(DRIVEN, [0.0, 2.0, 1.0], 5.0)
-    assert first_impact_s(DRIVEN, after).tolist() == [4.0] and not driving_s(DRIVEN, after).any()
+    assert first_impact_s(DRIVEN, after).tolist() == [4.0]
+    assert not driving_s(DRIVEN, after, DRIVEN.time_s).any()
     braked = later(CLOSE, [0.0, -2.0, 1.0], 1.0)
     assert first_impact_s(CLOSE, braked).tolist() == [1.0]
-    assert driving_s(CLOSE, braked)[0].tolist() == [0.0, 0.0, 1.0]
+    assert driving_s(CLOSE, braked, np.ones(1))[0].tolist() == [0.0, 0.0, 1.0]
 
 
-def test_drove__ends_with_an_impact_with_the_obstacle() -> None:
+def test_first_impact__with_the_obstacle() -> None:
     ahead = state_of([9.0], [10.0, 10.0], obstacle_gap_m=5.0)
     after = later(ahead, [0.0, 4.0], 1.0)
-    assert first_impact_s(ahead, after).tolist() == near([0.5]) and driving_s(ahead, after)[0, 1] == near(0.5)
+    assert first_impact_s(ahead, after).tolist() == near([0.5])
 
 
 def test_push__is_the_push_of_the_step_of_all_pairs() -> None:

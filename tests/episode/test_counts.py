@@ -31,7 +31,7 @@ SCENARIOS = ["paper-random", "paper-random-obstacle", "paper-random-buildup", "c
 def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_horizon() -> None:
     # Coasting, Vehicle 2 hits with 6 m/s at 1 s: 18.5 m/s in common. Vehicle 1 of 1 t brakes with 6 m/s2 against the
     # 3 t behind it for 0.3 s: a push of 1.8 m/s, and 18.5 - 0.3 x 1.5 = 18.05 m/s of both at the horizon.
-    # Of the impact and the push Vehicle 1 bears 3/4; each vehicle bears the price of its own motion.
+    # Of the impact Vehicle 1 bears 3/4; Vehicle 2 bears the price of its push, each that of its own motion.
     _, game = open_game(CRASH, reward="honest", reward_vector="vehicles")
     state, counted, borne = game.reset(game.draw(1, 0, 0)), 0.0, np.zeros(2)
     while not state.ended[0]:
@@ -46,7 +46,7 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     assert (state.harm("first"), state.harm("total")) == (near([36.0]), near([36.0]))
     assert counted == near(36.0 + 10 * 1.8 + 2 * 18.05**2)
     assert state.harm("honest").tolist() == near([counted])
-    expected = [0.75 * (36.0 + 10 * 1.8) + 18.05**2, 0.25 * (36.0 + 10 * 1.8) + 18.05**2]
+    expected = [0.75 * 36.0 + 18.05**2, 0.25 * 36.0 + 10 * 1.8 + 18.05**2]
     assert state.borne_harm("honest")[0].tolist() == near(expected) and borne.tolist() == near(expected)
     assert amounts(objectives_of("own", 2), None, state, "honest")[0].tolist() == near(expected)
 

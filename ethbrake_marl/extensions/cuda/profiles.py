@@ -16,10 +16,9 @@ from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.cuda.device import Kernel, device_named, enough_memory
 from ethbrake_marl.extensions.cuda.search_kernels import Own, Plans, Searched, search_each, shapes_of
 from ethbrake_marl.extensions.proofs.line import rows_of
-from ethbrake_marl.extensions.search.best_harm import joined
 from ethbrake_marl.extensions.search.kernels import STEPWISE
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, best_of
-from ethbrake_marl.extensions.search.search import PROFILES, seeded
+from ethbrake_marl.extensions.search.search import PROFILES, joined, seeded
 from ethbrake_marl.motion.layout import BRAKING, Floats
 
 WHOLE_NUMBERS = ("ends", "best_ends", "kind")  # in a thread's own memory
@@ -75,7 +74,8 @@ def search(
         part = None if seconds is None else seconds / (1 + len(problem.bodies))
         effort: Any = {"rounds": rounds, "restarts": restarts, "drawn": drawn, "changes": changes, "seed": seed}
         alone = best_alone(problem, partial(search, seconds=part, device=device, **effort))
-        given = alone if given is None else joined([given, alone], n)
+        both = joined([part.shortened() for part in (given, alone) if part is not None], n)
+        given = Profiles(*(array.reshape(-1, *array.shape[2:]) for array in both))
     with enough_memory(f"n = {n} worlds, restarts = {restarts} threads in each, on device {str(on)!r}"):
         searched, kernel = searched_worlds(problem, on)
         plans = started(problem, given, restarts, seed, on)

@@ -18,7 +18,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_one_learner
 from ethbrake_marl.extensions.fronts.weights import weight_table
-from ethbrake_marl.extensions.search.best_harm import best_harm, driven_profiles, joined, starting_profiles
+from ethbrake_marl.extensions.search.best_harm import best_harm, driven_profiles, starting_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
 from ethbrake_marl.extensions.search.search import search_profiles
 from ethbrake_marl.extensions.search.tables import best_known
@@ -178,7 +178,7 @@ def _search(pool: Pool, worlds: State, weights: Floats, effort: Mapping[str, int
         spent = {**effort, "budget": max(int(share * effort["budget"]), 1)}
         for row, aim in zip(weights, aims, strict=True):
             given = [pool.best(row), *(starts if k == 0 else ())]
-            pool.add(search_profiles(aim, joined(given, problem.n), **spent)[0])
+            pool.add(search_profiles(aim, given, **spent)[0])
             tell(problem.n)
 
 

@@ -26,7 +26,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 CANDIDATES = 500  # plans that +search simulates
 MOST_CANDIDATES = 1_000_000
 START = {"honest": "universal"}  # count -> policy whose episode a search also starts from,
-OTHER_START = "universal-paper"  # and that of every other count
+OTHER_START = "ppo"  # and that of every other count
 ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
 
 
@@ -93,7 +93,7 @@ class BestHarm(Planner):
         return commands, harm
 
     def search(self, game: Game, alert: State, problem: Problem, body: int, steps: int) -> tuple[Floats, Floats]:
-        profiles, values = search_profiles(problem, e_v2x_bm_profiles(problem, alert), budget=self.budget)
+        profiles, values = search_profiles(problem, [e_v2x_bm_profiles(problem, alert)], budget=self.budget)
         best = profiles.stepwise(steps)[:, :, 0]
         if self.scenario.learners != (body,):
             return best, values[self.count]

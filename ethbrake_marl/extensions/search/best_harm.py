@@ -18,7 +18,7 @@ from ethbrake_marl.episode.objectives import Declared
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.search.extremes import extreme_profiles
-from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, best_of, problem_of
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, best_of, problem_of
 from ethbrake_marl.extensions.search.search import compact, search_profiles
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
@@ -56,7 +56,7 @@ def best_harm(
         budget: number of profiles that are simulated in each world, for each count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        given: profiles that are tried first, [n] each.
+        given: profiles that are tried first, [n] each, with any number of phases.
         objective: whose harm is minimised, in each count, as under a scenario's key ``objective``; ``total``: the sum
             over the line. The table holds its values.
 
@@ -91,7 +91,7 @@ def _searched(
         commands = np.repeat(problem.bounds[:, np.newaxis, :, 0], best.ends.shape[1], axis=1)
         commands[:, :, c] = best.commands_mps2[:, :, 0]
         starts.append(Profiles(best.ends, commands))
-    return search_profiles(problem, joined(starts, problem.n), **effort)
+    return search_profiles(problem, starts, **effort)
 
 
 def starting_profiles(problem: Problem, alert: State, given: Sequence[Profiles] = ()) -> list[Profiles]:
@@ -109,15 +109,6 @@ def e_v2x_bm_profiles(problem: Problem, alert: State) -> Profiles:
     alert, end_s = alert._replace(wanted=problem.state.wanted), problem.state.clock[:, END]
     choice = coupled(alert, int(problem.bodies[0]), problem.harm_count, end_s)
     return problem.constant(-choice.deceleration_mps2[:, np.newaxis, np.newaxis])
-
-
-def joined(parts: Sequence[Profiles], n: int) -> Profiles:
-    """Join lists of profiles, each [n * q] (q may differ), into [n * Q]: first all Q profiles of world 0, and so on."""
-    short = [part.shortened() for part in parts]
-    ends = np.concatenate([part.ends.reshape(n, -1, MOST_PHASES) for part in short], axis=1)
-    B = parts[0].commands_mps2.shape[2]
-    commands = np.concatenate([part.commands_mps2.reshape(n, -1, MOST_PHASES, B) for part in short], axis=1)
-    return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, B))
 
 
 def search_list(

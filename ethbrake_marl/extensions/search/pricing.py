@@ -43,7 +43,8 @@ from ethbrake_marl.motion.layout import (
 
 UInt64s = NDArray[np.uint64]
 
-MOST_PHASES = 12  # of a profile that a search returns
+MOST_PHASES = 12  # of a profile, before it is polished at every decision,
+FEW_ENDS = 1, 2, 3, 4, 6, 8, 11, 14, 18, 23, 30  # and where they end, up to the last, in one that is shortened
 
 # what a search minimises
 WHOLE = 0.0  # harm of the line
@@ -70,11 +71,13 @@ class Profiles(NamedTuple):
         return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
 
     def shortened(self) -> Profiles:
-        """Return profiles with ``MOST_PHASES`` phases. A longer one becomes its first command, held throughout."""
+        """Return profiles with ``MOST_PHASES`` phases. Those of a longer one have its command at their beginning."""
         ends, commands = Profiles.padded([self], MOST_PHASES)[0]
         fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
-        ends = np.where(fits[:, np.newaxis], ends[:, :MOST_PHASES], ends[:, -1:])
-        return Profiles(ends, np.where(fits[:, np.newaxis, np.newaxis], commands[:, :MOST_PHASES], commands[:, :1]))
+        few = np.minimum(np.array([*FEW_ENDS, np.iinfo(np.int64).max]), ends[:, -1:])
+        begun = self.stepwise(FEW_ENDS[-1] + 1)[:, [0, *FEW_ENDS]]
+        ends = np.where(fits[:, np.newaxis], ends[:, :MOST_PHASES], few)
+        return Profiles(ends, np.where(fits[:, np.newaxis, np.newaxis], commands[:, :MOST_PHASES], begun))
 
     @staticmethod
     def of_steps(commands_mps2: Floats, last_step: Ints) -> Profiles:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -9,13 +10,14 @@ import numpy as np
 from ethbrake_marl.episode.counts import other_count, weights_of
 from ethbrake_marl.errors import InvalidInput, PhysicsError, check_whole_number
 from ethbrake_marl.extensions.search.kernels import CHANGE, DRAWING, PLAN, STEPWISE, Field, Room, World, gather, improve
-from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, UInt64s
+from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, UInt64s, best_of
 from ethbrake_marl.motion.layout import Floats, Ints, scratch_for
 
 # of a search for profiles
 DRAWN_SHARE = 0.35  # part of the budget for given and random profiles,
 ROUNDS_SHARE = 0.50  # for rounds of improvement, each of which halves the field,
-STEPWISE_SHARE = 0.02  # and for the last one, step by step, which takes several times longer
+STEPWISE_SHARE = 0.02  # for the last one, step by step, which takes several times longer,
+POLISHING_SHARE = 0.2  # and for changes at every decision
 PER_PROFILE = 400  # the first field has one profile for this part of the budget,
 SMALLEST_FIELD, LARGEST_FIELD = 4, 128  # but at least and at most so many
 SAME = 1e-6  # profiles whose values (m2/s2) are closer count as the same
@@ -33,36 +35,57 @@ PROFILES = np.zeros(DRAWING, np.int64)  # random profiles and changes are those 
 
 
 def search_profiles(
-    problem: Problem, given: Profiles, *, budget: int, seed: int = 0, threads: int = 1
+    problem: Problem, given: Sequence[Profiles], *, budget: int, seed: int = 0, threads: int = 1
 ) -> tuple[Profiles, dict[str, Floats]]:
     """Search each world for the best profile; return it, and what it costs, count -> [n] m2/s2.
 
-    It has at most ``MOST_PHASES`` phases and is at least as good as each of the profiles ``given``, [n * Q]: first the
-    Q profiles of world 0, and so on. ``budget`` is about the number of profiles that are simulated in each world. The
-    result does not depend on the number of threads.
+    It is at least as good as each of the profiles ``given``, [n * Q] each: first the Q profiles of world 0, and so on.
+    ``budget`` is about the number of profiles that are simulated in each world. The result does not depend on the
+    number of threads. At last the best is polished: its commands are changed at every decision.
 
     Raises ``InvalidInput`` for a bad number, and ``PhysicsError`` for worlds in which no profile can be simulated.
     """
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
-    n, B = problem.n, len(problem.bodies)
-    given = given.shortened()
-    ends = np.ascontiguousarray(given.ends.reshape(n, -1, MOST_PHASES))
-    commands = np.ascontiguousarray(given.commands_mps2.reshape(n, -1, MOST_PHASES, B))
-    random = seeded(problem.identity, seed)
+    n = problem.n
+    ends, commands = joined([part.shortened() for part in given], n)
+    whole = [part for part in given if part.ends.shape[1] > MOST_PHASES]  # in the search they are shortened
+    random, polishing = seeded(problem.identity, seed), int(POLISHING_SHARE * budget)
 
     def work(k: int) -> Profiles | None:
         world, room = prepared(problem, k, random, MOST_PHASES, False)
-        return search_world(world, room, Profiles(ends[k], commands[k]), int(problem.last_step[k]), budget)
+        last = int(problem.last_step[k])
+        return search_world(world, room, Profiles(ends[k], commands[k]), last, max(budget - polishing, 1))
+
+    def polished(k: int) -> Profiles:
+        last = int(problem.last_step[k])
+        world, room = prepared(problem, k, random, last, True)
+        each, mine = np.arange(1, last + 1), np.ascontiguousarray(best.take([k]).stepwise(last)[0])
+        _, active = improve(world, room, each, mine, polishing, PROFILES, 0.0)
+        each[max(active - 1, 0) :] = last
+        return compact(each, mine)
 
     with ThreadPoolExecutor(threads) as pool:
         found = list(pool.map(work, range(n)))
-    failed = [k for k in range(n) if found[k] is None]
-    if failed:
-        raise PhysicsError(dict.fromkeys(failed, "no profile could be simulated"))
-    best = Profiles.join([profile for profile in found if profile is not None])
-    best = Profiles.padded([best], MOST_PHASES)[0]
+        failed = [k for k in range(n) if found[k] is None]
+        if failed:
+            raise PhysicsError(dict.fromkeys(failed, "no profile could be simulated"))
+        best = Profiles.join([profile for profile in found if profile is not None])
+        every = [
+            best,
+            *(part.take(slice(q, None, len(part.ends) // n)) for part in whole for q in range(len(part.ends) // n)),
+        ]
+        best = best_of([(problem.value(problem.follow(one)), one) for one in every])[1]
+        better = Profiles.join(list(pool.map(polished, range(n))))
+    best = best_of([(problem.value(problem.follow(one)), one) for one in (best, better)])[1]
     return best, problem.values(best)
+
+
+def joined(parts: Sequence[Profiles], n: int) -> Profiles:
+    """Join lists of profiles of as many phases, each [n * q] (q may differ), into one list for each world, [n, Q]."""
+    K, B = parts[0].commands_mps2.shape[1:]
+    ends = np.concatenate([part.ends.reshape(n, -1, K) for part in parts], axis=1)
+    return Profiles(ends, np.concatenate([part.commands_mps2.reshape(n, -1, K, B) for part in parts], axis=1))
 
 
 def search_world(world: World, room: Room, given: Profiles, last: int, budget: int) -> Profiles | None:
