@@ -35,6 +35,7 @@ from ethbrake_marl.motion.layout import (
     HIGH_JERK,
     JERK,
     JOINED,
+    LAST_TIME,
     LATENCY,
     LIMIT,
     LOW,
@@ -301,7 +302,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
     if not move_apart(line, car, scratch, duration, ahead, builds):
         for i in range(ahead, bodies):
             scratch[CONTACT_SPEED, i] = scratch[NEW_FIRST, i] = scratch[NEW_TOTAL, i] = scratch[NEW_COUNT, i] = 0.0
-            scratch[NEXT_TIME, i], scratch[NEXT_CLOSING, i] = math.inf, 0.0
+            scratch[NEXT_TIME, i], scratch[NEXT_CLOSING, i], scratch[LAST_TIME, i] = math.inf, 0.0, math.inf
             scratch[FRONT_CHANGE, i] = scratch[REAR_CHANGE, i] = 0.0
         met = FAILED
         for _ in range(MOST_EVENTS):

@@ -32,6 +32,7 @@ from ethbrake_marl.motion.layout import (
     GAP,
     HIT,
     JERK,
+    LAST_TIME,
     MASS,
     NEW_COUNT,
     NEW_FIRST,
@@ -179,6 +180,24 @@ def note_passed(line, car, scratch, first, last):
             line[PASSED, p] += (rear - front) * (rear - front) - closing * closing
 
 
+@large
+def next_of_series(car, scratch, now, first, last):
+    """Pair of a cluster that an endless series of plastic impacts strikes next; -1 if the cluster is struck at once.
+
+    With e = 0 a light vehicle may rattle between two others: each gap is about the square of the one before, until it
+    is 0 in floating-point numbers, and the pairs touch. The series is then played to its end at this moment, one pair
+    after the other, the hardest impact first. It is known by a pair that had an impact at this moment: after a plastic
+    impact at once no pair closes.
+    """
+    hardest, again = first, False
+    for p in range(first, last):
+        again = again or scratch[LAST_TIME, p] == now
+        if scratch[CLOSING, p] > scratch[CLOSING, hardest]:
+            hardest = p
+    plays = again and last - first > 1 and car[RESTITUTION, 0] == 0.0 and scratch[CLOSING, hardest] > TOUCH_MPS
+    return hardest if plays else -1
+
+
 @kernel
 def resolve_impacts(line, car, scratch, now, ahead):
     """Resolve every cluster in which a pair closes, and count its harm; return False if no pair closes.
@@ -208,8 +227,15 @@ def resolve_impacts(line, car, scratch, now, ahead):
             closes = closes or scratch[CLOSING, last] > 0.0
             last += 1
         if closes:
-            resolve_cluster(line, car, scratch, first, last)
-            note_passed(line, car, scratch, first, last)
+            struck = next_of_series(car, scratch, now, first, last)
+            if struck >= 0:
+                closing = scratch[CLOSING, struck]
+                for p in range(first, last):
+                    scratch[CLOSING, p] = closing if p == struck else 0.0
+                resolve_cluster(line, car, scratch, struck, struck + 1)
+            else:
+                resolve_cluster(line, car, scratch, first, last)
+                note_passed(line, car, scratch, first, last)
         first = last + 1
     for p in range(ahead, pairs):
         scratch[CONTACT_SPEED, p] = 0.0
@@ -219,6 +245,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
             harm = scratch[CLOSING, p] * scratch[CLOSING, p]
             scratch[NEW_TOTAL, p] += harm
             scratch[NEW_COUNT, p] += 1.0
+            scratch[LAST_TIME, p] = now
             if scratch[NEXT_TIME, p] == math.inf:
                 scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p] = now, scratch[CLOSING, p]
             front, rear = abs(line[SPEED, p] - scratch[BEFORE, p]), abs(line[SPEED, p + 1] - scratch[BEFORE, p + 1])

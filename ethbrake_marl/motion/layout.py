@@ -81,9 +81,10 @@ NEXT_CLOSING = 31  # of the pair: closing speed of that impact (m/s)
 BEFORE = 32  # speed before an impact (m/s)
 FRONT_CHANGE = 33  # largest change of speed by one impact at the body's front in this interval (m/s)
 REAR_CHANGE = 34  # the same at its rear (m/s)
-PART = 35  # of a part of a line: acceleration by own forces (m/s2)
-PART_RATE = 36  # its rate (m/s3)
-ROWS = 37
+LAST_TIME = 35  # of the pair: time of its last impact in this interval (s from its start); infinite: none
+PART = 36  # of a part of a line: acceleration by own forces (m/s2)
+PART_RATE = 37  # its rate (m/s3)
+ROWS = 38
 
 FAR_M = 1e300  # gap ahead of a line without an obstacle
 

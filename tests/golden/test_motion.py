@@ -1,4 +1,4 @@
-"""Motion of random lines to the last bit: the record was made by version 0.5 of this package.
+"""Motion of random lines to the last bit.
 
 ``physics_worlds.json`` has a digest, which changes with the order of floating point operations, and rounded sums, which
 change only with the physics. ``python -m tests.golden.test_motion`` records both anew.

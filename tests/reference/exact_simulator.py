@@ -59,6 +59,7 @@ class Run:
         self.v = [*line.speeds, ZERO]
         self.joined = [False] * self.n
         self.hits: list[tuple[int, Fraction]] = []
+        self.last: dict[int, Fraction] = {}  # pair -> time of its last impact
         self.pushed = [ZERO] * len(self.g)
         self.passed = [ZERO] * len(self.g)
         self.struck, self.by_forces = set(line.struck), list(line.by_forces or self.pushed)
@@ -177,21 +178,40 @@ class Run:
                 return
             before = list(self.v)
             for run in self.runs(alike=False):
-                self.pass_on(run)
+                if self.rattles(run) is None:
+                    self.pass_on(run)
+            waiting = set()  # pairs whose turn in a series comes later
             for run in self.runs(alike=False):
-                self.cluster(run)
-            closing = [(p, before[p + 1] - before[p]) for p in self.pairs if self.g[p] == 0]
+                p = self.rattles(run)
+                if p is None:
+                    self.cluster(run)
+                else:
+                    waiting |= {q for q in self.within(run) if q != p}
+                    self.cluster(slice(max(p, 0), p + 2), against=p == -1)
+            closing = [(p, before[p + 1] - before[p]) for p in self.pairs if self.g[p] == 0 and p not in waiting]
             for p, speed in closing:
                 if speed > TOUCH_MPS and p in self.struck and self.by_forces[p] > 0:
                     taken = speed - (self.v[p + 1] - self.v[p])
                     self.pushed[p] += taken * min(self.by_forces[p], speed) / speed
             self.struck |= {p for p, speed in closing if speed > TOUCH_MPS}
             self.hits += [(p, speed) for p, speed in closing if speed > TOUCH_MPS]
+            self.last |= {p: self.time for p, speed in closing if speed > TOUCH_MPS}
+
+    def within(self, run: slice) -> range:
+        return range(-1 if self.at_obstacle(run) else run.start, run.stop - 1)
+
+    def rattles(self, run: slice) -> int | None:
+        """The pair that a series of plastic impacts at this one moment strikes next; None where there is no series."""
+        pairs = self.within(run)
+        if self.line.restitution != 0 or len(pairs) < 2 or all(self.last.get(p) != self.time for p in pairs):
+            return None
+        hardest = max(pairs, key=lambda p: self.v[p + 1] - self.v[p])
+        return hardest if self.v[hardest + 1] - self.v[hardest] > TOUCH_MPS else None
 
     def pass_on(self, run: slice) -> None:
         """Add what each contact would take up if its two sides were alone, minus what its own pair closes."""
         now = list(self.v)
-        for p in range(-1 if self.at_obstacle(run) else run.start, run.stop - 1):
+        for p in self.within(run):
             self.cluster(slice(run.start, p + 1))
             front, self.v = self.v[p], list(now)
             self.cluster(slice(p + 1, run.stop), against=False)
