@@ -1,19 +1,22 @@
 """Registries of agents, shields, measures, features, objectives, algorithms and commands, by name.
 
 A running program adds an object with a ``register_...`` function. An installed package adds one with an entry point in
-its ``pyproject.toml``, as this package does for its extensions:
+its ``pyproject.toml``:
 
     [project.entry-points."ethbrake_marl.agents"]
     gentle = "my_package.agents:make_gentle"
 
-When the name is first used, the entry point is loaded and its value is passed to the ``register_...`` function.
+This package has a table ``parts.py`` instead, for its core and in the folder of each extension. When the name is first
+used, the entry point is loaded and its value is passed to the ``register_...`` function.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import cache
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from importlib.resources import files
 from threading import RLock
 from typing import Any, TypeVar
 
@@ -55,15 +58,31 @@ class Part:
 def points(group: str) -> dict[str, list[EntryPoint]]:
     """Return name -> entry points of a group such as ``agents``, this package's first; several may have one name."""
     by_name: dict[str, list[EntryPoint]] = {}
-    in_order = sorted(entry_points(group=f"ethbrake_marl.{group}"), key=lambda each: (giver(each) != OURS, each.name))
-    for point in in_order:
+    others = [point for point in entry_points(group=f"ethbrake_marl.{group}") if giver(point) != OURS]
+    for point in (*sorted(own_points(group), key=by_its_name), *sorted(others, key=by_its_name)):
         by_name.setdefault(point.name, []).append(point)
     return by_name
 
 
+def own_points(group: str) -> list[EntryPoint]:
+    """Return the parts of a group in the tables ``parts.py`` of this package."""
+    package = __name__.rpartition(".")[0]
+    folder = files(package) / "extensions"
+    extensions = [each.name for each in folder.iterdir() if (each / "parts.py").is_file()] if folder.is_dir() else []
+    found = []
+    for place in (package, *(f"{package}.extensions.{name}" for name in extensions)):
+        table = import_module(f"{place}.parts").PARTS.get(group, {})
+        found += [EntryPoint(name, f"{place}.{value}", group) for name, value in table.items()]
+    return found
+
+
+def by_its_name(point: EntryPoint) -> str:
+    return point.name
+
+
 def giver(point: EntryPoint) -> str:
-    """Return the name of the package that defines an entry point, or ``?``."""
-    return "?" if point.dist is None else point.dist.name
+    """Return the name of the package that defines an entry point."""
+    return OURS if point.dist is None else point.dist.name
 
 
 def versions_used() -> dict[str, str]:
@@ -185,9 +204,4 @@ class Registry(Mapping[str, T]):
 
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
         """Return the error for an unknown name. ``known``: names to suggest or list; None: all."""
-        if not points("agents"):
-            return UnknownName(
-                f"unknown {self.kind} {name!r}: no entry points of the package {OURS} are installed; install the"
-                " package, or install it again if its files are newer than the installation (make venv)"
-            )
         return unknown_name(self.kind, name, self if known is None else known, may_be_own=True)

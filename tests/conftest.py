@@ -19,7 +19,6 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
     "MPLBACKEND": "Agg", "SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1",
 }  # fmt: skip
 
-# `installed` comes first: what it finds is what the others, and all processes that they start, find.
 FIXTURES = ("installed", "kernels", "pictures", "commands", "registered", "other_law")
 pytest_plugins = [f"tests.fixtures.{name}" for name in FIXTURES]
 

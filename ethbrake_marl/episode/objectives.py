@@ -52,7 +52,7 @@ FIRST_WEIGHT = 1000.0  # weight of A in ``first:A,then:B``; B keeps the scale fo
 class Harm(NamedTuple):
     """Harm of n worlds over some time: of each pair, of each vehicle, and of the line."""
 
-    pairs: Floats  # [n, N + 1] harm of each pair, m2/s2; column 0: with the obstacle
+    pairs: Floats  # [n, N + 1] harm of each pair without the price of conduct, m2/s2; column 0: with the obstacle
     borne: Floats  # [n, N] harm that each vehicle bears, m2/s2
     whole: Floats  # [n] harm of the line, m2/s2
     car: Floats  # [n, CAR_ROWS, N + 1] parameters (`motion.layout`)
@@ -61,14 +61,15 @@ class Harm(NamedTuple):
     def of(cls, pairs: Floats, own: Floats, car: Floats) -> Harm:
         """Harm of pairs, vehicles and line, from the harm ``pairs`` of each pair (column 0: with the obstacle).
 
-        The rear vehicle of a pair bears the part ``own`` alone; the two share the rest by their masses. ``pairs`` and
+        The rear vehicle of a pair bears the part ``own``, its conduct, alone; the two share the rest by their masses. ``pairs`` and
         ``own`` are [n, N + 1] m2/s2, ``car`` the parameters of a ``State``.
         """
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             whole = whole + pairs[:, p]
-        split_harm(pairs - own, car[:, MASS], borne)
-        return cls(pairs, borne + own[:, :-1], whole, car)
+        impacts = np.maximum(pairs - own, 0.0)
+        split_harm(impacts, car[:, MASS], borne)
+        return cls(impacts, borne + own[:, :-1], whole, car)
 
     def weighted(self, weights: Floats) -> Floats:
         """``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for ``weights`` [n, N]; summed from front to rear."""

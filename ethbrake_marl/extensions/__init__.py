@@ -1,5 +1,5 @@
 """Extensions: optional parts of the package, one folder each.
 
-The rest of the package works without the folder ``extensions``, because every extension registers itself by an entry
-point.
+The rest of the package works without the folder ``extensions``, because the table ``parts.py`` of an extension says
+what it adds.
 """

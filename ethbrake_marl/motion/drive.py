@@ -342,7 +342,7 @@ def through_interval_building(line, car, scratch, start, until, ahead):
 def note_driving(line, car, wanted, start, until):
     """Add to the row DROVE what the engines do from ``start`` to ``until``; ``line`` is that of ``start``.
 
-    It depends on a vehicle's own force and command alone, so no contact and no other vehicle changes a bit of it.
+    It depends on a vehicle's own force and command alone: no contact makes driving free.
     """
     for i in range(1, line.shape[1]):
         if wanted[i] > 0.0 or line[FORCE, i] > 0.0:

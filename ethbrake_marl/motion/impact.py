@@ -184,18 +184,26 @@ def note_passed(line, car, scratch, first, last):
 def next_of_series(car, scratch, now, first, last):
     """Pair of a cluster that an endless series of plastic impacts strikes next; -1 if the cluster is struck at once.
 
+    All other pairs of the cluster then count as not closing.
+
     With e = 0 a light vehicle may rattle between two others: each gap is about the square of the one before, until it
     is 0 in floating-point numbers, and the pairs touch. The series is then played to its end at this moment, one pair
     after the other, the hardest impact first. It is known by a pair that had an impact at this moment: after a plastic
     impact at once no pair closes.
     """
+    if car[RESTITUTION, 0] > 0.0 or last - first < 2:
+        return -1
     hardest, again = first, False
     for p in range(first, last):
         again = again or scratch[LAST_TIME, p] == now
         if scratch[CLOSING, p] > scratch[CLOSING, hardest]:
             hardest = p
-    plays = again and last - first > 1 and car[RESTITUTION, 0] == 0.0 and scratch[CLOSING, hardest] > TOUCH_MPS
-    return hardest if plays else -1
+    if not again or scratch[CLOSING, hardest] <= TOUCH_MPS:
+        return -1
+    for p in range(first, last):
+        if p != hardest:
+            scratch[CLOSING, p] = 0.0  # its turn comes later
+    return hardest
 
 
 @kernel
@@ -228,14 +236,8 @@ def resolve_impacts(line, car, scratch, now, ahead):
             last += 1
         if closes:
             struck = next_of_series(car, scratch, now, first, last)
-            if struck >= 0:
-                closing = scratch[CLOSING, struck]
-                for p in range(first, last):
-                    scratch[CLOSING, p] = closing if p == struck else 0.0
-                resolve_cluster(line, car, scratch, struck, struck + 1)
-            else:
-                resolve_cluster(line, car, scratch, first, last)
-                note_passed(line, car, scratch, first, last)
+            resolve_cluster(line, car, scratch, first if struck < 0 else struck, last if struck < 0 else struck + 1)
+            note_passed(line, car, scratch, first, last if struck < 0 else first)
         first = last + 1
     for p in range(ahead, pairs):
         scratch[CONTACT_SPEED, p] = 0.0

@@ -44,10 +44,12 @@ from markdown_it import MarkdownIt
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command, whole_command
 from tests.cli.test_printed import PROGRESS
+from tests.fixtures.registered import registries
 from tests.programmes.__main__ import main as run_programme
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+GROUPS = {f"ethbrake_marl.{each.group}" for each in registries()}
 COMMENT = re.compile(r"<!-- block: (.*) -->\s*", re.DOTALL)
 MARK = re.compile(r"(slow$|not run: |needs |short(?: |$)|except |write |show |change |without )(.*)")
 NO_CODE = ("text", "bibtex", "{include} ../CHANGELOG.md")
@@ -147,7 +149,7 @@ class Reader:
             read_yaml(block)
         elif block.language == "toml":
             groups = tomllib.loads(block.text)["project"]["entry-points"]
-            assert groups.keys() <= PROJECT["entry-points"].keys(), f"{block.place}: unknown entry points"
+            assert groups.keys() <= GROUPS, f"{block.place}: unknown entry points"
         elif block.language == "{eval-rst}":
             for name in re.findall(r"(?m)^   ([a-zA-Z_.]+)$|autopydantic_model:: ethbrake_marl\.(.*)$", block.text):
                 pkgutil.resolve_name(f"ethbrake_marl.{''.join(name)}")

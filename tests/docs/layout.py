@@ -14,10 +14,9 @@ BEGINNING = """# How the code is laid out
 Which file does what? [Another page](reading.md) says in which order to read the core.
 
 The core has everything that the paper's environment, training, scenarios and levels of cooperation
-need. An extension is a folder that registers itself by entry points (`pyproject.toml`); [no module
-of the core names it](../decisions/README.md#the-core-never-names-an-extension). To delete one,
-delete its folder, its folder in `tests/extensions/`, its lines in `pyproject.toml` and every
-extension that uses it; then run `make venv`.
+need. An extension is a folder whose table `parts.py` says what it adds; [no module of the core names
+it](../decisions/README.md#the-core-never-names-an-extension). To delete one, delete its folder, its
+folder in `tests/extensions/`, and every extension that uses it.
 
 A module imports only from its own folder or from what this page lists below it; `make lint` checks
 this. `python -m tests.docs.layout` makes this page from the code.
@@ -34,7 +33,7 @@ this. `python -m tests.docs.layout` makes this page from the code.
 | Where does a number in a table come from? | `evaluation/`: `measures.py`, `statistics.py`, `summary.py` |
 | Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/decision.py` |
 | What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
-| Which agents are there? | `pyproject.toml`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
+| Which agents are there? | `parts.py`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
 | Who lets agents drive? | `agents/drive.py`: `play`, `drive` |
 | What can a scenario file say? | `worlds/`: `scenario.py`, `rules.py`; [scenarios](../scenarios.md) |
 | How does a training run? | `training/`: `train.py`, `ppo.py`, `sac.py`; between two updates: `updates.py` |
@@ -44,7 +43,7 @@ From a name to a number, as in `ethbrake evaluate --agents universal`:
 
 ```text
 cli/evaluate.py         evaluate_command
-names.py                teams_of, make_agent; pyproject.toml says: agents/trained.py, make_trained
+names.py                teams_of, make_agent; parts.py says: agents/trained.py, make_trained
 policies/bundle.py      load_shipped
 evaluation/compared.py  Compared.of (in Python one begins with the next line)
 evaluation/door.py      evaluate; worlds/sampling.py, draw: the fixed list of worlds
@@ -95,7 +94,7 @@ def layers(folder: str) -> list[list[str]]:
     """The layers of a folder of the package in the contracts of import-linter, from the top down."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["importlinter"]["contracts"]
     (contract,) = (each for each in contracts if each.get("containers") == [folder])
-    return [layer.split(" | ") for layer in contract["layers"]]
+    return [[room.strip("()") for room in layer.split(" | ")] for layer in contract["layers"]]
 
 
 def table(rooms: list[list[str]], inside: str = "") -> list[str]:

@@ -1,6 +1,6 @@
 """The core without extensions: a copy passes the core's tests, trains, evaluates and uses the shield.
 
-The copy has no extensions, no tests of them, and no entry points to them. ``make core`` takes about 100 s of processor
+The copy has no extensions and no tests of them. ``make core`` takes about 100 s of processor
 time: the first case of each parametrised test, without the tests of the installation. ``--whole`` runs all tests of the
 core with all cases. ``--each`` instead deletes one extension at a time, with the extensions that use it, and runs the
 tests that remain, the first case of each.
@@ -13,13 +13,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import tomllib
 from collections.abc import Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
 from tests.docs.layout import arrows, layers
-from tests.fixtures.installed import write_metadata
 from tests.programmes import ROOT, Cases, Given, Told
 
 OPTIONS = {
@@ -81,7 +79,7 @@ def users_of(extension: str) -> set[str]:
 
 
 def copy_without(extensions: Iterable[str] | None, folder: Path) -> Path:
-    """Copy the repository without these extensions (None: without any), with the package metadata of the copy."""
+    """Copy the repository without these extensions (None: without any)."""
     folder.mkdir()
     for name in COPIED:
         source = ROOT / name
@@ -92,11 +90,6 @@ def copy_without(extensions: Iterable[str] | None, folder: Path) -> Path:
     for parent in ("ethbrake_marl/extensions", "tests/extensions"):
         for path in [parent] if extensions is None else [f"{parent}/{each}" for each in extensions]:
             shutil.rmtree(folder / path, ignore_errors=True)
-    project = folder / "pyproject.toml"
-    which = r"\w+" if extensions is None else "|".join(extensions)
-    text = re.sub(rf'(?m)^["\w.-]+ = "ethbrake_marl\.extensions\.({which})\..*"\n', "", project.read_text("utf-8"))
-    project.write_text(text, "utf-8")
-    write_metadata(folder, tomllib.loads(text)["project"])
     return folder
 
 

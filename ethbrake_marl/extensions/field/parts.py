@@ -1,0 +1,14 @@
+"""The parts that this extension adds: group -> name -> module of this folder and object."""
+
+PARTS = {
+    "agents": {
+        "idm": "controllers:IDM",
+        "acc": "controllers:ACC",
+        "cacc": "controllers:CACC",
+        "rss": "controllers:RSS",
+        "r157_human": "controllers:R157_HUMAN",
+        "r157_fsm": "controllers:R157_FSM",
+        "aeb": "controllers:AEB",
+        "field": "controllers:FIELD",
+    }
+}

@@ -1,0 +1,16 @@
+"""The parts that this extension adds: group -> name -> module of this folder and object."""
+
+PARTS = {
+    "features": {
+        "age": "features:AGE",
+        "intent": "features:INTENT",
+        "place_known": "features:KNOWN.place",
+        "speed_known": "features:KNOWN.speed",
+        "acceleration_known": "features:KNOWN.acceleration",
+        "braking_capacity_known": "features:KNOWN.braking_capacity",
+        "latency_known": "features:KNOWN.latency",
+        "mass_known": "features:KNOWN.mass",
+        "intent_known": "features:KNOWN.intent",
+    },
+    "v2x_extensions": {"persistence": "declared:MESSAGES", "tells": "declared:MESSAGES"},
+}

@@ -1,0 +1,35 @@
+"""The parts of the core: group -> name -> module and object, loaded when the name is first used."""
+
+PARTS = {
+    "agents": {
+        "coast": "agents.scripts:COAST_ENTRY",
+        "full_brake": "agents.scripts:FULL_BRAKE_ENTRY",
+        "constant": "agents.scripts:CONSTANT_ENTRY",
+        "policy": "agents.trained:POLICY",
+        "team": "agents.trained:TEAM",
+        "ppo": "agents.trained:PPO",
+        "sac": "agents.trained:SAC",
+        "universal": "agents.trained:UNIVERSAL",
+        "universal-paper": "agents.trained:UNIVERSAL_PAPER",
+        "ppo-obstacle": "agents.trained:PPO_OBSTACLE",
+        "rollout-obstacle": "agents.trained:ROLLOUT_OBSTACLE",
+        "vine-preference": "agents.trained:VINE_PREFERENCE",
+        "vine-front": "agents.trained:VINE_FRONT",
+        "vine-pair": "agents.trained:VINE_PAIR",
+        "vine-all": "agents.trained:VINE_ALL",
+        "e_v2x_bm": "agents.e_v2x_bm:E_V2X_BM",
+        "ladder": "agents.scripts:LADDER",
+    },
+    "shields": {"step": "shields.step:STEP", "episode": "shields.algorithm_1:EPISODE"},
+    "terms": {"intervention": "shields.decision:intervention"},
+    "measures": {
+        "pushed_mps": "evaluation.pushing:PUSHED_MPS",
+        "pushed_m": "evaluation.pushing:PUSHED_M",
+        "drove_towards": "evaluation.pushing:DROVE_TOWARDS",
+        "still_moving": "evaluation.pushing:STILL_MOVING",
+        "injury": "evaluation.injuries:INJURY",
+        "injury_lr4s": "evaluation.injuries:LR4S",
+        "injury_reference": "evaluation.injuries:REFERENCE",
+        "injury_gidas": "evaluation.injuries:GIDAS",
+    },
+}
