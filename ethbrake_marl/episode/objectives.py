@@ -61,8 +61,8 @@ class Harm(NamedTuple):
     def of(cls, pairs: Floats, own: Floats, car: Floats) -> Harm:
         """Harm of pairs, vehicles and line, from the harm ``pairs`` of each pair (column 0: with the obstacle).
 
-        The rear vehicle of a pair bears the part ``own``, its conduct, alone; the two share the rest by their masses. ``pairs`` and
-        ``own`` are [n, N + 1] m2/s2, ``car`` the parameters of a ``State``.
+        The rear vehicle of a pair bears the part ``own``, its conduct, alone; the two share the rest by their masses.
+        ``pairs`` and ``own`` are [n, N + 1] m2/s2, ``car`` the parameters of a ``State``.
         """
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
