@@ -18,6 +18,7 @@ from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise, summarise_by, summarise_lists
 from ethbrake_marl.files.sheet import terminal_text
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Foreteller, evaluated, recorded
+from tests.fixtures.scenarios import VARIED
 from tests.refused import refused
 
 EXPENSIVE = ["pushed_mps", "pushed_m"]
@@ -255,5 +256,5 @@ def test_lists__of_worlds_that_differ_show_the_worst_impact_and_the_mean_harm() 
 
 
 def test_summary__of_one_scenario_of_a_mixture_has_no_range_of_what_is_not_there() -> None:
-    tables = eb.summarise_by(eb.evaluate("mixture-universal", "coast", episodes=8), "scenario")
+    tables = eb.summarise_by(eb.evaluate(VARIED, "coast", episodes=8), "scenario")
     assert any("obstacle_gap_m" not in table.parameters for table in tables.values())

@@ -9,6 +9,7 @@ from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from tests.contract.interfaces import SCENARIOS, actions
+from tests.fixtures.scenarios import VARIED
 from tests.refused import refused
 
 N, STEPS = 3, 160
@@ -69,12 +70,12 @@ def test_infos__are_those_of_the_single_environment(scenario: Any) -> None:
 
 
 def test_description__has_columns_that_only_some_of_the_worlds_have() -> None:
-    env = EthBrakeVectorEnv(4, "mixture-universal")
-    env.reset(seed=2)
+    env = EthBrakeVectorEnv(4, VARIED)
+    env.reset(seed=4)
     worlds = env.describe_worlds()
-    assert worlds["world"].tolist() == [0, 1, 2, 3] and worlds["world_seed"].tolist() == [2] * 4
-    assert worlds["vehicle_1_type"].tolist() == ["", "", "", "equipped"]
-    assert np.isnan(worlds["obstacle_gap_m"]).tolist() == [False, True, False, True]
+    assert worlds["world"].tolist() == [0, 1, 2, 3] and worlds["world_seed"].tolist() == [4] * 4
+    assert worlds["vehicle_1_type"].tolist() == ["", "", "unequipped", "equipped"]
+    assert np.isnan(worlds["obstacle_gap_m"]).tolist() == [False, True, True, True]
     assert worlds["scenario"].shape == (4,)
 
 

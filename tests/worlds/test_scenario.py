@@ -23,7 +23,7 @@ from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
 from ethbrake_marl.worlds.game import Pool, views_of
 from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
-from tests.fixtures.scenarios import SHIPPED
+from tests.fixtures.scenarios import SHIPPED, VARIED
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")
@@ -46,7 +46,7 @@ def bits(state: Any) -> list[bytes]:
 
 @pytest.mark.parametrize(
     "name",
-    ["paper-random", "engineering-loaded-lorries", "cooperation-4-congested", "mixture-trucks", "standards-r157"],
+    ["paper-random", "engineering-loaded-lorries", "cooperation-4-congested", "mixture-three-tests", "standards-r157"],
 )
 def test_world_k__is_the_same_alone_and_in_any_batch(name: str) -> None:
     scenario = load_scenario(name)
@@ -174,7 +174,7 @@ def test_table__gives_whole_rows() -> None:
 
 
 def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> None:
-    mixture = load_scenario("mixture-trucks")
+    mixture = load_scenario("mixture-three-tests")
     drawn = mixture.draw(60, 7)
     parts = [drawn.scenarios == member.name for member in mixture.members]
     assert np.sum(parts, axis=0).tolist() == [1] * 60
@@ -243,7 +243,7 @@ def test_columns__are_all_that_was_drawn() -> None:
     assert [*of_mixture][:3] == ["world", "scenario", "gap_1_m"]
     assert [*of_types][:5] == ["world", "vehicle_1_type", "vehicle_2_type", "vehicle_3_type", "gap_1_m"]
     assert of_types["world"].tolist() == [5, 6, 7]
-    some = load_scenario("mixture-universal").draw(30, 7)
+    some = VARIED.draw(30, 7)
     assert set(columns_of(some)["obstacle_gap_m"][some.worlds.obstacle_gap_m == np.inf].astype(str)) == {"nan"}
     assert (of_wet["braking_capacity_1_mps2"] == of_wet["friction"] * 9.81).all()
     fixed = {f"{name}_{i}_{unit}" for name, unit in (("mass", "t"), ("latency", "s")) for i in (1, 2, 3)}
@@ -260,7 +260,7 @@ def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
 
 
 def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert len(list_scenarios()) == 57
+    assert len(list_scenarios()) == 52
     assert len(group_of_scenarios("benchmark")) == 10
     assert group_of_scenarios("stress") == ["stress-wide", "stress-wide-obstacle"]
     assert group_of_scenarios("nothing") == []
