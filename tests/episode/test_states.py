@@ -22,7 +22,7 @@ REWARDS: dict[str, Any] = {
     "paper-random-obstacle": {"harm": 1.0, "harm_count": "total", "terminal": 1.0},
     "cooperation-3-pair": {"harm": 0.05, "shaping": 0.05, "jerk": 1e-4, "objective": "own"},
     "paper-random-buildup": "paper",
-    "mixture-universal": "total-harm",
+    "realistic-mixed": "total-harm",
 }
 
 

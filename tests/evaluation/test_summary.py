@@ -255,5 +255,7 @@ def test_lists__of_worlds_that_differ_show_the_worst_impact_and_the_mean_harm() 
 
 
 def test_summary__of_one_scenario_of_a_mixture_has_no_range_of_what_is_not_there() -> None:
-    tables = eb.summarise_by(eb.evaluate("mixture-universal", "coast", episodes=8), "scenario")
+    both = [{"scenario": "paper-random"}, {"scenario": "paper-random-obstacle"}]
+    mixture = eb.load_scenario({"name": "both", "mixture": both})
+    tables = eb.summarise_by(eb.evaluate(mixture, "coast", episodes=8), "scenario")
     assert any("obstacle_gap_m" not in table.parameters for table in tables.values())

@@ -96,7 +96,7 @@ CONTENT = load_scenario("paper-random").declared()
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "scenario": {"scenario": load_scenario("paper-random-obstacle")},
     "mixture": {"scenario": load_scenario("mixture-trucks")},
-    "table": {"scenario": load_scenario("engineering-measured-triples")},
+    "table": {"scenario": load_scenario("standards-ccrs")},
     "path": {"scenario": Path("mine.yaml")},
     "content": {"scenario": {**CONTENT, "mass_t": np.array([1.0, 2.0, 3.0]), "gaps_m": {"choice": (7, np.float32(8))}}},
     "reward": {"reward": {"harm": np.float32(0.3), "jerk": np.float64(1e-5), "objective": ("own", "own", "own")}},
@@ -136,13 +136,18 @@ def test_spec__every_argument_goes_through_json_and_makes_the_same_episode(given
     assert same.spec.max_episode_steps == alike.spec.max_episode_steps == many.spec.max_episode_steps >= len(first) - 1
 
 
+LATER = load_scenario("realistic-motorway").replace(
+    speeds_mps={"uniform": [3, 8]}, gaps_m={"uniform": [4, 12]}, alert_s={"uniform": [1, 5]}, horizon_s=9.0
+)
+
+
 @pytest.mark.parametrize(
     ("scenario", "learner", "steps", "least"),
     [("paper-random", "vehicle_2", 75, 75), ("paper-random", "vehicle_3", 72, 72),
-     ("mixture-delays", "vehicle_2", 79, 77), ("engineering-stop-and-go", "vehicle_2", 75, 60),
+     ("mixture-delays", "vehicle_2", 79, 77), (LATER, "vehicle_2", 75, 60),
      ("paper-random-obstacle", "vehicle_1", 80, 80)],
 )  # fmt: skip
-def test_spec__states_the_longest_episode_in_steps(scenario: str, learner: str, steps: int, least: int) -> None:
+def test_spec__states_the_longest_episode_in_steps(scenario: Any, learner: str, steps: int, least: int) -> None:
     env = gymnasium.make("EthBrake-v2", scenario=scenario, learners=[learner])
     assert env.spec.max_episode_steps == env.unwrapped.spec.max_episode_steps == steps
     taken, driving = [], np.ones(1, np.float32)

@@ -121,7 +121,7 @@ def test_report__that_fails_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"), [({"scenario": "cooperation-0-sensors"}, "has no learner"), ({"list_seed": -1}, "seed")]
+    ("settings", "said"), [({"scenario": "level-0-sensors"}, "has no learner"), ({"list_seed": -1}, "seed")]
 )
 def test_refused__before_anything_is_written(settings: dict[str, Any], said: str, tmp_path: Path) -> None:
     with refused(said):

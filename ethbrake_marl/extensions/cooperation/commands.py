@@ -69,7 +69,7 @@ def ablate_command(
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.cli.train import changed
         from ethbrake_marl.extensions.cooperation.ablation import FULL, QUICK, Ablation, measure, train_all
-        from ethbrake_marl.extensions.cooperation.levels import LADDER, STANDARD, SWEPT, read_levels, sweep_levels
+        from ethbrake_marl.extensions.cooperation.levels import STANDARD, SWEPT, read_levels, sweep_levels
         from ethbrake_marl.extensions.cooperation.optimum import with_optima
         from ethbrake_marl.extensions.cooperation.results import tables, write_ablation
         from ethbrake_marl.training.recipe import load_recipe
@@ -80,7 +80,7 @@ def ablate_command(
         changes = read_settings(settings, [key for recipe in loaded for key in type(recipe).model_fields])
         own = [changed(recipe, changes.recipe, out) for recipe in loaded]
         own = [recipe if recipe.scheme else recipe.replace(scheme="shared") for recipe in own]
-        usual = ",".join(LADDER if quick else STANDARD) if sweep is None else SWEPT
+        usual = ",".join(STANDARD) if sweep is None else SWEPT
         names = [each.strip() for each in (levels or usual).split(",")]
         if sweep is not None and len(names) != 1:
             raise InvalidInput(f"levels: {len(names)} levels given; a sweep needs exactly one level")

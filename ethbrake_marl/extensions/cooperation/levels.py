@@ -17,15 +17,10 @@ from ethbrake_marl.extensions.cooperation.sweep import Swept, parse_sweep
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.worlds.describe import quantities_of
-from ethbrake_marl.worlds.mixture import WORDS
 from ethbrake_marl.worlds.sampling import Drawn
 from ethbrake_marl.worlds.scenario import Scenario
 
-LADDER = (
-    *("cooperation-0-sensors", "cooperation-1-front", "cooperation-2-paper", "cooperation-3-pair"),
-    "cooperation-4-all",
-)
-STANDARD = (*LADDER, "cooperation-2-blocked")
+STANDARD = ("level-0-sensors", "level-1-messages", "level-2-own", "level-3-line", "level-4-pair", "level-5-all")
 SWEPT = "cooperation-3-pair"  # default level of a sweep
 
 SHARED = ("vehicles", "time_step_s", "horizon_s", "observation")  # keys that are the same at all levels
@@ -46,31 +41,19 @@ class Level(NamedTuple):
 
 
 def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
-    """Load the levels of an ablation, and choose for each the earlier level with which it is compared.
+    """Load the levels of an ablation; each is compared with the previous one.
 
-    A level that differs from an earlier one only in ``v2x`` is compared with that one. The other levels form a ladder,
-    in which each is compared with the previous one. Raises ``InvalidInput`` for fewer than two levels, or one given
-    twice.
+    Raises ``InvalidInput`` for fewer than two levels, or one given twice.
     """
     levels: list[Level] = []
-    ladder: list[Level] = []
     for name in names:
         scenario = settings.change_scenario(name)
         if any(level.name == scenario.name for level in levels):
             raise InvalidInput(f"levels: {scenario.name!r} is given twice; give each level once")
-        clear = next((each for each in ladder if _is_other_channel(scenario, each.scenario)), None)
-        before = clear or (ladder[-1] if ladder else None)
-        levels.append(Level(scenario.name, scenario, before and before.name))
-        if clear is None:
-            ladder.append(levels[-1])
+        levels.append(Level(scenario.name, scenario, levels[-1].name if levels else None))
     if len(levels) < 2:
         raise InvalidInput(f"levels: {count_of(len(levels), 'level')} given; give at least two levels to compare")
     return levels
-
-
-def _is_other_channel(one: Scenario, other: Scenario) -> bool:
-    contents = [each.content(without=("name", *WORDS, "v2x")) for each in (one, other)]
-    return one.v2x != other.v2x and contents[0] == contents[1]
 
 
 def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[TrainingRecipe]) -> list[Level]:

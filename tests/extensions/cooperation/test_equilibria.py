@@ -140,7 +140,7 @@ def test_price__is_the_ratio_of_the_means_over_worlds_where_something_converged(
 @pytest.mark.parametrize(
     ("level", "options", "message"),
     [
-        ("cooperation-0-sensors", {}, "'cooperation-0-sensors' has no learner; give at least one vehicle"),
+        ("level-0-sensors", {}, "'level-0-sensors' has no learner; give at least one vehicle"),
         ("cooperation-3-pair", {"rounds": 0}, "rounds = 0: must be a whole number, at least 1"),
         ("cooperation-3-pair", {"budget": 0}, "budget = 0: must be a whole number, at least 1"),
         ("cooperation-3-pair", {"objective": ["own"]}, "objective: the list has 1 entries; must have 3"),

@@ -207,7 +207,7 @@ def test_the_learning_rate__is_the_tensor_that_the_optimiser_reads(program: Modu
             ["--device", "cpu", "--scenario", "paper-random-map", "--harm-count", "first"],
             "another physics run on a processor only",
         ),
-        (["--device", "cpu", "--scenario", "cooperation-0-sensors"], "has no learner"),
+        (["--device", "cpu", "--scenario", "level-0-sensors"], "has no learner"),
         (["--device", "cpu", "--harm-count", "last"], "harm_count"),
         (["--steps", "0"], "steps = 0"),
         (["--n", "2", "--rollout", "4"], "minibatches = 16: must be at most n * rollout = 8"),

@@ -20,7 +20,7 @@ SIX = {
     "obstacle": "paper-random-obstacle",
     "learners": "cooperation-4-all",
     "five": "cooperation-4-five",
-    "types": "mixture-universal",
+    "types": "realistic-mixed",
 }
 
 FOLLOWED = eb.load_scenario("paper-random").replace(

@@ -39,8 +39,7 @@ def driven(name: str, **settings: Any) -> tuple[Problem, Profiles, State]:
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["paper-random", "paper-random-obstacle", "paper-random-buildup", "cooperation-3-pair", "engineering-queue-ahead"],
+    "name", ["paper-random", "paper-random-obstacle", "paper-random-buildup", "cooperation-3-pair", "realistic-mixed"]
 )
 def test_follow__to_the_last_bit_what_agents_do(name: str) -> None:
     problem, profiles, last = driven(name)
