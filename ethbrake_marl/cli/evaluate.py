@@ -61,7 +61,7 @@ def evaluate_command(
     A name can be followed by a shield, +episode or +step; for instance full_brake+step or policy@PATH+step, where PATH
     is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
     total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving
-    before the first impact and for motion at the horizon. --set measures=injury,pushed_m adds measures to the
+    before the first impact and for motion at the horizon. --set measures=pushed_mps,pushed_m adds measures to the
     results.
     """
     with Out(as_json=as_json, force=force) as out:
@@ -98,7 +98,7 @@ def _compared(
 
     harm_count, measures = chosen.command.get("harm_count", "first"), chosen.command.get("measures", "")
     if not isinstance(measures, str):
-        raise InvalidInput("--set measures: must be names with commas between them, for instance measures=injury")
+        raise InvalidInput("--set measures: must be names with commas between them, for instance measures=pushed_m")
     loaded = chosen.change_scenario(scenario)
     return Compared.of(
         loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,

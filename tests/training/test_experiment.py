@@ -68,7 +68,7 @@ def test_several_learners__are_compared_whole_without_each_and_shielded(scheme: 
 
 def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_path: Path) -> None:
     class Mine:
-        measures: tuple[str, ...] = ("injury_lr4s", "nobody_has_this")
+        measures: tuple[str, ...] = ("pushed_mps", "nobody_has_this")
 
         def write(self, experiment: Experiment, tell: Callable[[Progress], None]) -> tuple[list[str], str]:
             (experiment.trained.directory / "mine.txt").write_text("x")
@@ -81,7 +81,7 @@ def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_pa
         SHORT, eb.load_scenario("paper-random-buildup"), run, episodes=10, list_seed=3, report=Mine(),
         on_progress=lambda progress: notes.append(progress.note),
     )  # fmt: skip
-    assert (found.measures, tables, where) == (("injury_lr4s",), ["table"], "there")
+    assert (found.measures, tables, where) == (("pushed_mps",), ["table"], "there")
     assert found.compared.result.about["seed"] == 3 and "mine.txt" in status(run)["written"]
     (said,) = filter(None, notes)
     assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise: brakes build up gradually")
