@@ -11,8 +11,7 @@ from ethbrake_marl.extensions.reproduction import curves, strategies, tables
 from ethbrake_marl.extensions.reproduction.items import ITEMS
 from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Settings
 from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED, reported
-from ethbrake_marl.extensions.reproduction.readings import STATED
-from ethbrake_marl.extensions.reproduction.search import NEAREST
+from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
 from ethbrake_marl.extensions.reproduction.verdicts import claims_sheet
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.site import DOCS, load
