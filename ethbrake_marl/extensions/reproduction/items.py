@@ -14,6 +14,7 @@ from ethbrake_marl import __version__
 from ethbrake_marl.errors import count_of, unknown_name
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.extensions.reproduction.curves import reproduce_delays, reproduce_distance, reproduce_illustration
+from ethbrake_marl.extensions.reproduction.documents import latex, markdown
 from ethbrake_marl.extensions.reproduction.learning import (
     HIGH,
     LOW,
@@ -161,7 +162,7 @@ def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[Drawn] = 
     for sheet in sheets:
         stem = re.sub(r"[^a-z0-9]+", "-", sheet.title.lower()).strip("-") or "claims"
         write_output(place / f"{stem}.csv", sheet.csv().encode(), force=True)
-        write_output(place / f"{stem}.tex", f"{sheet.latex()}\n".encode(), force=True)
+        write_output(place / f"{stem}.tex", f"{latex(sheet)}\n".encode(), force=True)
 
 
 def plain(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
@@ -186,11 +187,11 @@ def overview(results: Mapping[Item, Made]) -> Sheet:
 
 def page(made_by: str, results: Mapping[Item, Made], settings: Settings) -> str:
     lead = f"Numbers, statements and figures of {PAPER}, and ours. Made by {made_by}."
-    parts = ["# The paper, reproduced", lead, LEAD, *([] if settings.full else [QUICK]), overview(results).markdown()]
+    parts = ["# The paper, reproduced", lead, LEAD, *([] if settings.full else [QUICK]), markdown(overview(results))]
     for item, made in results.items():
         labels = f" In the paper's source: {', '.join(f'`{label}`' for label in item.labels)}." if item.labels else ""
         parts += [f"## {item.title}", f"{item.what}{labels} Command: `ethbrake reproduce {item.name}`.", *made.notes]
         parts += [f"![{each.title}. {each.text}]({item.name}/{each.stem}.svg)" for each in made.figures]
         for sheet in made.sheets:
-            parts += [f"### {sheet.title}", sheet.markdown(), *filter(None, [sheet.note])]
+            parts += [f"### {sheet.title}", markdown(sheet), *filter(None, [sheet.note])]
     return "\n\n".join(parts).replace("H*", r"H\*") + "\n"
