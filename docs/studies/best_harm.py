@@ -66,7 +66,8 @@ def main(words: list[str]) -> None:
     if given.shipped:
         if outdated := outdated_tables():
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
-        print(shipped_bounds(shipped_tables()).markdown())
+        sheet = shipped_bounds(shipped_tables())
+        print("\n".join(f"| {' | '.join(cell.in_words for cell in row)} |" for row in sheet.shown()))
         return
     names = [Path(word).name if word.endswith(".npz") else word for word in words]  # without folders
     table = search(given, shlex.join(["docs/studies/best_harm.py", *names]))

@@ -1,4 +1,4 @@
-"""The commands ``evaluate`` and ``compare``."""
+"""The command ``evaluate``."""
 
 from __future__ import annotations
 
@@ -139,21 +139,3 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
     if per_world == "parquet":
         need("pyarrow")
     check_folder(output, FILES, force=out.force)
-
-
-FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of `evaluate --output`.")
-
-
-def compare_command(first: Annotated[Path, FILE], second: Annotated[Path, FILE], as_json: JsonOption = False) -> None:
-    """Show how harm differs between two results.
-
-    Shows the harm in the second result minus the harm in the first, for each agent that both results contain. The two
-    results must come from the same worlds of the same scenario. Confidence intervals are paired by world if both
-    folders contain the file that --per-world writes.
-    """
-    with Out(as_json=as_json) as out:
-        from ethbrake_marl.evaluation.compare import compare_results
-        from ethbrake_marl.evaluation.results import read_result
-
-        comparison = compare_results(read_result(first), read_result(second))
-        out.result(comparison.to_json(), comparison.sheet())
