@@ -68,7 +68,7 @@ def test_equal_time__compares_with_the_first_team() -> None:
     scenario, game = eb.open_game("paper-random")
     teams = make_teams("e_v2x_bm,full_brake", scenario)
     rows = equal_time.rows_of(equal_time.drive(scenario.sample(30, 7), teams, game, 1), teams)
-    assert {row[0]: row[5] == "" for row in rows} == {"`e_v2x_bm`": True, "`full_brake`": False}
+    assert {row[0]: row[6] == "" for row in rows} == {"`e_v2x_bm`": True, "`full_brake`": False}
     assert all(float(row[2]) > 0.0 for row in rows)
 
 
