@@ -100,12 +100,16 @@ if __name__ == "__main__":
     parser.add_argument("picture", help="file for the figure")
     given = parser.parse_args()
     every = {test: costs_of(test) for test in TESTS}
-    print("| who drives Vehicle 2 | price | first-impact harm | total harm | honest cost | push (m/s) | drives | moves |")
+    print(
+        "| who drives Vehicle 2 | price | first-impact harm | total harm | honest cost | push (m/s) | drives | moves |"
+    )
     print("|---|---:|---:|---:|---:|---:|---:|---:|")
     for test, costs in every.items():
         print(f"| **{TESTS[test]}** | | | | | | | |")
         for agent, price, first, total, honest, push, drove, moving in costs:
             shown = "" if agent == "full_brake" else f"{price:g}"
-            numbers = f"{first:.2f} | {total:.2f} | {honest:.2f} | {push:.2f} | {100 * drove:.1f} % | {100 * moving:.1f} %"
+            numbers = (
+                f"{first:.2f} | {total:.2f} | {honest:.2f} | {push:.2f} | {100 * drove:.1f} % | {100 * moving:.1f} %"
+            )
             print(f"| {agent} | {shown} | {numbers} |")
     write_picture(given.picture, draw(every), force=True)

@@ -40,7 +40,7 @@ def mean_harm(scenario: eb.Scenario) -> dict[str, list[float]]:
 
 @in_our_style
 def draw(harm: dict[str, np.ndarray]) -> Figure:
-    """Return the figure: the saved share of full braking's honest cost by agent and time gap, with a panel per scenario.
+    """Return the figure: the saved share of full braking's honest cost by agent and time gap, a panel per scenario.
 
     ``harm``: scenario -> mean honest cost [time gaps, agents] in m2/s2.
     """
@@ -54,8 +54,7 @@ def draw(harm: dict[str, np.ndarray]) -> Figure:
     panels[0].set_ylabel("saved of full braking's honest cost (%)")
     panels[1].legend(fontsize=8.5)
     return finish(
-        figure,
-        f"{WORLDS:,} lines of seed {SEED} for each time gap. Lines end where full braking does almost no harm.",
+        figure, f"{WORLDS:,} lines of seed {SEED} for each time gap. Lines end where full braking does almost no harm."
     )
 
 

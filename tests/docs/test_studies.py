@@ -104,10 +104,13 @@ def test_team_curves__the_table_in_the_docs_is_made_from_the_numbers_beside_the_
     rows = team_curves.table(found)
     levels, drivers = (list(dict.fromkeys(row[k] for row in rows)) for k in (0, 1))
     harms = {(level, driver): first for level, driver, _, _, first, _ in rows}
-    assert table_of("results/cooperation", "## Five algorithms at 45 processor seconds each") == [
-        ["who drives the learners", *levels],  # without baselines, which have other numbers on the evaluation list
-        *([driver, *(harms[level, driver] for level in levels)] for driver in drivers[2:]),
-    ]
+    assert (
+        table_of("results/cooperation", "## Five algorithms at 45 processor seconds each")
+        == [
+            ["who drives the learners", *levels],  # without baselines, which have other numbers on the evaluation list
+            *([driver, *(harms[level, driver] for level in levels)] for driver in drivers[2:]),
+        ]
+    )
     assert team_curves.NUMBERS.read_text("utf-8") == team_curves.text_of(found)
     assert len(found["curves"]) == len(team_curves.LEVELS) * len(team_curves.ALGORITHMS) * 5
 

@@ -32,7 +32,11 @@ def with_best_known(compared: Compared) -> Compared:
     more[AVOIDABLE] = least["first"] == 0.0
     more[UNAVOIDABLE] = least["first"] > 0.0
     columns = {agent: {**own, **more} for agent, own in result.columns.items()}
-    searched = replace(result, columns=columns, measures=(*result.measures, Measure("best_known"), Measure(AVOIDABLE), Measure(UNAVOIDABLE)))
+    searched = replace(
+        result,
+        columns=columns,
+        measures=(*result.measures, Measure("best_known"), Measure(AVOIDABLE), Measure(UNAVOIDABLE)),
+    )
     return compared._replace(result=searched, table=summarise(searched))
 
 
