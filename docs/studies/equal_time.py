@@ -59,7 +59,7 @@ def rows_of(driven: Mapping[str, tuple[float, eb.State]], teams: Mapping[str, eb
         low, high = change.interval or (change.value, change.value)
         shown = "" if name == against else f"{change.value:+.3f} [{low:+.3f}, {high:+.3f}]"
         means = [
-            f"{last.harm(count).mean() / driven[against][1].harm(count).mean():.3f}"
+            f"{100.0 * last.harm(count).mean() / driven[against][1].harm(count).mean():.1f} %"
             for count in ("first", "total", "honest")
         ]
         rows.append([f"`{name}`", known_by(teams[name]), f"{spent_ms:.2f}", *means, shown])
