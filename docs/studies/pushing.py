@@ -1,4 +1,4 @@
-"""Results of the training programs in docs/train.md and README with five seeds, for docs/results/learning.md.
+"""Results of the training programs in docs/train.md and README with five seeds.
 
     python docs/studies/pushing.py one-honest pair-honest readme-honest
     python docs/studies/pushing.py one pair readme one-bootstrap pair-bootstrap readme-bootstrap one-speed pair-speed
