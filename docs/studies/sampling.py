@@ -20,7 +20,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.evaluation.identity import versions, worlds_sha256
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style, write_picture
 
-SCENARIO, WORLDS, SEED = "paper-random", 10_000, 7
+SCENARIO, WORLDS, SEED = "paper-random", 2000, 7
 STEPS_S = (0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001)
 FITTED_UP_TO_S = 0.1  # at 0.2 s there is another error: the latency of Vehicle 3 falls between two samples
 AGENTS = ("full_brake", "constant:5")
