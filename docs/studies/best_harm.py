@@ -147,7 +147,7 @@ def difference(table: BestHarmTable) -> str:
     return words and f"NOT renewed: other harms in worlds: {words}; search the list again"
 
 
-# *Contact proven* is not *impact proven*. In the worlds between the two, every command leads to contact, but perhaps
+# *Contact certain* is not *impact proven*. In the worlds between the two, every command leads to contact, but perhaps
 # not to an impact. Either leaning without an impact is possible there, or the proof is loose. The harm of the best
 # known profiles in these worlds shows which: almost no harm, or much harm.
 
@@ -174,7 +174,7 @@ def shipped_bounds(tables: Iterable[BestHarmTable]) -> Sheet:
     harm, share = partial(Column, digits=3), partial(Column, digits=1, scale=100.0, unit=" %")
     columns = (
         "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"),
-        harm("best known, total"), share("gap"), share("contact proven"),
+        harm("best known, total"), share("gap"), share("contact certain"),
         share("impact proven"), share("between"), harm("best known there, first"),
         share("next to none there"),
     )  # fmt: skip
