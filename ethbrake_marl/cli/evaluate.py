@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.cli.settings import Settings
     from ethbrake_marl.evaluation.compared import Compared
 
-GROUP_EPISODES = 400  # worlds of each scenario of a group; best known harms exist for these worlds of `benchmark`
+GROUP_EPISODES = 2_000  # worlds of each scenario of a group, except the three tests
 REPORT = "report.html"
 FILES = ("results.json", "worlds.csv", "worlds.parquet", REPORT)
 
@@ -60,13 +60,13 @@ def evaluate_command(
     `ethbrake agent list` shows all agents; the name ladder is short for those that need no training, from bad to good.
     A name can be followed by a shield, +episode or +step; for instance full_brake+step or policy@PATH+step, where PATH
     is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
-    total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving
-    before the first impact and for motion at the horizon. --set measures=pushed_mps,pushed_m adds measures to the
+    total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving and
+    for motion at the horizon. --set measures=pushed_mps,pushed_m adds measures to the
     results.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.worlds.catalogue import group_of_scenarios
+        from ethbrake_marl.worlds.catalogue import THREE_TESTS, group_of_scenarios
 
         chosen = read_settings(settings, of_command=("harm_count", "measures"))
         _check_outputs(out, output, per_world, report=report)
@@ -80,8 +80,11 @@ def evaluate_command(
             raise InvalidInput(
                 f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
             )
-        count = (GROUP_EPISODES if names else 10_000) if episodes is None else episodes
-        every = {name: _compared(out, name, chosen, agents, count, seed, jobs) for name in names or [scenario]}
+        every = {}
+        for name in names or [scenario]:
+            usual = GROUP_EPISODES if names and name not in THREE_TESTS else 10_000
+            count = usual if episodes is None else episodes
+            every[name] = _compared(out, name, chosen, agents, count, seed, jobs)
         if report and output is not None:
             write = page_of("evaluation", "--report")
             output.mkdir(parents=True, exist_ok=True)
