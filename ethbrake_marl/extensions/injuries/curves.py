@@ -70,7 +70,7 @@ def injured_by_harm(harm: Harm, vehicle: int, curve: str) -> Floats:
     changes = np.stack([rebound, np.zeros(mass.shape)], axis=1)  # front, rear
     changes[:, 1, :-1] = mass[:, 1:] / both * rebound[:, 1:]
     changes[:, 0, 1:] *= mass[:, :-1] / both
-    return np.cumsum(1_000.0 * risks(changes, curve).max(axis=1), axis=1)[:, -1]
+    return np.asarray(np.cumsum(1_000.0 * risks(changes, curve).max(axis=1), axis=1)[:, -1])
 
 
 def speed_changes(before: State, after: State) -> Floats:
@@ -91,7 +91,7 @@ def injured(changes: Floats, curve: str) -> Floats:
     Only the side (front or rear) with the larger change counts.
     """
     front, rear = np.moveaxis(risks(changes, curve), 1, 0)
-    return 1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front)
+    return np.asarray(1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front))
 
 
 OBJECTIVE = Part(injured_by_harm, arguments=tuple(CURVES))

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.report.curves import curves_figure
+from ethbrake_marl.extensions.report.figures import curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.learning import unconverged
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings

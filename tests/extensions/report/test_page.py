@@ -8,7 +8,7 @@ import re
 import pytest
 
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.extensions.report.harm_figures import SLIM_IN
+from ethbrake_marl.extensions.report.figures import SLIM_IN
 from ethbrake_marl.extensions.report.page import Section, data, drawing, part, table, whole_page as page_of
 from ethbrake_marl.extensions.report.style import finish, new_figure
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown

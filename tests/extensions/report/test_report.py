@@ -13,11 +13,22 @@ from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.extensions.report.best_known import UNAVOIDABLE
-from ethbrake_marl.extensions.report.episodes import shown_worlds, worst_rows
-from ethbrake_marl.extensions.report.first_sentence import first_sentence
-from ethbrake_marl.extensions.report.learners import learners_sheets
-from ethbrake_marl.extensions.report.player import SAMPLE_S, episode_data, pieces_of, replaced_at_s
-from ethbrake_marl.extensions.report.report import Report, Test as OtherTest, avoidable_section, worst_section
+from ethbrake_marl.extensions.report.episodes import (
+    SAMPLE_S,
+    episode_data,
+    pieces_of,
+    replaced_at_s,
+    shown_worlds,
+    worst_rows,
+)
+from ethbrake_marl.extensions.report.report import (
+    Report,
+    Test as OtherTest,
+    avoidable_section,
+    first_sentence,
+    worst_section,
+)
+from ethbrake_marl.extensions.report.run import learners_sheets
 from ethbrake_marl.names import teams_of
 from ethbrake_marl.training.experiment import TEAM, without
 from tests.evaluation.lines import recorded

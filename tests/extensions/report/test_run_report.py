@@ -10,9 +10,8 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import _EXTRA_OF
 from ethbrake_marl.evaluation.compared import Compared
-from ethbrake_marl.extensions.report.learners import learners_sheets
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, is_papers_test, printed_sheet
-from ethbrake_marl.extensions.report.run import telling_row
+from ethbrake_marl.extensions.report.run import learners_sheets, telling_row
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, is_as_shipped, other_tests
 from ethbrake_marl.training.experiment import run_experiment
 from tests.cli.test_run import ctrl_c_when, status_of
