@@ -10,7 +10,7 @@ PARTS = {
         "ppo": "agents.trained:PPO",
         "sac": "agents.trained:SAC",
         "universal": "agents.trained:UNIVERSAL",
-        "universal-paper": "agents.trained:UNIVERSAL_PAPER",
+        "vine-paper": "agents.trained:VINE_PAPER",
         "ppo-obstacle": "agents.trained:PPO_OBSTACLE",
         "rollout-obstacle": "agents.trained:ROLLOUT_OBSTACLE",
         "vine-preference": "agents.trained:VINE_PREFERENCE",

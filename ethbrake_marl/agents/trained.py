@@ -62,7 +62,7 @@ POLICY = Part(
 )
 TEAM = Part(make_trained, form="team@RUN", about="the learners of a run, each with its policy", knows=MESSAGES)
 UNIVERSAL = _shipped("universal", "paper-random, without driving and with an obstacle, honest cost")
-UNIVERSAL_PAPER = _shipped("universal-paper", "every scenario, total harm: it pushes")
+VINE_PAPER = _shipped("vine-paper", "paper-random, first-impact harm: it pushes")
 PPO_OBSTACLE = _shipped("ppo-obstacle", "paper-random-obstacle, first-impact harm")
 ROLLOUT_OBSTACLE = _shipped("rollout-obstacle", "paper-random-obstacle, total harm")
 VINE_PREFERENCE = _shipped("vine-preference", "paper-random-preference")

@@ -40,7 +40,7 @@ class Manifest(Finite):
     """Everything that a policy bundle records, except the tensors."""
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
-    format_version: Literal[2, 3, 4, 5] = 2  # `NetworkSpec.format_version`
+    format_version: Literal[2, 4] = 2  # `NetworkSpec.format_version`
     algorithm: Annotated[str, Field(pattern=NAME_PATTERN)]
     network: NetworkSpec
     observation: ObservationSchema

@@ -12,7 +12,6 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.manifest import Manifest
-from ethbrake_marl.policies.network import NetworkSpec
 
 CAPACITIES = ("own.braking_capacity", "own.driving_capacity")
 
@@ -47,33 +46,22 @@ def onnx_model(manifest: Manifest, observation: View, tensors: Mapping[str, Floa
     zero = constant("zero", np.zeros(1, np.float32))
     bounds = [constant(name, np.array(at, np.float32)) for name, at in (("lowest", -1.0), ("highest", 1.0))]
 
-    def network(name: str, hidden: int, activation: str) -> str:
+    def actor() -> str:
         x = "observation"
-        for layer in [*(f"{name}.{k}" for k in range(hidden)), f"{name}.output"]:
+        for layer in [*(f"policy.{k}" for k in range(len(spec.policy_hidden))), "policy.output"]:
             weight, bias = (constant(f"{layer}.{part}", tensors[f"{layer}.{part}"]) for part in ("weight", "bias"))
             x = node("Gemm", [x, weight, bias], transB=1)
             if not layer.endswith("output"):
-                x = node("Relu" if activation == "relu" else "Tanh", [x])
-        return x
-
-    def actor(spec: NetworkSpec, prefix: str) -> str:
-        outputs = [network(prefix + name, len(spec.policy_hidden), spec.activation) for name in spec.actors]
-        x = outputs[0]
-        if len(outputs) > 1:  # of the expert with the highest score
-            gate = network(f"{prefix}gate", len(spec.gate_hidden), spec.activation)
-            best = node("ArgMax", [gate], axis=1, keepdims=1)
-            x = node("GatherElements", [node("Concat", outputs, axis=1), best], axis=1)
+                x = node("Relu" if spec.activation == "relu" else "Tanh", [x])
         if spec.output == "tanh":
             return node("Tanh", [x])
         if spec.output == "clip":
             return node("Clip", [x, *bounds])
-        members = [actor(each, f"among_{m}.") for m, each in enumerate(spec.among, 1)]
         nothing = node("Mul", [node("ReduceMax", [x], axes=[1], keepdims=1), zero])  # [n, 1]
-        actions = node("Add", [nothing, constant(f"{prefix}choices", spec.actions[np.newaxis])])
-        best = node("ArgMax", [x], axis=1, keepdims=1)
-        return node("GatherElements", [node("Concat", [*members, actions], axis=1), best], axis=1)
+        actions = node("Add", [nothing, constant("choices", spec.actions[np.newaxis])])
+        return node("GatherElements", [actions, node("ArgMax", [x], axis=1, keepdims=1)], axis=1)
 
-    action = node("Identity", [actor(spec, "")], output="action")
+    action = node("Identity", [actor()], output="action")
     capacities = []  # in m/s2, [n, 1] each
     for name in CAPACITIES:
         column, scale = columns[name]

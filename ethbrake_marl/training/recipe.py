@@ -167,9 +167,6 @@ class TrainingRecipe(FileModel):
             output="clip",
         )
 
-    def check_learners(self, learners: int) -> None:
-        """Raise ``InvalidInput`` if the recipe does not support this number of learners."""
-
     def replace(self, **changes: Any) -> Self:
         """Return the recipe with changed values, such as ``replace(seed=3)``. Raises the errors of ``load_recipe``."""
         content = {**self.model_dump(mode="json"), **{key: plain(value) for key, value in changes.items()}}

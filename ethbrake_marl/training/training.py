@@ -132,4 +132,3 @@ def _check(recipe: TrainingRecipe, scenario: Scenario, scheme: Scheme, learners:
             f"scheme {scheme}: the algorithm {recipe.algorithm} of recipe {recipe.name!r} does not support this scheme;"
             " use a recipe for PPO, for instance cooperation-ppo"
         )
-    recipe.check_learners(len(learners))

@@ -95,7 +95,7 @@ def test_pettingzoo_without_a_registry__runs(monkeypatch: pytest.MonkeyPatch) ->
 CONTENT = load_scenario("paper-random").declared()
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "scenario": {"scenario": load_scenario("paper-random-obstacle")},
-    "mixture": {"scenario": load_scenario("mixture-trucks")},
+    "mixture": {"scenario": load_scenario("mixture-three-tests")},
     "table": {"scenario": load_scenario("standards-ccrs")},
     "path": {"scenario": Path("mine.yaml")},
     "content": {"scenario": {**CONTENT, "mass_t": np.array([1.0, 2.0, 3.0]), "gaps_m": {"choice": (7, np.float32(8))}}},

@@ -29,8 +29,6 @@ KINDS: dict[str, dict[str, Any]] = {
     "clip": {"value_hidden": (5,)},
     "tanh": {"output": "tanh", "activation": "tanh"},
     "choice": {"output": "choice", "choices": 33},
-    "experts": {"networks": 3, "gate_hidden": (6,)},
-    "experts-tanh": {"networks": 2, "gate_hidden": (4, 4), "activation": "tanh", "output": "tanh"},
 }
 
 
@@ -38,27 +36,17 @@ def network(kind: str, **more: Any) -> NetworkSpec:
     return NetworkSpec(**{**BASE, **KINDS.get(kind, {}), **more})
 
 
-def among() -> NetworkSpec:
-    """One that chooses among three experts, a squashed actor, and full braking, coasting, full driving."""
-    return network("choice", choices=3, among=(network("experts"), network("tanh")))
-
-
 def tensors_for(spec: NetworkSpec, seed: int = 0) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     shapes = spec.tensors.items()
-    tensors = {name: (rng.normal(size=s) / np.sqrt(s[-1])).astype(np.float32) for name, s in shapes}
-    for name in ("gate.output", "policy.output") if spec.networks > 1 or spec.among else ():
-        if f"{name}.weight" in tensors:  # each choice is the best somewhere
-            tensors[f"{name}.weight"] -= tensors[f"{name}.weight"].mean(axis=0)
-            tensors[f"{name}.bias"] *= np.float32(0.0)
-    return tensors
+    return {name: (rng.normal(size=s) / np.sqrt(s[-1])).astype(np.float32) for name, s in shapes}
 
 
 def observations(n: int, size: int = 27, seed: int = 1) -> Any:
     return np.random.default_rng(seed).uniform(-2.0, 2.0, (n, size)).astype(np.float32)
 
 
-SPECS = {**{kind: network(kind) for kind in KINDS}, "among": among(), "wide": network("choice", choices=801)}
+SPECS = {**{kind: network(kind) for kind in KINDS}, "wide": network("choice", choices=801)}
 
 
 @pytest.mark.parametrize(
@@ -118,40 +106,8 @@ def test_squash__is_the_rounded_hyperbolic_tangent() -> None:
     assert actual[0, -2:].tolist() == [1.0, -1.0]
 
 
-def test_mixture__acts_as_the_expert_of_the_highest_score_the_first_of_equal_ones() -> None:
-    spec, seen = SPECS["experts"], observations(300)
-    tensors = tensors_for(spec)
-    hidden = np.maximum(seen @ tensors["gate.0.weight"].T + tensors["gate.0.bias"], 0.0)
-    best = (hidden @ tensors["gate.output.weight"].T + tensors["gate.output.bias"]).argmax(axis=1)
-    assert len(set(best)) == 3
-    together = Actor(spec, tensors)(seen)
-    for number in range(3):
-        own = f"network_{number + 1}."
-        alone = {name.replace(own, "policy."): each for name, each in tensors.items() if name.startswith(own)}
-        assert np.array_equal(together[best == number], Actor(network(""), alone)(seen)[best == number])
-    equal = {name: each * np.float32(not name.startswith("gate.output")) for name, each in tensors.items()}
-    assert (Actor(spec, equal).expert(np.ascontiguousarray(seen.T)) == 0).all()
-
-
-def test_among__acts_as_the_policy_or_the_action_of_the_highest_score() -> None:
-    spec, seen = SPECS["among"], observations(2000)
-    tensors = tensors_for(spec, 4)
-    x = seen
-    for layer in ("policy.0", "policy.1"):
-        x = np.maximum(x @ tensors[f"{layer}.weight"].T + tensors[f"{layer}.bias"], 0.0)
-    best = (x @ tensors["policy.output.weight"].T + tensors["policy.output.bias"]).argmax(axis=1)
-    inside = [
-        {name.removeprefix(f"among_{m}."): each for name, each in tensors.items() if name.startswith(f"among_{m}.")}
-        for m in (1, 2)
-    ]
-    every = [Actor(each, own)(seen) for each, own in zip(spec.among, inside, strict=True)]
-    every += [np.full((2000, 1), action, np.float32) for action in (-1.0, 0.0, 1.0)]
-    assert set(best) == set(range(5))
-    assert np.array_equal(Actor(spec, tensors)(seen), np.choose(best[:, np.newaxis], every))
-
-
 def test_policy__says_which_format_its_network_needs() -> None:
-    versions = {"clip": 2, "tanh": 2, "experts": 3, "choice": 4, "among": 5}
+    versions = {"clip": 2, "tanh": 2, "choice": 4}
     for kind, version in versions.items():
         policy = Policy.make(tensors_for(SPECS[kind]), network=SPECS[kind], observation=View(), **FIELDS)
         assert policy.manifest.format_version == version
@@ -161,7 +117,7 @@ def test_policy__says_which_format_its_network_needs() -> None:
 def test_onnx__asks_for_the_same_acceleration(kind: str) -> None:
     spec = SPECS[kind]
     tensors = tensors_for(spec)
-    if "policy.output.weight" in tensors and kind in ("clip", "tanh"):
+    if kind in ("clip", "tanh"):
         tensors["policy.output.weight"] *= np.float32(3.0)  # so that some actions reach the bounds
     policy = Policy.make(tensors, network=spec, observation=View(), **FIELDS)
     scenario, game = open_game("paper-random")
@@ -185,23 +141,11 @@ def test_onnx__needs_the_capacities() -> None:
 
 
 WRONG: dict[str, dict[str, Any]] = {
-    "gate_hidden = []: must have a layer if networks is above 1": {"networks": 2},
-    "gate_hidden = [4]: must have a layer if": {"gate_hidden": (4,)},
-    "value_hidden: must be empty if networks is above 1": {
-        "networks": 2, "gate_hidden": (4,), "value_hidden": (5,),
-    },
+    "value_hidden: must be empty if output is 'choice'": {"output": "choice", "choices": 3, "value_hidden": (5,)},
     "choices = None: must be a number if output is 'choice'": {"output": "choice"},
     "choices = 3: must be a number if": {"choices": 3},
-    "output = 'choice': needs networks = 1": {"output": "choice", "choices": 3, "networks": 2, "gate_hidden": (4,)},
-    "among[0]: needs output = 'choice', no key": {"among": (network("clip"),)},
-    "among[0]: needs output = 'choice', no key among of its own": {
-        "output": "choice", "choices": 3, "among": (among(),),
-    },
-    "no key among of its own, and observation_size = 27": {
-        "output": "choice", "choices": 3, "among": (network("clip", observation_size=26),),
-    },
     "less than or equal to 4096": {"policy_hidden": (10**9,)},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("message", WRONG)

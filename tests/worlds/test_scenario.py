@@ -44,7 +44,7 @@ def bits(state: Any) -> list[bytes]:
 
 
 @pytest.mark.parametrize(
-    "name", ["paper-random", "realistic-mixed", "cooperation-4-congested", "mixture-trucks", "standards-r157"]
+    "name", ["paper-random", "realistic-mixed", "cooperation-4-congested", "mixture-three-tests", "standards-r157"]
 )
 def test_world_k__is_the_same_alone_and_in_any_batch(name: str) -> None:
     scenario = load_scenario(name)
@@ -172,7 +172,7 @@ def test_table__gives_whole_rows() -> None:
 
 
 def test_mixture__is_world_by_world_that_of_its_members(empty_folder: Path) -> None:
-    mixture = load_scenario("mixture-trucks")
+    mixture = load_scenario("mixture-three-tests")
     drawn = mixture.draw(60, 7)
     parts = [drawn.scenarios == member.name for member in mixture.members]
     assert np.sum(parts, axis=0).tolist() == [1] * 60
@@ -258,7 +258,7 @@ def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
 
 
 def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert len(list_scenarios()) == 50
+    assert len(list_scenarios()) == 46
     assert len(group_of_scenarios("benchmark")) == 10
     assert group_of_scenarios("stress") == ["stress-wide", "stress-wide-obstacle"]
     assert group_of_scenarios("nothing") == []

@@ -27,24 +27,20 @@ from ethbrake_marl.training.training import Training
 
 
 class CudaVine(Vine):
-    """The algorithm vine on the recipe's device. A mixture of experts trains on a processor only."""
+    """The algorithm vine on the recipe's device."""
 
     def new_model(self, training: Training, environment: EthBrakeVecEnv) -> CudaVineModel:
         """Return a new model, with the same random weights as on a processor.
 
-        Raises ``InvalidInput`` for a mixture of experts, for minibatches of different sizes, for what ``Worlds``
-        refuses, and for more worlds than the device has memory for.
+        Raises ``InvalidInput`` for minibatches of different sizes, for what ``Worlds`` refuses, and for more worlds
+        than the device has memory for.
         """
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
-        where = place_of(recipe)
-        if recipe.experts is not None:
-            raise InvalidInput(
-                f"{where}: experts: a mixture of experts trains on a processor only; leave out experts, or train on the"
-                " device 'cpu'"
-            )
         if recipe.tried % recipe.batch_size:
-            raise InvalidInput(f"{where}: batch_size = {recipe.batch_size}: must divide tried = {recipe.tried} there")
+            raise InvalidInput(
+                f"{place_of(recipe)}: batch_size = {recipe.batch_size}: must divide tried = {recipe.tried} there"
+            )
         with enough_memory(sizes(recipe)):
             return CudaVineModel(training, environment, self.device_of(recipe))
 
@@ -80,7 +76,7 @@ class CudaVineModel(VineModel):
         self.seen = self.worlds.reset().repeat(recipe.n_steps, 1, 1)  # [D, L, F]
         self.each_learner = torch.arange(self.learners, device=place)
         self.played = Graphed(self.play_here, place)
-        self.descended = Graphed(partial(super().descend, self.policy), place)
+        self.descended = Graphed(super().descend, place)
 
     def new_policy(self) -> nn.Module:
         actor = super().new_policy().to(self.worlds.device)
@@ -124,7 +120,7 @@ class CudaVineModel(VineModel):
 
     def improve(self, seen: Any, states: Any) -> None:
         """Measure gradients at some of the decisions that ``collect`` visited, and update the actor with them."""
-        self.train_actor(self.policy, self.measure(seen))
+        self.train_actor(self.measure(seen))
 
     @torch.no_grad()
     def measure(self, seen: Tensor) -> Tried:
@@ -157,6 +153,6 @@ class CudaVineModel(VineModel):
             discount *= self.recipe.gamma
         return result
 
-    def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    def descend(self, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
         loss: Tensor = self.descended(seen, target, weight)
         return loss.clone()

@@ -1,1 +1,1 @@
-"""Learning algorithms that try several actions in the same state: vine, mixtures of experts, rollout classification."""
+"""Learning algorithms that try several actions in the same state: vine and rollout classification."""

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from ethbrake_marl.extensions.learners.mixture import MixtureModel
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
 from ethbrake_marl.extensions.learners.rollout_classification import RolloutClassificationModel
-from ethbrake_marl.extensions.learners.start import named_policy, start_weights
+from ethbrake_marl.extensions.learners.start import start_weights, starting_policy
 from ethbrake_marl.extensions.learners.vine import VineModel
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.policies.layers import Float32s
@@ -20,34 +19,32 @@ from ethbrake_marl.training.training import Training
 
 
 class Vine(Algorithm):
-    """Algorithm vine: one actor drives all learners, or a mixture of experts drives the only one."""
+    """Algorithm vine: one actor drives all learners."""
 
     def build(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
         model = self.new_model(training, environment)
         if recipe.start is not None:
-            first = model.policy.actors[0] if isinstance(model, MixtureModel) else model.policy
-            policy, wanted = named_policy(recipe.start, recipe.name, "start"), recipe.network_spec(len(model.features))
+            policy, wanted = starting_policy(recipe.start, recipe.name), recipe.network_spec(len(model.features))
             tensors = start_weights(policy, wanted, model.features, recipe.name)
-            for name, weight in first.weights("policy").items():
+            for name, weight in model.policy.weights("policy").items():
                 weight.copy_(torch.from_numpy(tensors[name]))
-            first.learning.load_state_dict(first.average.state_dict())
+            model.policy.learning.load_state_dict(model.policy.average.state_dict())
         return model
 
     def new_model(self, training: Training, environment: EthBrakeVecEnv) -> VineModel:
-        recipe: Any = training.recipe
-        return (VineModel if recipe.experts is None else MixtureModel)(training, environment)
+        return VineModel(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
         one = {"policy.log_std": np.full(1, -3.0, np.float32)}  # which never counts, because vine does not explore
-        return dict(actor.tensors("policy") | one if network.networks == 1 else actor.tensors(network))
+        return dict(actor.tensors("policy") | one)
 
 
 class RolloutClassification(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """Return a new model, which acts like the first of the recipe's ``policies``, or brakes fully."""
+        """Return a new model, which brakes fully."""
         return RolloutClassificationModel(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        return dict(actor.all_tensors())
+        return dict(actor.tensors("policy"))

@@ -12,12 +12,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from torch import nn
 
-from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.learners.branches import Act
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
-from ethbrake_marl.motion.layout import Floats, Ints
-from ethbrake_marl.policies.layers import Float32s
+from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.training.training import Training
 
 
@@ -39,8 +36,6 @@ class BranchingModel(BaseAlgorithm):
         )
         self.recipe: Any = recipe
         self.rows, self.game, self.learners = environment, environment.game, len(training.learners)
-        objective = recipe.reward.objective or training.scenario.objective
-        self.objectives = objectives_of(objective, training.scenario.vehicles)
         self.features = training.row.names
         self._setup_model()
 
@@ -78,17 +73,13 @@ class BranchingModel(BaseAlgorithm):
         return self
 
     def collect(self, callback: BaseCallback) -> tuple[Any, Any]:
-        """Return the observations of the decisions visited in this update, [decisions L, F], and the states there."""
-        return self.visit(callback, self.policy.act)
-
-    def visit(self, callback: BaseCallback, act: Act) -> tuple[Float32s, State]:
-        """Drive all worlds for ``n_steps`` decisions; return the same as ``collect``."""
+        """Drive all worlds for ``n_steps`` decisions; return their observations, [decisions L, F], and states."""
         seen, states, every = [], [], np.arange(self.rows.n)
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
             seen.append(observations)
             states.append(self.rows.episode.take(every))
-            new_obs, rewards, dones, infos = self.rows.step(act(observations)[:, np.newaxis])
+            new_obs, rewards, dones, infos = self.rows.step(self.policy.act(observations)[:, np.newaxis])
             self.num_timesteps += self.n_envs
             ended = [infos[row] for row in np.flatnonzero(dones)]  # only these have statistics
             self._update_info_buffer(ended, dones[dones])
@@ -99,10 +90,6 @@ class BranchingModel(BaseAlgorithm):
 
     def dump_logs(self) -> None:
         self.logger.dump(step=self.num_timesteps)
-
-    def harm(self, state: State, count: str) -> Floats:
-        """Return the harm so far that each learner minimises, [n, L]."""
-        return amounts(self.objectives, None, state, count)[:, self.game.rules.learners - 1]
 
     def drawn_steps(self, count: int) -> Ints:
         holds = np.array(self.recipe.holds, np.int64)

@@ -1,8 +1,7 @@
-"""Recipes of ``vine``, with its mixtures of experts, and of ``rollout-classification``."""
+"""Recipes of ``vine`` and of ``rollout-classification``."""
 
 from __future__ import annotations
 
-from functools import cached_property
 from operator import not_
 from typing import Annotated, Literal, Self
 
@@ -10,8 +9,6 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from ethbrake_marl.agents.drive import MESSAGES
 from ethbrake_marl.agents.trained import make_trained
-from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.learners.start import Member, members_of, named_policy
 from ethbrake_marl.files.model import FileModel, refuse
 from ethbrake_marl.policies.network import Activation, NetworkSpec
 from ethbrake_marl.registry import Part
@@ -19,7 +16,6 @@ from ethbrake_marl.training.recipe import (
     ACTOR_LAYERS,
     BATCH_SIZE,
     NETWORK,
-    Fraction,
     Layers,
     NonNegative,
     Positive,
@@ -30,7 +26,6 @@ from ethbrake_marl.training.recipe import (
 MOST_DECISIONS = 2**22  # of one update whose states fit into memory
 
 Text = Annotated[str, Field(max_length=4096)]
-Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Action = Annotated[float, Field(ge=-1.0, le=1.0)]
 Steps = Annotated[tuple[Annotated[int, Field(ge=1, le=1000)], ...], Field(strict=False, min_length=1, max_length=16)]
 
@@ -84,57 +79,6 @@ class ActorShape(FileModel):
     )
 
 
-class Shares(FileModel):
-    """Share of all updates, 0 to 1, that each stage of training a mixture of experts gets."""
-
-    pretraining_first: Fraction  # the first expert, in all worlds
-    pretraining_others: Fraction  # the others together, each in worlds selected for it
-    gating: Fraction  # the gating network
-
-    @model_validator(mode="after")
-    def _everything(self) -> Self:
-        total = self.pretraining_first + self.pretraining_others + self.gating
-        if not abs(total - 1.0) <= 1e-9:
-            raise ValueError(
-                "pretraining_first, pretraining_others and gating are shares of all updates: they must sum to 1, but"
-                f" sum to {total:g}"
-            )
-        return self
-
-
-class ExpertsPlan(FileModel):
-    """A mixture of experts: several networks, and a gating network that chooses one of them at every decision."""
-
-    networks: int = Field(ge=2, le=16, description="number of experts")
-    gating: Layers = Field(description="hidden layers of the gating network")
-    worlds: Count = Field(description="number of worlds in which templates are compared with experts")
-    templates: int = Field(
-        ge=1, le=100_000, description="number of templates (random braking profiles) drawn in each world"
-    )
-    gain: NonNegative = Field(
-        description="a new expert imitates a template if its return exceeds the best earlier expert's by more than this"
-    )
-    margin: Positive = Field(
-        description="a new expert is trained in the worlds in which its return is at least the best earlier expert's"
-        " return minus this number"
-    )
-    imitation_epochs: int = Field(
-        ge=1, le=1000, description="number of passes over the decisions of the imitated templates"
-    )
-    gating_states: Count = Field(
-        description="number of decisions per update at which the returns of the experts are compared"
-    )
-    gating_memory: Count = Field(description="number of stored decisions at which experts were compared")
-    gating_steps: int = Field(
-        ge=1, le=100_000, description="number of gradient steps of the gating network in each update"
-    )
-    tie_break: NonNegative = Field(
-        description="weight, when experts are compared, of the count of harm that the reward does not use: first, or"
-        " total if the reward counts first"
-    )
-    shares: Shares = Field(description="share of all updates for each stage of the training; the shares sum to 1")
-
-
 class VineRecipe(BranchingRecipe):
     """Recipe of vine: the difference in return between a higher and a lower action gives the gradient."""
 
@@ -150,20 +94,6 @@ class VineRecipe(BranchingRecipe):
     anchor: Positive = Field(description="weight that holds actions at their value where the gradient is small")
     n_epochs: int = Field(ge=1, le=1000, description="number of passes of each update over the tried decisions")
     network: ActorShape = Field(description=NETWORK)
-    experts: Annotated[ExpertsPlan | None, Field(exclude_if=not_)] = Field(
-        None, description="mixture of experts: several networks and a gating network; left out: one network"
-    )
-
-    def network_spec(self, observation_size: int) -> NetworkSpec:
-        spec, plan = super().network_spec(observation_size), self.experts
-        return spec if plan is None else spec.model_copy(update={"networks": plan.networks, "gate_hidden": plan.gating})
-
-    def check_learners(self, learners: int) -> None:
-        if self.experts is not None and learners != 1:
-            raise InvalidInput(
-                f"recipe {self.name!r}: experts: a mixture of experts can drive only one learner, but the scenario has"
-                f" {learners} learners; leave out experts"
-            )
 
 
 class ChoosingShape(FileModel):
@@ -177,15 +107,12 @@ class ChoosingShape(FileModel):
 class RolloutClassificationRecipe(BranchingRecipe):
     """Recipe of rollout classification: several choices are tried at a decision, and the network learns the cheapest.
 
-    A choice is one of ``network.choices`` actions, or one of the trained ``policies``. Tried are the policy's own
-    choice, an action below and one above it for each range of ``near``, the ``fixed`` actions, and ``drawn`` others.
+    A choice is one of ``network.choices`` actions. Tried are the policy's own choice, an action below and one above it
+    for each range of ``near``, the ``fixed`` actions, and ``drawn`` others.
     The *cost* of a choice is minus the return from the decision to the end of the episode.
     """
 
     algorithm: Literal["rollout-classification"]
-    policies: Annotated[tuple[Text, ...], Field(strict=False, max_length=16, exclude_if=not_)] = Field(
-        (), description="trained policies; at a decision the network can let one of them act; left out: none"
-    )
     near: Annotated[tuple[Range, ...], Field(strict=False, max_length=8)] = Field(
         description="ranges of distances; from each range one distance is drawn, and the actions this far below and"
         " above the policy's action are tried"
@@ -193,9 +120,7 @@ class RolloutClassificationRecipe(BranchingRecipe):
     fixed: Annotated[tuple[Action, ...], Field(strict=False, max_length=16)] = Field(
         description="actions that are always tried; rounded to the nearest choice of the network"
     )
-    drawn: int = Field(
-        ge=0, le=16, description="number of choices that are drawn and tried: policies if there are any, else actions"
-    )
+    drawn: int = Field(ge=0, le=16, description="number of actions that are drawn and tried")
     largest_cost: Positive = Field(
         description="limit of an action's extra cost (its cost minus the best tried action's cost)"
     )
@@ -204,23 +129,6 @@ class RolloutClassificationRecipe(BranchingRecipe):
         exclude_if=not_,
         description="weight of a further cost, which is the action's cost minus the cost of full braking to the end of"
         " the episode, if positive; the weight grows from 0 to this value during the training",
-    )
-    tie_break: NonNegative = Field(
-        0.0,
-        exclude_if=not_,
-        description="weight, in the cost, of the count that decides ties (first, or total if the reward counts first)",
-    )
-    relative: bool = Field(
-        False,
-        exclude_if=not_,
-        description="true: in a mixture of scenarios, a cost is divided by the mean cost in its scenario",
-    )
-    focus: float = Field(
-        0.0,
-        ge=0.0,
-        le=0.99,
-        exclude_if=not_,
-        description="share of the remembered decisions that are drawn in proportion to their largest extra cost",
     )
     guide: NonNegative = Field(
         description="weight of the convex term of the loss; without it learning can stall at the beginning"
@@ -243,29 +151,9 @@ class RolloutClassificationRecipe(BranchingRecipe):
             refuse(("near",), list(self.near), "must contain a range, because the recipe has no fixed or drawn actions")
         return self
 
-    @cached_property
-    def members(self) -> tuple[Member, ...]:
-        """The policies in the key ``policies``. A policy that chooses among others is replaced by these.
-
-        Raises ``InvalidInput`` if one cannot be used, or if ``drawn`` exceeds their number.
-        """
-        named = (named_policy(name, self.name, "policies") for name in self.policies)
-        members = tuple(member for policy in named for member in members_of(policy))
-        if members and not self.drawn <= len(members):
-            raise InvalidInput(
-                f"recipe {self.name!r}: drawn = {self.drawn}: drawn must be at most {len(members)}, the number of"
-                " policies"
-            )
-        return members
-
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        own = {"observation_size": observation_size, "value_hidden": ()}
-        among = tuple(each.network.model_copy(update=own) for each in self.members)
-        return (
-            super()
-            .network_spec(observation_size)
-            .model_copy(update={"output": "choice", "choices": self.network.choices, "among": among})
-        )
+        spec = super().network_spec(observation_size)
+        return spec.model_copy(update={"output": "choice", "choices": self.network.choices})
 
 
 VINE = Part(VineRecipe, "ethbrake_marl.extensions.learners.algorithms:Vine")

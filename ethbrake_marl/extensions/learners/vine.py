@@ -77,15 +77,15 @@ class VineModel(BranchingModel):
         return ["policy", "policy.optimizer"], []
 
     def improve(self, seen: Any, states: Any) -> None:
-        self.train_actor(self.policy, self.try_out(seen, states, self.policy))
+        self.train_actor(self.try_out(seen, states))
 
-    def try_out(self, seen: Float32s, states: State, policy: Actor) -> Tried:
+    def try_out(self, seen: Float32s, states: State) -> Tried:
         """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's."""
         branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
-        gained, moved = self.play(states, branches, policy)
+        gained, moved = self.play(states, branches)
         own = seen[branches.decisions(self.learners)]
         gradient = self.measured_gradient(torch.from_numpy(gained), torch.from_numpy(moved))
-        return Tried(torch.from_numpy(own), torch.from_numpy(policy.means(own)), gradient)
+        return Tried(torch.from_numpy(own), torch.from_numpy(self.policy.means(own)), gradient)
 
     def draw_branches(self, decisions: Ints) -> Branches:
         rows, offset = drawn(decisions, self.recipe.tried), self.recipe.offset
@@ -94,7 +94,7 @@ class VineModel(BranchingModel):
         world, learner = np.divmod(np.tile(rows, 2), self.learners)
         return Branches(world, learner, np.concatenate([sizes, -sizes]), np.tile(self.drawn_steps(len(rows)), 2))
 
-    def play(self, states: State, branches: Branches, policy: Actor) -> tuple[Floats, Floats]:
+    def play(self, states: State, branches: Branches) -> tuple[Floats, Floats]:
         """Simulate branches to the end; return their learners' returns, and how far actions were moved, [2B] each.
 
         An action stays in [-1, 1], so it may move by less than ``size``. Moves are summed over the steps.
@@ -103,7 +103,7 @@ class VineModel(BranchingModel):
         moved, longest = np.zeros(len(size)), int(steps.max(initial=0))
 
         def decide(now: Moment) -> Floats:
-            actions = now.ask(policy.act)
+            actions = now.ask(self.policy.act)
             some = np.flatnonzero(now.number < steps[now.rows]) if now.number < longest else steps[:0]
             row = now.rows[some]
             before = actions[some, learner[row]]
@@ -124,21 +124,21 @@ class VineModel(BranchingModel):
         self.logger.record("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / whole if whole else 0.0)
         return gradient.float()
 
-    def train_actor(self, actor: Actor, tried: Tried) -> None:
+    def train_actor(self, tried: Tried) -> None:
         recipe = self.recipe
-        self._update_learning_rate(actor.optimizer)
+        self._update_learning_rate(self.policy.optimizer)
         lesson, losses = (tried.seen, *trusted_targets(tried, recipe.trust_radius, recipe.anchor)), []
         for _ in range(recipe.n_epochs):
             for batch in torch.split(torch.randperm(len(tried.seen)).to(tried.seen.device), recipe.batch_size):
-                losses.append(self.descend(actor, *(part[batch] for part in lesson)))
+                losses.append(self.descend(*(part[batch] for part in lesson)))
         self._n_updates += recipe.n_epochs
         self.logger.record("train/loss", float(np.mean([loss.item() for loss in losses])) if losses else 0.0)
         self.logger.record("train/gradient", float(tried.gradient.abs().mean()) if losses else 0.0)
         self.logger.record("train/tried", len(tried.seen))
 
-    def descend(self, actor: Actor, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        loss = (weight * (actor.learning(seen)[:, 0] - target) ** 2).mean()
-        return actor.descend(loss, self.recipe.averaging)
+    def descend(self, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        loss = (weight * (self.policy.learning(seen)[:, 0] - target) ** 2).mean()
+        return self.policy.descend(loss, self.recipe.averaging)
 
 
 def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Tensor, Tensor]:

@@ -27,7 +27,7 @@ def _group() -> None:
 def falsify_command(
     agent: Annotated[
         str, typer.Option(help="Agent whose worst worlds the command finds; any agent of `ethbrake evaluate`.")
-    ] = "universal-paper",
+    ] = "universal",
     measure: Annotated[
         str, typer.Option(metavar="harm|regret|bound", help="How bad a world is; the search maximises it.")
     ] = "regret",

@@ -20,7 +20,7 @@ from ethbrake_marl.extensions.learners.recipes import VineRecipe
 from ethbrake_marl.extensions.learners.vine import Branches
 from ethbrake_marl.training.recipe import VARIANTS, load_recipe
 from ethbrake_marl.training.train import resume, train
-from tests.extensions.learners.tiny import EXPERTS, PAIR, PAPER, VINE, new_model
+from tests.extensions.learners.tiny import PAIR, PAPER, VINE, new_model
 from tests.refused import refused
 from tests.training.tiny import dying_after, kept, killed
 
@@ -59,7 +59,7 @@ def test_decisions_and_gradients__are_those_of_the_processor(scenario: Any) -> N
         np.testing.assert_array_equal(seen, here.numpy())
         assert cpu.num_timesteps == twin.num_timesteps
         torch.manual_seed(5)
-        expected = cpu.try_out(seen, states, cpu.policy)
+        expected = cpu.try_out(seen, states)
         torch.manual_seed(5)
         tried = twin.measure(here)
         assert torch.equal(tried.seen, expected.seen) and torch.equal(tried.mean, expected.mean)
@@ -81,7 +81,7 @@ def test_returns__are_those_of_the_processor_to_the_last_bit(scenario: Any, rewa
         (_, states), _ = cpu.collect(NOTHING), twin.collect(NOTHING)
         world, size = np.arange(192), np.tile([0.125, -0.25, 0.75, -0.75], 48)
         branches = Branches(world, world % cpu.learners, size, np.tile([1, 2, 4], 64))
-        gained, moved = cpu.play(states, branches, cpu.policy)
+        gained, moved = cpu.play(states, branches)
         with torch.no_grad():
             here = twin.played(*(torch.from_numpy(column) for column in branches))
         twin.branches.check()
@@ -202,7 +202,6 @@ def start(recipe: Any, scenario: Any = PAPER, device: str = "twin") -> Callable[
 
 
 REFUSED: dict[str, Callable[[], object]] = {
-    "experts: a mixture of experts trains on a processor only; leave out experts": start(EXPERTS),
     "batch_size = 7: must divide tried = 16 there": start(VINE.replace(batch_size=7)),
     "which functions of Python compute; the groups own,": start(load_recipe("vine").replace(
         n_envs=8, n_steps=4, tried=16, batch_size=8)),

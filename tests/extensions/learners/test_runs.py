@@ -6,36 +6,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.policies.bundle import load_shipped
-from ethbrake_marl.policies.network import NetworkSpec
-from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.training.recipe import load_recipe, shipped_recipes
 from ethbrake_marl.training.train import resume, train
-from tests.extensions.learners.tiny import (
-    EXPERTS,
-    MIXTURE,
-    OWN,
-    PAIR,
-    PAPER,
-    PLAN,
-    POLICIES,
-    ROLLOUTS,
-    VINE,
-    fingerprint,
-)
+from tests.extensions.learners.tiny import OWN, PAIR, PAPER, ROLLOUTS, VINE, fingerprint
 from tests.refused import refused
 from tests.training.tiny import dying_after, kept, killed
 
 TRAININGS: dict[str, tuple[Any, Any]] = {
     "vine": (VINE.replace(reward=OWN), PAIR),
     "rollouts": (ROLLOUTS.replace(reward=OWN), PAIR),
-    "policies": (POLICIES, MIXTURE),
-    "experts": (EXPERTS, PAPER),
 }
 
 
@@ -43,17 +27,11 @@ def begin(name: str, run: Path, **settings: Any) -> Any:
     return train(*TRAININGS[name], run, **{"on_progress": None, **settings})
 
 
-# recorded from version 0.5, but for `experts`, whose templates come from another stream of random numbers
+# recorded from version 0.5
 GOLDEN = {
     "vine": ([0.0992646, 46.9787, 0.022246, 0.156827], 144.39235738133806),
     "rollouts": ([0.879668, 20.5613, 0.141928, 0.430946], 49.66282439932783),
-    "policies": ([0.764504, 22.6973, 0.447578, 2.08936], 17.379859304495284),
-    "experts": (
-        [0.327937, 11.58204, 0.1145992, 0.3498816, 0.0632358, 46.823, 0.0112957, 0.0715289, 0.2389114, 59.32831,
-         0.2745146, 1.112371],
-        12.534840496474057,
-    ),
-}  # fmt: skip
+}
 ENDED: dict[str, dict[str, Any]] = {}  # name -> what its training has left
 
 
@@ -67,7 +45,7 @@ def test_training__learns_the_weights_that_it_always_has(name: str, tmp_path: Pa
     ENDED[name] = kept(tmp_path / "run")
 
 
-@pytest.mark.parametrize(("name", "updates"), [("vine", 3), ("experts", 4), ("experts", 7), ("policies", 4)])
+@pytest.mark.parametrize(("name", "updates"), [("vine", 3), ("rollouts", 4)])
 def test_resume__after_a_kill_everything_is_the_same(name: str, updates: int, tmp_path: Path) -> None:
     if name not in ENDED:
         begin(name, tmp_path / "whole")
@@ -83,7 +61,6 @@ AMPLE = {
 }  # fmt: skip
 LEARNERS = {
     "vine": VINE.replace(**AMPLE, network={"policy": [32]}, total_steps=30 * 512),
-    "experts": EXPERTS.replace(**AMPLE, total_steps=16 * 512, experts=PLAN | {"worlds": 400, "imitation_epochs": 20}),
     "rollouts": ROLLOUTS.replace(
         **AMPLE, network={"policy": [32], "choices": 9}, total_steps=12 * 512, memory=4000, gradient_steps=60
     ),
@@ -104,7 +81,6 @@ RECIPES = [name for name, file in shipped_recipes().items() if file.parent.name 
 def test_shipped_recipe__is_like_its_own_content(name: str) -> None:
     base = load_recipe(name)
     assert load_recipe(base.model_dump(mode="json")) == base
-    assert "experts" not in load_recipe("vine").model_dump(mode="json")
 
 
 @pytest.mark.slow
@@ -112,28 +88,15 @@ def test_shipped_recipe__is_like_its_own_content(name: str) -> None:
 def test_shipped_recipe__trains_for_one_update(name: str, tmp_path: Path) -> None:
     recipe = load_recipe(name)
     few = recipe.replace(n_envs=-(-max(recipe.batch_size, recipe.tried) // recipe.rounds), total_steps=1)
-    of_its_own = {
-        "universal-paper": "mixture-universal",
-        "universal": "mixture-three-tests",
-        "preference": "paper-random-preference",
-        "vine": "paper-random",
-    }
+    of_its_own = {"universal": "mixture-three-tests", "preference": "paper-random-preference", "vine": "paper-random"}
     scenario = of_its_own.get(name, "cooperation-1-front")
     result = train(few, scenario, tmp_path / "run", measure=None, on_progress=None)
     assert result.updates == 1 and eb.load_policy(tmp_path / "run").manifest.algorithm == recipe.algorithm
 
 
-def experts(**changes: Any) -> Any:
-    return EXPERTS.replace(experts=PLAN | changes)
-
-
 def start(name: str, **changes: Any) -> Callable[[], object]:
     recipe = load_recipe("vine").replace(start=name, **changes)
     return lambda: train(recipe, "paper-random", "new", measure=None, on_progress=None)
-
-
-def choose(**changes: Any) -> Callable[[], object]:
-    return lambda: train(load_recipe("rollout-classification").replace(**changes), "paper-random", "new")
 
 
 REFUSED: dict[str, Callable[[], object]] = {
@@ -152,41 +115,24 @@ REFUSED: dict[str, Callable[[], object]] = {
     "near = []: must contain a range, because the recipe has no fixed": lambda: ROLLOUTS.replace(
         near=[], fixed=[], drawn=0
     ),
-    "shares of all updates: they must sum to 1, but sum to 1.5": lambda: experts(
-        shares={"pretraining_first": 0.5, "pretraining_others": 0.5, "gating": 0.5}
-    ),
-    "experts.gatin: unknown key; did you mean gating?": lambda: experts(gatin=[8]),
-    "experts: a mixture of experts can drive only one learner, but the scenario has 2": lambda: train(
-        EXPERTS, PAIR, "new"
-    ),
     "scheme independent: the algorithm vine": lambda: train(VINE, PAIR, "new", scheme="independent"),
     "runs/mine: is not a folder; give the folder of a policy bundle": start("ppo@runs/mine"),
     "agent 'vine@first': the policy was trained by ppo; write ppo@first": start("vine@first"),
-    "recipe 'vine': start: the policy that this key names is a mixture of 3 networks": start("vine@mixture"),
+    "recipe 'vine': start: full_brake: must name a trained policy, such as ppo or policy@PATH": start("full_brake"),
     "observation lacks the features rear_1.known, rear_1.gap": start("ppo", observation=["own", "front_1", "contact"]),
     "network.policy_hidden is (64, 64), but must be (128, 128), as in the policy": start(
         "ppo", network={"policy": [64, 64]}
     ),
-    "policies: full_brake: must name a trained policy, such as ppo or": choose(policies=["full_brake"], drawn=1),
-    "drawn = 2: drawn must be at most 1, the number of policies": choose(policies=["ppo"]),
 }
 
 
 @pytest.mark.parametrize("message", REFUSED)
 def test_recipe_or_training__is_refused(message: str, empty_folder: Path) -> None:
-    shipped = load_shipped("ppo")
-    shipped.save("first")
-    mixture = NetworkSpec(
-        observation_size=27, action_size=1, policy_hidden=(3,), value_hidden=(), activation="relu", output="clip",
-        networks=3, gate_hidden=(6,),
-    )  # fmt: skip
-    zeros = {name: np.zeros(shape, np.float32) for name, shape in mixture.tensors.items()}
-    fields = shipped.manifest.model_dump(include={"learners", "scenario", "reward", "seeds", "steps"})
-    Policy.make(zeros, network=mixture, observation=shipped.observation, algorithm="vine", **fields).save("mixture")
+    load_shipped("ppo").save("first")
     with refused(message):
         REFUSED[message]()
 
 
-def test_policy_to_choose_among__is_one_that_ships(empty_folder: Path) -> None:
+def test_policy_to_start_from__is_one_that_ships(empty_folder: Path) -> None:
     with refused("unknown agent 'nobody'", UnknownName):
-        choose(policies=["nobody"], drawn=1)()
+        start("nobody")()

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.learners.start import members_of, widened
+from ethbrake_marl.extensions.learners.start import widened
 from ethbrake_marl.extensions.learners.vine import Tried, trusted_targets
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.recipe import load_recipe
@@ -36,7 +36,7 @@ def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: fl
     recipe = VINE.replace(gradient_limit=limit, holds=[2], tried=32, reward={"harm": 1.0, "objective": "own"})
     model = new_model(recipe, PAIR)
     states, seen = model.rows.episode.take(np.arange(8)), model._last_obs
-    tried = model.try_out(seen, states, model.policy)
+    tried = model.try_out(seen, states)
     gradients = tried.gradient.numpy()
     assert len(tried.seen) == 16 and np.abs(gradients).max() > (0.1 if limit > 1.0 else 0.0)
     assert np.abs(gradients).max() <= np.float32(limit)
@@ -79,17 +79,7 @@ def test_training__for_the_honest_count_selects_by_it(tmp_path: Path) -> None:
 
 
 def test_wider_policy__keeps_the_weights_of_its_features_in_their_new_places() -> None:
-    (member,) = members_of(load_shipped("ppo"))
-    turned = ["contact.brake_total_harm", *reversed(member.features)]
-    first = widened(member, turned, "mine", "start")["policy.0.weight"]
+    policy = load_shipped("ppo")
+    first = widened(policy, ["contact.brake_total_harm", *reversed(policy.observation.names)])["policy.0.weight"]
     assert not first[:, 0].any()
-    np.testing.assert_array_equal(first[:, 1:], member.tensors["policy.0.weight"][:, ::-1])
-
-
-def test_policies_inside_a_policy__keep_their_own_weights() -> None:
-    universal = load_shipped("universal-paper")
-    members = members_of(universal)
-    assert len(members) == 11
-    for m, member in enumerate(members, 1):
-        assert member.tensors.keys() == {name for name in member.network.tensors if not name.startswith("value.")}
-        assert all(array is universal.tensors[f"among_{m}.{name}"] for name, array in member.tensors.items())
+    np.testing.assert_array_equal(first[:, 1:], policy.tensors["policy.0.weight"][:, ::-1])

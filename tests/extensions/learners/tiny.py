@@ -14,7 +14,6 @@ from ethbrake_marl.worlds.catalogue import load_scenario
 
 PAPER = load_scenario("paper-random")
 PAIR = PAPER.with_learners(["vehicle_2", "vehicle_3"])
-MIXTURE = load_scenario({"name": "two", "mixture": [{"scenario": "paper-random"}, {"scenario": "paper-delay-high"}]})
 OWN = {"harm": 1.0, "harm_count": "total", "objective": "own", "terminal": 0.5}
 
 SHORT = {
@@ -29,16 +28,6 @@ ROLLOUTS = load_recipe("rollout-classification").replace(
     network={"policy": [8], "choices": 9},
     **SHORT,
 )
-POLICIES = ROLLOUTS.replace(
-    policies=["ppo", "sac"], drawn=2, near=[], focus=0.5, relative=True, tie_break=0.5,
-    observation=["own", "front_1", "rear_1", "own_harm_weight"],
-)  # fmt: skip
-PLAN: dict[str, Any] = {
-    "networks": 2, "gating": [4], "worlds": 64, "templates": 20, "gain": 0.0, "margin": 5.0, "imitation_epochs": 2,
-    "gating_states": 32, "gating_memory": 100, "gating_steps": 4, "tie_break": 0.05,
-    "shares": {"pretraining_first": 0.25, "pretraining_others": 0.25, "gating": 0.5},
-}  # fmt: skip
-EXPERTS = VINE.replace(experts=PLAN)
 
 
 def new_model(recipe: Any, scenario: Any = PAPER) -> Any:
@@ -52,5 +41,5 @@ def new_model(recipe: Any, scenario: Any = PAPER) -> Any:
 def fingerprint(policies: Any) -> list[float]:
     """Return the sum of the absolute weights of each learned tensor of the first policy."""
     tensors = next(iter(policies.values())).tensors
-    learned = sorted(name for name in tensors if not name.startswith("among") and "log_std" not in name)
+    learned = sorted(name for name in tensors if "log_std" not in name)
     return [float(np.abs(tensors[name].astype(np.float64)).sum()) for name in learned]

@@ -81,14 +81,14 @@ def test_planners__minimise_the_objective_of_the_scenario_also_in_worlds_of_a_ta
 
 def test_planners__spare_one_vehicle_first_and_then_the_line() -> None:
     first = PAPER.replace(objective="first:vehicle_3,then:total")
-    result = eb.evaluate(first, "best_harm:200,full_brake,full_brake+search,e_v2x_bm,universal-paper", episodes=10)
+    result = eb.evaluate(first, "best_harm:200,full_brake,full_brake+search,e_v2x_bm,vine-paper", episodes=10)
     goal = {
         agent: 1000.0 * result[agent]["first_impact_harm_3"] + result[agent]["first_impact_harm"] for agent in result
     }
     for agent in ("best_harm:200", "full_brake+search"):
         assert result[agent]["predicted_harm"] == pytest.approx(goal[agent], rel=1e-9)
         assert result[agent]["first_impact_harm"].mean() < result["full_brake"]["first_impact_harm"].mean()
-    assert (goal["best_harm:200"] <= goal["universal-paper"] + 1e-9).all()
+    assert (goal["best_harm:200"] <= goal["vine-paper"] + 1e-9).all()
     assert (goal["best_harm:200"] <= goal["e_v2x_bm"] + 1e-9).all()
 
 
