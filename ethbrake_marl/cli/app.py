@@ -38,7 +38,6 @@ for name, command, shown in (
     ("run", run.run_command, "run --steps 200000 --seed 1"),
     ("train", train.train_command, "train --recipe sac --output runs/sac"),
     ("evaluate", evaluate.evaluate_command, "evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000"),
-    ("compare", evaluate.compare_command, "compare before/results.json after/results.json"),
     ("doctor", doctor.doctor_command, "doctor"),
 ):
     app.command(name, epilog=example(shown) + (f"\n\n{_NAMES}" if name in ("train", "evaluate") else ""))(command)

@@ -18,8 +18,9 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 FOLDERS: dict[str, Path] = {}  # registered folders: path as text -> path
 
+THREE_TESTS = ("paper-random", "paper-random-brake-only", "paper-random-obstacle")
 BENCHMARK = (  # scenarios that ship with a table of best known harm, which the share of the possible reduction needs
-    *("paper-random", "paper-random-brake-only", "paper-random-obstacle", "paper-delay-high", "paper-distance"),
+    *(*THREE_TESTS, "paper-delay-high", "paper-distance"),
     *("realistic-motorway", "realistic-mixed", "stress-wide", "cooperation-2-blocked", "cooperation-2-five"),
 )
 

@@ -174,7 +174,7 @@ def test_output__is_a_folder_of_its_own(line: str, message: str, refuse: Refuse)
             "--agents bad.py:worst",
             "file 'bad.py': 'worst' is not a function; write FILE.py:FUNCTION, where FUNCTION makes the agent",
         ),
-        ("", "--set measures=injur", "unknown measure 'injur'; did you mean 'injury'?"),
+        ("", "--set measures=pushed_n", "unknown measure 'pushed_n'; did you mean 'pushed_m'?"),
         (
             "import ethbrake_marl as eb\ndef slow(): return eb.policy_agent(lambda seen: exit(0))\n",
             "--agents bad.py:slow --episodes 3",

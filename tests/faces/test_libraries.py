@@ -196,18 +196,6 @@ def test_spaces__are_taken_by_every_function_of_gymnasium_on_spaces() -> None:
             assert getattr(same, name, None) == getattr(alone, name, None)
 
 
-def test_spaces__in_models_that_1_0_0_saved_are_read() -> None:
-    env = EthBrakeEnv(actions=5, observation=["front_1.gap", "own.mass"])
-    assert env.observation_space.features == ("front_1.gap", "own.mass") and env.action_space.evenly_spaced is True
-    now = b"gymnasium.spaces.box\nBox", b"gymnasium.spaces.discrete\nDiscrete"
-    then = b"ethbrake_marl.faces.spaces\nFeatureBox", b"ethbrake_marl.faces.actions\nIndices"
-    for space, name, old_name in zip((env.observation_space, env.action_space), now, then, strict=True):
-        saved = pickle.dumps(space, 0)
-        assert name in saved
-        read = pickle.loads(saved.replace(name, old_name))
-        assert read == space and vars(read).keys() == vars(space).keys()
-
-
 @pytest.mark.parametrize("vector", [SyncVectorEnv, pytest.param(AsyncVectorEnv, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("mode", ["same", "different"])
 @pytest.mark.parametrize("settings", [{}, {"actions": 5}], ids=str)

@@ -105,8 +105,8 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}
     if known is not None:
         columns |= {f"Best known, {count}": known.harm[count] for count in counts if count in known.harm}
-        if known.avoidable is not None:
-            columns["Contact"] = np.where(known.avoidable, "avoidable", "unavoidable")
+        if known.unavoidable is not None:
+            columns["An impact is"] = np.where(known.unavoidable, "unavoidable", "perhaps avoidable")
     columns["Impacts"] = result[focus]["impacts"]
     rows = []
     for k in worst_rows(compared, focus).tolist():
@@ -128,13 +128,13 @@ def avoidable_section(compared: Compared) -> Section:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
         return Section("World by world", [drawing(figure, "Harm", words)])
     body: list[str] = []
-    if known.avoidable is not None:
-        share = rate(known.avoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
+    if known.unavoidable is not None:
+        share = rate(known.unavoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
-            f"Contact can be avoided in {share} of the worlds. In the other worlds, no command can avoid it (both"
-            " proven for each world)."
+            f"An impact is unavoidable in {share} of the worlds: it is proven for each of them that no command avoids"
+            " an impact."
         )
-        for where, among in (("Contact avoidable", known.avoidable), ("Contact unavoidable", ~known.avoidable)):
+        for where, among in (("Impact unavoidable", known.unavoidable), ("Other worlds", ~known.unavoidable)):
             if among.any():
                 body.append(table(_harm_among(compared, known, where, among)))
     words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."

@@ -41,7 +41,6 @@ from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables
 from ethbrake_marl.training.run import RunFolder
 
-MOST_WORLDS = 2_000  # of each of the other two tests
 PAGE = "report.html"
 
 
@@ -62,8 +61,7 @@ class RunReport:
             begin(f"the same policy in {test.name}")
             with warnings.catch_warnings():  # the page says that the policy was not trained for this test
                 warnings.simplefilter("ignore", Unfamiliar)
-                few = min(compared.result.n, MOST_WORLDS)
-                others[test.name] = experiment.in_another(test, few, TEAM_BASELINES, Tables.measures)
+                others[test.name] = experiment.in_another(test, compared.result.n, TEAM_BASELINES, Tables.measures)
             write_results(folder, others[test.name].table, name=f"results-{test.name}.json", force=True)
         learners = [] if single else learners_sheets(compared)
         begin("figures")

@@ -13,8 +13,7 @@ from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.learning import unconverged
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, WORLDS, opened
-from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
-from ethbrake_marl.extensions.reproduction.search import NEAREST
+from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import (
     COUPLED,
     MAP_STEP_S,

@@ -131,7 +131,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "vehicles [4]: must be one or more of 1 to 3, each once": of([4]),
     "vehicles []: must be one or more of 1 to 3, each once": of([]),
     "vehicles [2, 2]: must be one or more of 1 to 3, each once": of([2, 2]),
-    "objective 'injury:CURVE': is not a weighted sum": of(None, objective="injury:lr4s"),
+    "objective 'maximin': is not a weighted sum": of(None, objective="maximin"),
     "objective 'maximin': is not a weighted sum": of(None, objective="first:own,then:maximin"),
     "objective 'own': the 2 controlled vehicles have different objectives": of(None, "cooperation-3-pair", "own"),
 }

@@ -11,10 +11,10 @@ from functools import partial
 import numpy as np
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.injury import CURVES, injured, speed_changes
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.evaluation.measures import Given
+from ethbrake_marl.extensions.injuries.curves import CURVES, injured, speed_changes
 from ethbrake_marl.registry import Part
 
 

@@ -7,10 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.objectives import Harm
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import driven_again
 from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
 from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats
+from ethbrake_marl.registry import Part
 
 
 class Curve(NamedTuple):
@@ -56,15 +58,14 @@ def risks(changes: Floats, curve: str) -> Floats:
     return np.where(changes > 0.0, np.stack(each, axis=1), 0.0)
 
 
-def injured_by_harm(pairs: Floats, car: Floats, curve: str) -> Floats:
-    """Expected injuries in 1,000 lines, [n], as if a single impact had done each pair's harm ``pairs``.
+def injured_by_harm(harm: Harm, vehicle: int, curve: str) -> Floats:
+    """Expected injuries in 1,000 lines, as if a single impact had done each pair's harm.
 
-    ``pairs`` is [n, N + 1] m2/s2, column 0 for the obstacle; ``car``: parameters of the ``State``. A vehicle that is
-    hit on both sides counts with the larger of its two risks. Exact for first impacts of two vehicles; too large if
-    several impacts of a pair add up.
+    A vehicle that is hit on both sides counts with the larger of its two risks. Exact for first impacts of two
+    vehicles; too large if several impacts of a pair add up.
     """
-    rebound = (1.0 + car[:, RESTITUTION, :-1]) * np.sqrt(pairs[:, :-1])
-    mass = car[:, MASS, 1:]
+    rebound = (1.0 + harm.car[:, RESTITUTION, :-1]) * np.sqrt(harm.pairs[:, :-1])
+    mass = harm.car[:, MASS, 1:]
     both = mass[:, :-1] + mass[:, 1:]
     changes = np.stack([rebound, np.zeros(mass.shape)], axis=1)  # front, rear
     changes[:, 1, :-1] = mass[:, 1:] / both * rebound[:, 1:]
@@ -91,3 +92,6 @@ def injured(changes: Floats, curve: str) -> Floats:
     """
     front, rear = np.moveaxis(risks(changes, curve), 1, 0)
     return 1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front)
+
+
+OBJECTIVE = Part(injured_by_harm, arguments=tuple(CURVES))
