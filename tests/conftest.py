@@ -64,11 +64,17 @@ def _one_torch_thread() -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all", action="store_true", help="the slow tests, too, as continuous integration")
     parser.addoption("--first-case", action="store_true", help="of each parametrised test the first case alone")
+    parser.addoption("--size", type=int, default=1, help="how many times their least work the nightly tests do")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("all"):
-        config.option.markexpr = ""
+        config.option.markexpr = "not nightly"
+
+
+@pytest.fixture(scope="session")
+def size(request: pytest.FixtureRequest) -> int:
+    return int(request.config.getoption("size"))
 
 
 @pytest.hookimpl(trylast=True)  # behind the choice by marks
