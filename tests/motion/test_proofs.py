@@ -1,8 +1,8 @@
 """Statements about the package's own code that a solver proves, and planted bugs that must break the proofs.
 
-The statements are about real numbers, for all values that the assumptions allow; rounding is not covered. Compilation
-must be switched off (``NUMBA_DISABLE_JIT=1``): then the functions of the package run in Python, with symbols instead of
-numbers, along every path of their comparisons. So the proofs are about the code itself.
+The statements are about real numbers, for all values that the assumptions allow; rounding is not covered. The functions
+of the package run in Python, without being compiled, with symbols instead of numbers, along every path of their
+comparisons. So the proofs are about the code itself.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import inspect
 import itertools
 import math
 import operator
-import os
 import sys
 from collections.abc import Callable, Iterator
 from fractions import Fraction
@@ -21,11 +20,24 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
-import z3
+import pytest
 
 from ethbrake_marl.motion import contact as contacts, drive, forces, impact
 from ethbrake_marl.motion.layout import CAR_ROWS, CLOSING, LINE_ROWS, MASS, RESTITUTION, ROWS, SPEED
-from tests.programmes import Cases, Given, Told
+
+z3 = pytest.importorskip("z3")
+pytestmark = pytest.mark.nightly
+
+
+@pytest.fixture(autouse=True)
+def _uncompiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in [each for name, each in sys.modules.items() if name.startswith("ethbrake_marl.motion.")]:
+        for name, value in [*vars(module).items()]:
+            if hasattr(value, "py_func"):
+                monkeypatch.setattr(module, name, value.py_func)
+            elif name in ("kernel", "large"):
+                monkeypatch.setattr(module, name, lambda function: function)
+
 
 # ---------------------------------------------------------------- symbolic execution
 
@@ -370,28 +382,19 @@ BUGS = {
 }  # fmt: skip
 
 
-def proven(statement: Statement) -> Told:
-    return Told(True, f"proven along {statement()} paths")
+@pytest.mark.parametrize("text", STATEMENTS)
+def test_statement__is_proven(text: str) -> None:
+    print(f"proven along {STATEMENTS[text]()} paths")
 
 
-def unproven(bug: Bug) -> Told:
-    """Check that the statement is no longer proven with the bug."""
+@pytest.mark.parametrize("name", BUGS)
+def test_statement__is_not_proven_with_a_bug(name: str) -> None:
+    bug = BUGS[name]
     source = inspect.getsource(getattr(bug.module, bug.function))
-    times = source.count(bug.old)
-    assert times == 1, f"{bug.function}: {bug.old!r} occurs {times} times, not once"
-    with mock.patch.object(bug.module, bug.function):
+    assert source.count(bug.old) == 1
+    with (
+        mock.patch.object(bug.module, bug.function),
+        pytest.raises(AssertionError, match=r"not proven|the root of what"),
+    ):
         exec(compile(source.replace(bug.old, bug.new), str(bug.module.__file__), "exec"), vars(bug.module))
-        try:
-            bug.breaks()
-        except AssertionError as error:
-            return Told(True, str(error))
-    return Told(False, "MISSED: the statement is proven in spite of the bug")
-
-
-def cases(given: Given) -> Cases:
-    if os.environ.get("NUMBA_DISABLE_JIT") != "1":
-        sys.exit("compilation must be switched off: NUMBA_DISABLE_JIT=1")
-    for text, statement in STATEMENTS.items():
-        yield text, partial(proven, statement)
-    for name, bug in BUGS.items():
-        yield f"bug: {name}", partial(unproven, bug)
+        bug.breaks()
