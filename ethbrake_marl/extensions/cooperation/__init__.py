@@ -1,10 +1,17 @@
-"""What a level of cooperation is worth (``ethbrake study ablate``)."""
+"""What cooperation is worth (``study ablate``), and what sparing one vehicle costs the others (``study front``)."""
 
 from typing import TYPE_CHECKING
 
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
+    from ethbrake_marl.extensions.cooperation.front import (
+        Front as Front,
+        corners as corners,
+        least_largest as least_largest,
+        search_front as search_front,
+        weight_grid as weight_grid,
+    )
     from ethbrake_marl.extensions.cooperation.seeds import (
         mean_over_seeds as mean_over_seeds,
         share_over_seeds as share_over_seeds,
