@@ -70,9 +70,8 @@ def ablate_command(
     with Out(as_json=as_json, remains=REMAINS) as out:
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.cli.train import changed
-        from ethbrake_marl.extensions.cooperation.ablation import FULL, QUICK, Ablation, measure, train_all
+        from ethbrake_marl.extensions.cooperation.ablation import FULL, QUICK, Ablation, measure, train_all, with_optima
         from ethbrake_marl.extensions.cooperation.levels import STANDARD, SWEPT, read_levels, sweep_levels
-        from ethbrake_marl.extensions.cooperation.optimum import with_optima
         from ethbrake_marl.extensions.cooperation.results import tables, write_ablation
         from ethbrake_marl.training.recipe import load_recipe
 
@@ -149,8 +148,8 @@ def front_command(
 
     For each choice of weights, a search looks in every world for the commands with the least weighted honest cost (with
     --set rules=paper: first-impact harm). Beside them stand full braking, maximin (the least that the largest cost of a
-    vehicle can be) and, if there is one learner, agents. The default weights are a grid, equal weights, and, for each
-    vehicle, 1 with a tiny weight for all others. The command writes front.json and front.png.
+    vehicle can be) and agents, each of which drives all learners. The default weights are a grid, equal weights, and,
+    for each vehicle, 1 with a tiny weight for all others. The command writes front.json and front.png.
     """
     with Out(as_json=as_json, force=force) as out:
         import numpy as np
