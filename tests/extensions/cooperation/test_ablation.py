@@ -9,11 +9,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COLUMN
-from ethbrake_marl.extensions.cooperation.ablation import Measured
-from ethbrake_marl.extensions.cooperation.comparison import compare
+from ethbrake_marl.extensions.cooperation.ablation import Answer, Measured, can_imitate, least_known
 from ethbrake_marl.extensions.cooperation.levels import Level
-from ethbrake_marl.extensions.cooperation.optimum import Answer, can_imitate, least_known
-from ethbrake_marl.extensions.cooperation.results import levels_csv
+from ethbrake_marl.extensions.cooperation.results import compare, levels_csv
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.motion.layout import FAR_M, GAP
 from tests.fixtures.commands import Command

@@ -7,8 +7,14 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.settings import read_settings
-from ethbrake_marl.extensions.cooperation.levels import STANDARD, Level, common_worlds, read_levels, sweep_levels
-from ethbrake_marl.extensions.cooperation.sweep import parse_sweep
+from ethbrake_marl.extensions.cooperation.levels import (
+    STANDARD,
+    Level,
+    common_worlds,
+    parse_sweep,
+    read_levels,
+    sweep_levels,
+)
 from ethbrake_marl.worlds.mixture import WORDS
 from tests.fixtures.commands import Refuse
 from tests.refused import refused

@@ -11,7 +11,7 @@ from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.search.best_harm import driven_profiles
-from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, beside_braking, problem_of
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, FORCE, GAP, LATENCY, MASS, SPEED
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
@@ -36,6 +36,16 @@ def driven(name: str, **settings: Any) -> tuple[Problem, Profiles, State]:
     alert, team = scenario.sample(20, seed=3), Team("wild", dict.fromkeys(scenario.learners, Wild()))
     problem = problem_of(game, alert, **settings)
     return problem, driven_profiles(problem, game, alert, team), drive(game, alert, team)
+
+
+@pytest.mark.parametrize("body", [2, 3])
+def test_beside_braking__one_vehicle_drives_as_alone_although_the_other_decides_earlier(body: int) -> None:
+    (_, pair), (one, game) = eb.open_game("cooperation-3-pair"), eb.open_game("cooperation-3-pair", [f"vehicle_{body}"])
+    alert = one.sample(20, seed=3)
+    together, alone = problem_of(pair, alert), problem_of(game, alert)
+    profiles = driven_profiles(alone, game, alert, Team("wild", {body: Wild()}))
+    both = together.follow(beside_braking(together, alone, profiles))
+    assert both.borne_harm("honest") == pytest.approx(alone.follow(profiles).borne_harm("honest"), abs=1e-9)
 
 
 @pytest.mark.parametrize(

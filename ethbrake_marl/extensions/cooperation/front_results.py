@@ -1,4 +1,4 @@
-"""Results of a front: mean harms with intervals, hypervolumes, and a comparison with agents."""
+"""Results of a front: mean harms with intervals, hypervolumes, a comparison with agents, tables and the figure."""
 
 from __future__ import annotations
 
@@ -7,15 +7,26 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.agents.scripts import FULL_BRAKE
 from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
+from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import by_recording
 from ethbrake_marl.evaluation.identity import about_scenario, versions, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
-from ethbrake_marl.extensions.fronts.front import Borne, Front, weighted
-from ethbrake_marl.extensions.fronts.hypervolume import MOST_DIMENSIONS, hypervolume
+from ethbrake_marl.extensions.cooperation.front import Borne, Front, weighted
+from ethbrake_marl.extensions.report.style import (
+    TITLES,
+    finish,
+    in_our_style,
+    label_text,
+    new_panels,
+    plain,
+    series_style,
+)
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
@@ -24,6 +35,8 @@ from ethbrake_marl.worlds.sampling import Drawn
 from ethbrake_marl.worlds.scenario import Scenario
 
 FRONT = "Pareto front"  # name of the front beside the agents in the entry "hypervolume"; no agent can have this name
+MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of the dimensions less one
+SIZE_IN = (5.6, 4.6)  # narrow enough for a phone
 
 Json = dict[str, Any]
 
@@ -100,6 +113,28 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
     return entries
 
 
+def hypervolume(points: Floats, reference: Floats) -> float:
+    """Return the exact volume of the region between ``points`` [Q, N], which dominate it, and ``reference`` [N].
+
+    Smaller coordinates are better. A point is ignored unless all its coordinates are below the reference point's. The
+    region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
+
+    >>> import numpy as np
+    >>> from ethbrake_marl.extensions.cooperation.front_results import hypervolume
+    >>> hypervolume(np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([3.0, 3.0]))
+    3.0
+    """
+    points = points[(points < reference).all(axis=1)]
+    if not len(points):
+        return 0.0
+    if len(reference) == 1:
+        return float(reference[0] - points.min())
+    points = points[np.argsort(points[:, -1], kind="stable")]
+    ends = np.append(points[1:, -1], reference[-1])
+    slices = ((end - points[k, -1], points[: k + 1, :-1]) for k, end in enumerate(ends))
+    return sum(float(height) * hypervolume(below, reference[:-1]) for height, below in slices if height > 0.0)
+
+
 def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
     game = open_game(scenario)[1]
     last = drive(game, drawn.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
@@ -147,3 +182,29 @@ def hypervolume_sheet(results: Json) -> Sheet:
     ]
     columns: list[Column | str] = ["Reference", "Of", Column("Hypervolume"), share]
     return Sheet(f"Hypervolume of the mean {IN_WORDS[results['harm_count']]}, (m2/s2)^N", columns, rows, gap=2)
+
+
+@in_our_style
+def front_figure(results: Json) -> Figure:
+    """Draw one point for each choice of weights: the line's mean harm against that of the vehicle that bears most.
+
+    ``results``: the content of ``front.json``.
+    """
+    beside = {name: [{"vehicles": vehicles}] for name, vehicles in results["beside"].items()}
+    count, all_positive = results["harm_count"], True
+    figure, (axes,) = new_panels(SIZE_IN)
+    for number, (name, points) in enumerate({"Pareto front": results["points"], **beside, **results["agents"]}.items()):
+        harm = np.array([[each["value"] for each in point["vehicles"][count]] for point in points])
+        style = series_style(number) | {"linestyle": "none", "markersize": 5.0, "fillstyle": "none"}
+        axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style)
+        all_positive &= bool((harm.max(axis=1) > 0.0).all())
+    if all_positive:
+        axes.set(xscale="log", yscale="log")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(FuncFormatter(plain))
+            axis.set_minor_formatter(FuncFormatter(plain))
+    axes.tick_params(which="minor", labelsize=7)
+    axes.set(xlabel=f"Line: {TITLES[count].lower()}", ylabel=f"Vehicle that bears most: {TITLES[count].lower()}")
+    worlds = count_of(results["episodes"], "world")
+    caption = f"{results['scenario']}, {worlds}; one point for each of {len(results['points'])} choices of the weights."
+    return finish(figure, caption, axes, columns=2, fontsize=8)

@@ -7,8 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.fronts.front import search_front
-from ethbrake_marl.extensions.fronts.weights import corners, weight_grid
+from ethbrake_marl.extensions.cooperation.front import corners, search_front, weight_grid
 
 
 @pytest.mark.parametrize(("vehicles", "steps"), [(2, 7), (3, 5), (4, 3)])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.extensions.fronts.hypervolume import hypervolume
+from ethbrake_marl.extensions.cooperation.front_results import hypervolume
 
 
 @pytest.mark.parametrize(
