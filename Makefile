@@ -28,7 +28,7 @@ help:
 	@echo "make venv             make only the environment $(VENV)"
 	@echo "make run [ARGS=...]   train, evaluate and write a report to runs/ (ethbrake run)"
 	@echo "make core [ARGS=...]   check a copy without extensions: tests of the core, training, evaluation, shield"
-	@echo "make test [ARGS=...]  run the tests; ARGS=--all also runs the slow ones, as .ci/run does"
+	@echo "make test [ARGS=...]  run the tests; ARGS=--all also runs the slow ones, as .ci/run does; ARGS='-m nightly' attacks"
 	@echo "make lint             check the code: ruff, ruff format --check, mypy --strict, deptry, import-linter"
 	@echo "make docs             build the site in docs/_build/html and run its notebooks; a warning is an error"
 	@echo "make figures          make blocks, tables and pictures of README and docs again, and compare them (half an hour)"
@@ -121,7 +121,7 @@ figures: $(STAMP)
 	@$(PROGRAMME) figures $(ARGS)
 
 programme: $(STAMP)
-	@$(if $(filter proofs,$(NAME)),NUMBA_DISABLE_JIT=1) $(PROGRAMME) $(NAME) $(ARGS)
+	@$(PROGRAMME) $(NAME) $(ARGS)
 
 clean:
 	rm -rf $(VENV) .venvs .pytest_cache .ruff_cache .mypy_cache .hypothesis build dist docs/_build

@@ -67,7 +67,6 @@ if TYPE_CHECKING:
         summarise as summarise,
         summarise_by as summarise_by,
     )
-    from ethbrake_marl.evaluation.compare import compare_results as compare_results
     from ethbrake_marl.evaluation.results import (
         read_result as read_result,
         write_results as write_results,

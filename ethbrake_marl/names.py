@@ -7,7 +7,8 @@
     wrapper = NAME[:ARGUMENT], a search or a shield around what stands before it
 
 The tables ``AGENTS`` and ``WRAPPERS`` contain the names. An entry called ``NAME.ARGUMENT`` is used for this argument
-only. An agent's entry may also be a group: a list of specs, such as ``ladder``.
+only. An agent's entry may also be a group: a list of specs, such as ``ladder``. Lists are split at commas, and specs at
+``+``, so no path may contain one of them.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
 from inspect import signature
+from itertools import product
 from typing import Any
 
 from ethbrake_marl.agents.drive import UNSTATED, Agent, Team, check_agent, check_knows
@@ -141,7 +142,10 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
     """
     check_count("harm_count", harm_count)
     loaded = None if scenario is None else load_scenario(scenario)
-    core, wrappers = _split(spec)
+    if not isinstance(spec, str) or not spec:
+        raise InvalidInput(f"agent {spec!r:.80}: must be a name, for instance full_brake, policy@runs/mine or ppo+step")
+    split_specs(spec)
+    core, *wrappers = spec.split("+")
     settings = AgentSettings(core, None, loaded, harm_count)
     driver = _make(core, settings)
     for wrapper in wrappers:
@@ -221,46 +225,22 @@ def group(name: str) -> list[str]:
 
 
 def split_specs(text: str) -> list[str]:
-    """Split a list of specs at its commas, except commas in the path of an existing file or folder."""
-    parts, specs = text.split(","), []
-    while parts:
-        joined = (k for k in range(len(parts), 1, -1) if _path_exists(",".join(parts[:k])))
-        count = next(joined, 1)
-        specs.append(",".join(parts[:count]))
-        parts = parts[count:]
-    return specs
+    """Split a list of specs at its commas. Raises the error of ``check_path`` for a path that exists."""
+    begins = [match.end() for match in re.finditer(r"^|[,@]", text)]
+    ends = [match.end() for match in re.finditer(r"(?=[,+]|$)|\.py(?=:)", text)]
+    for begin, end in product(begins, ends):
+        path = text[begin:end]
+        if (text[:begin].endswith("@") or path.endswith(".py")) and os.path.lexists(os.path.expanduser(path)):
+            check_path(path)
+    return text.split(",")
 
 
-def _path_exists(text: str) -> bool:
-    core = text
-    while core.rpartition("+")[2].partition(":")[0] in WRAPPERS:
-        core = core.rpartition("+")[0]
-    head, _, path = core.partition("@")
-    if not path:
-        head, path = "", core.partition(".py:")[0] + ".py"
-    return "," in path and "," not in head and os.path.lexists(os.path.expanduser(path))
-
-
-def _split(spec: object) -> tuple[str, list[str]]:
-    """Return the agent's spec and its wrappers, the innermost first. A ``+`` in an existing path belongs to the path.
-
-    Raises ``UnknownName`` for an unknown wrapper.
-    """
-    if not isinstance(spec, str) or not spec:
-        raise InvalidInput(f"agent {spec!r:.80}: must be a name, for instance full_brake, policy@runs/mine or ppo+step")
-    core, wrappers = spec, list[str]()
-    while True:
-        before, plus, last = core.rpartition("+")
-        path = core.partition("@")[2] or (core.partition(":")[0] if ".py:" in core else "")
-        may_be_in_path = "@" in core or ".py:" in last
-        if not plus or (may_be_in_path and os.path.lexists(os.path.expanduser(path))):
-            return core, wrappers
-        word = last.partition(":")[0]
-        if word not in WRAPPERS:
-            if not path or get_close_matches(word, WRAPPERS, n=1):
-                raise WRAPPERS.unknown(word)
-            return core, wrappers
-        core, wrappers = before, [last, *wrappers]
+def check_path(path: str | os.PathLike[str]) -> None:
+    """Raise ``InvalidInput`` for a path that cannot stand in the name of an agent."""
+    if {",", "+"} & {*str(path)}:
+        raise InvalidInput(
+            f"{path}: a path in the name of an agent must have no comma and no plus; rename it, or make a link to it"
+        )
 
 
 def _make(core: str, settings: AgentSettings) -> Driver:

@@ -27,9 +27,5 @@ PARTS = {
         "pushed_m": "evaluation.pushing:PUSHED_M",
         "drove_towards": "evaluation.pushing:DROVE_TOWARDS",
         "still_moving": "evaluation.pushing:STILL_MOVING",
-        "injury": "evaluation.injuries:INJURY",
-        "injury_lr4s": "evaluation.injuries:LR4S",
-        "injury_reference": "evaluation.injuries:REFERENCE",
-        "injury_gidas": "evaluation.injuries:GIDAS",
     },
 }

@@ -1,18 +1,12 @@
 """What holds for every test: one thread, no display, the same examples in every run."""
 
-import copy
-import dataclasses
-import functools
 import os
 import signal
 import sys
 from pathlib import Path
 
 import pytest
-import typer.main
 from hypothesis import settings
-
-from ethbrake_marl.files import yaml
 
 # Before the first numerical import: each pool reads its variable once.
 os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1") | {
@@ -21,23 +15,6 @@ os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM
 
 FIXTURES = ("installed", "kernels", "pictures", "commands", "registered", "other_law")
 pytest_plugins = [f"tests.fixtures.{name}" for name in FIXTURES]
-
-# Typer builds all commands for each command line, 100 ms; the suite has a thousand in one process.
-typer.main.get_command_from_info = functools.cache(typer.main.get_command_from_info)
-
-# The suite reads the shipped files several thousand times, 10 ms each: what is parsed is the same for the same text.
-_parse_anew = yaml._parse
-_parse = functools.cache(_parse_anew)
-
-
-def _parsed_once(text: str, file: str) -> yaml.Document:
-    if len(text) > 20_000:  # no scenario: somebody measures what a long one costs
-        return _parse_anew(text, file)
-    document = _parse(text, file)
-    return dataclasses.replace(document, content=copy.deepcopy(document.content))
-
-
-yaml._parse = _parsed_once
 
 # A shell's background job ignores Ctrl-C, and so would all processes that it starts; the tests send it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -64,11 +41,17 @@ def _one_torch_thread() -> None:
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--all", action="store_true", help="the slow tests, too, as continuous integration")
     parser.addoption("--first-case", action="store_true", help="of each parametrised test the first case alone")
+    parser.addoption("--size", type=int, default=1, help="how many times their least work the nightly tests do")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("all"):
-        config.option.markexpr = ""
+        config.option.markexpr = "not nightly"
+
+
+@pytest.fixture(scope="session")
+def size(request: pytest.FixtureRequest) -> int:
+    return int(request.config.getoption("size"))
 
 
 @pytest.hookimpl(trylast=True)  # behind the choice by marks

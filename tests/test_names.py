@@ -20,7 +20,6 @@ from ethbrake_marl.names import (
     open_game,
     register_agent,
     register_shield,
-    split_specs,
     teams_of,
 )
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -177,28 +176,33 @@ def test_a_function_of_a_file__takes_an_argument_and_wrappers(tmp_path: Path, mo
     monkeypatch.chdir(tmp_path)
     register_shield("around", around)
     text = "import ethbrake_marl as eb\ndef make(argument, settings):\n    return eb.make_agent('constant:' + argument)"
-    for name in ("mine.py", "a+b.py"):
-        (tmp_path / name).write_text(text)
-        team = make_agent(f"{name}:make:3+around", scenario=PAPER)
-        assert team.name == f"{name}:make:3+around" and team.drivers[2].name == "constant:3"
+    (tmp_path / "mine.py").write_text(text)
+    team = make_agent("mine.py:make:3+around", scenario=PAPER)
+    assert team.name == "mine.py:make:3+around" and team.drivers[2].name == "constant:3"
 
 
-def test_a_path__keeps_its_plus_and_commas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", ["a+b", "a,b", "lr=1,seed=2,x", "a+around"])
+@pytest.mark.parametrize("kind", ["{}", "policy@{}", "policy@{}+around", "coast,policy@{}/policy,full_brake"])
+def test_a_path_with_a_comma_or_plus__is_refused(name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "a+around,b").mkdir()
     register_shield("around", around)
-    policies = []
-    register_agent(
-        "theirs", lambda argument, settings: policies.append(settings.policy) or make_agent("coast"), form="theirs@PATH"
-    )
-    assert split_specs("coast,theirs@a+around,b+around,full_brake") == [
-        "coast",
-        "theirs@a+around,b+around",
-        "full_brake",
-    ]
-    make_agent("theirs@a+around,b", scenario=PAPER)
-    make_agent("theirs@a+around,b+around", scenario=PAPER)
-    assert policies == ["a+around,b"] * 2
+    file = kind == "{}"
+    path = Path(f"{name}.py" if file else f"{name}/policy" if "/" in kind else name)
+    path.parent.mkdir(exist_ok=True)
+    path.touch()
+    agents = f"coast,{path}:make+around" if file else kind.format(name)
+    with pytest.raises(InvalidInput, match="must have no comma and no plus; rename it") as refusal:
+        teams_of(agents, PAPER)
+    assert str(refusal.value).startswith(f"{path}: ")
+    if "coast" not in agents:
+        with pytest.raises(InvalidInput, match="must have no comma"):
+            make_agent(agents, scenario=PAPER)
+
+
+def test_a_list__is_not_taken_for_the_path_of_a_file_with_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "coast,full_brake").touch()
+    assert [*make_teams("coast,full_brake", PAPER)] == ["coast", "full_brake"]
 
 
 def test_a_group__stands_for_its_agents_and_a_list_has_each_once():

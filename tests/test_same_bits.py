@@ -1,7 +1,7 @@
 """Nothing that shapes a world, an episode, a list or a recorded result has other last bits on another processor.
 
 The C library, numpy and scipy choose their exponentials, powers and matrix products by processor. The package's calls
-of them are listed here, each with the reason why it may stay; ``make programme NAME=machines`` tries recorded results
+of them are listed here, each with the reason why it may stay; ``tests/golden/test_machines.py`` tries recorded results
 on other processors.
 """
 

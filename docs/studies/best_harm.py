@@ -66,7 +66,8 @@ def main(words: list[str]) -> None:
     if given.shipped:
         if outdated := outdated_tables():
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
-        print(shipped_bounds(shipped_tables()).markdown())
+        sheet = shipped_bounds(shipped_tables())
+        print("\n".join(f"| {' | '.join(cell.in_words for cell in row)} |" for row in sheet.shown()))
         return
     names = [Path(word).name if word.endswith(".npz") else word for word in words]  # without folders
     table = search(given, shlex.join(["docs/studies/best_harm.py", *names]))
@@ -146,7 +147,7 @@ def difference(table: BestHarmTable) -> str:
     return words and f"NOT renewed: other harms in worlds: {words}; search the list again"
 
 
-# *Contact proven* is not *impact proven*. In the worlds between the two, every command leads to contact, but perhaps
+# *Contact certain* is not *impact proven*. In the worlds between the two, every command leads to contact, but perhaps
 # not to an impact. Either leaning without an impact is possible there, or the proof is loose. The harm of the best
 # known profiles in these worlds shows which: almost no harm, or much harm.
 
@@ -173,7 +174,7 @@ def shipped_bounds(tables: Iterable[BestHarmTable]) -> Sheet:
     harm, share = partial(Column, digits=3), partial(Column, digits=1, scale=100.0, unit=" %")
     columns = (
         "list", Column("worlds"), harm("proven"), harm("best known, first"), share("gap"),
-        harm("best known, total"), share("gap"), share("contact proven"),
+        harm("best known, total"), share("gap"), share("contact certain"),
         share("impact proven"), share("between"), harm("best known there, first"),
         share("next to none there"),
     )  # fmt: skip

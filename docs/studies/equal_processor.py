@@ -16,7 +16,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import HARM
-from ethbrake_marl.extensions.report.curves import Curve, curves_figure
+from ethbrake_marl.extensions.report.figures import Curve, curves_figure
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Estimate

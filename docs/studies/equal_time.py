@@ -1,9 +1,10 @@
-"""Harm and processor time of agents on the same worlds, for docs/results/baselines.md.
+"""Harm, honest cost and processor time of agents on the same worlds, for docs/results/baselines.md.
 
     .venv/bin/python docs/studies/equal_time.py [AGENT ...]
 
-All agents are compared with the first one. The time is for whole episodes: the work at the alert, all decisions, and
-the motion of the worlds. No shipped table contains the worlds of this list, so ``best_harm:K`` has to search.
+Agents that search minimise the honest cost. All agents are compared with the first one: harms and cost are divided by
+its own. The time is for whole episodes: the work at the alert, all decisions, and the motion of the worlds. No shipped
+table contains the worlds of this list, so ``best_harm:K`` has to search.
 """
 
 from __future__ import annotations
@@ -20,13 +21,10 @@ from ethbrake_marl.evaluation.statistics import difference
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.names import make_teams
 
-AGENTS = (
-    "ppo+search", "ppo", "universal-paper", "full_brake+search", "e_v2x_bm",
-    *(f"best_harm:{candidates}" for candidates in (1000, 3000, 10_000, 40_000)),
-)  # fmt: skip
+AGENTS = ("universal", "universal+search", "best_harm:1000", "best_harm:40000")
 WORLDS, SEED, REPEATS = 1000, 8, 2
 AT_ONCE = 500  # worlds simulated together, equal for all agents
-HEAD = ("agent", "knows", "CPU, ms per world", "first-impact", "total", "difference")
+HEAD = ("agent", "knows", "CPU, ms per world", "first-impact harm", "total harm", "honest cost", "difference")
 
 
 def drive(
@@ -53,14 +51,17 @@ def _plain(states: Sequence[eb.State]) -> list[eb.State]:
 def rows_of(driven: Mapping[str, tuple[float, eb.State]], teams: Mapping[str, eb.Team]) -> list[Sequence[str]]:
     """Return the rows of the table, fastest team first.
 
-    The difference in first-impact harm from the first team is paired by world, with its 95 % interval.
+    The difference in honest cost from the first team is paired by world, with its 95 % interval.
     """
     against, rows = next(iter(teams)), []
     for name, (spent_ms, last) in sorted(driven.items(), key=lambda each: each[1][0]):
-        change = difference(last.harm("first"), driven[against][1].harm("first"))
+        change = difference(last.harm("honest"), driven[against][1].harm("honest"))
         low, high = change.interval or (change.value, change.value)
         shown = "" if name == against else f"{change.value:+.3f} [{low:+.3f}, {high:+.3f}]"
-        means = [f"{last.harm(count).mean():.3f}" for count in ("first", "total")]
+        means = [
+            f"{100.0 * last.harm(count).mean() / driven[against][1].harm(count).mean():.1f} %"
+            for count in ("first", "total", "honest")
+        ]
         rows.append([f"`{name}`", known_by(teams[name]), f"{spent_ms:.2f}", *means, shown])
     return rows
 
@@ -69,7 +70,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("agents", nargs="*", default=AGENTS)
     scenario, game = eb.open_game("paper-random")
-    teams = make_teams(parser.parse_args().agents, scenario)
+    teams = make_teams(parser.parse_args().agents, scenario, harm_count="honest")
     rows = rows_of(drive(scenario.sample(WORLDS, SEED), teams, game, REPEATS), teams)
     print("\n".join(f"| {' | '.join(cells)} |" for cells in (HEAD, ["---"] * len(HEAD), *rows)))
     print(f"\nMachine: {this_machine()}")

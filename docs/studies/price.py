@@ -28,7 +28,6 @@ ALONE = ("full_brake", POLICY)  # agents that have no variant ``estimated``
 LIMITS = {  # agent that decides on received messages -> the same agent that knows the line exactly
     "e_v2x_bm:estimated": "e_v2x_bm",
     f"{POLICY}+step:estimated": f"{POLICY}+step",
-    f"{POLICY}+robust:estimated": f"{POLICY}+step",  # no robust shield is exact
 }
 COUNTS = {"first": "first_impact_harm", "total": "total_harm"}
 CAPTION = (

@@ -1,4 +1,4 @@
-"""Results of the training programs in docs/train.md and README with five seeds, for docs/results/learning.md.
+"""Results of the training programs in docs/train.md and README with five seeds.
 
     python docs/studies/pushing.py one-honest pair-honest readme-honest
     python docs/studies/pushing.py one pair readme one-bootstrap pair-bootstrap readme-bootstrap one-speed pair-speed
@@ -25,7 +25,8 @@ BLOCKS = {  # program -> scenario, parallel worlds, reward
     "pair": ("cooperation-3-pair", 32, SHAPED),
     "readme": ("paper-random", 64, {"harm": 1.0}),
 }
-SEEDS, STEPS, WORLDS = range(5), 200_000, 500
+SEEDS, STEPS = range(5), 200_000
+WORLDS = {"paper-random": 10_000, "cooperation-3-pair": 2_000}
 MEASURES = {  # heading -> measure, factor, digits
     "first-impact harm": ("first_impact_harm", 1.0, 2),
     "total harm": ("total_harm", 1.0, 2),
@@ -56,7 +57,7 @@ def measure(block: str, model: PPO) -> dict[str, float]:
     agents = {block: eb.policy_agent(model, clip=True)}
     scenario = BLOCKS[block.partition("-")[0]][0]
     asked = "pushed_m,pushed_mps"
-    columns = eb.evaluate(scenario, agents, episodes=WORLDS, measures=asked)[block]
+    columns = eb.evaluate(scenario, agents, episodes=WORLDS[scenario], measures=asked)[block]
     values = {name: float(columns[name].mean()) for name, _, _ in MEASURES.values() if name in columns}
     return values | {"moving": float((columns["ended"] == "horizon").mean())}
 

@@ -25,7 +25,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.extensions.studies.machine import this_machine
-from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.files.sheet import Column, Sheet, terminal_text
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import Floats
 
@@ -286,7 +286,7 @@ def main() -> None:
         for speed in figures
     ]
     columns: list[Column | str] = ["per CPU-second", *map(Column, ("worlds", "median", "range", "x vehicles", "aim"))]
-    print(Sheet("", columns, rows).markdown())
+    print(terminal_text(Sheet("", columns, rows)), end="")
     print("Medians and ranges over repetitions. Aim: at least this rate, at most this number of seconds.")
     print(f"Machine: {machine}")
 

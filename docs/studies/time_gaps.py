@@ -1,9 +1,10 @@
-"""How much of full braking's harm can be avoided, by time gap: the figure of docs/findings.md.
+"""How much of full braking's honest cost can be saved, by time gap: the figure of docs/findings.md.
 
     .venv/bin/python docs/studies/time_gaps.py docs/figures/time-gaps.png
 
 Lines drive at 20 m/s, and all vehicles have the same time gap. All other quantities are drawn as in the scenario.
-Prints the harm of each agent, and the avoided share of full braking's harm, by scenario, time gap and count of harm.
+Agents that choose minimise the honest cost. Prints the harm and cost of each agent, and the saved share of full
+braking's, by scenario, time gap and count of harm.
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from ethbrake_marl.extensions.report.style import finish, in_our_style, new_pane
 
 WORLDS, SEED = 2000, 7
 GAPS_S = (0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.3, 1.4)
-AGENTS = ("full_brake", "e_v2x_bm", "idm", "universal-paper", "best_harm")
-COUNTS = {"first": "first_impact_harm", "total": "total_harm"}
+AGENTS = ("full_brake", "e_v2x_bm", "idm", "universal")
+COUNTS = {"first": "first_impact_harm", "total": "total_harm", "honest": "honest_cost"}
 SCENARIOS = ("paper-random", "realistic-motorway")
 LEAST = 0.05  # no share is shown if the mean harm of full braking (m2/s2) is below this
 
@@ -33,15 +34,15 @@ def with_time_gap(base: eb.Scenario, gap_s: float) -> eb.Scenario:
 
 def mean_harm(scenario: eb.Scenario) -> dict[str, list[float]]:
     """Return the mean harm of each agent on the same worlds in m2/s2, by count of harm."""
-    result = eb.evaluate(scenario, AGENTS, episodes=WORLDS, seed=SEED)
+    result = eb.evaluate(scenario, AGENTS, episodes=WORLDS, seed=SEED, harm_count="honest")
     return {count: [float(result[name][column].mean()) for name in AGENTS] for count, column in COUNTS.items()}
 
 
 @in_our_style
-def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
-    """Return the figure: the avoided share of full braking's harm by agent and time gap, with a panel per scenario.
+def draw(harm: dict[str, np.ndarray]) -> Figure:
+    """Return the figure: the saved share of full braking's honest cost by agent and time gap, a panel per scenario.
 
-    ``harm``: scenario -> mean harm [time gaps, agents] in m2/s2.
+    ``harm``: scenario -> mean honest cost [time gaps, agents] in m2/s2.
     """
     figure, panels = new_panels((8.4, 3.6), columns=len(SCENARIOS), sharey=True)
     for axes, (name, rows) in zip(panels, harm.items(), strict=True):
@@ -50,12 +51,10 @@ def draw(harm: dict[str, np.ndarray], count: str) -> Figure:
             share = 100.0 * (1.0 - rows[shown, k + 1] / rows[shown, 0])
             axes.plot(np.array(GAPS_S)[shown], share, label=agent, **series_style(k))
         axes.set(title=name, xlabel="time gap (s)", xlim=(GAPS_S[0] - 0.05, GAPS_S[-1] + 0.05), ylim=(0.0, 103.0))
-    panels[0].set_ylabel("saved of full braking's harm (%)")
+    panels[0].set_ylabel("saved of full braking's honest cost (%)")
     panels[1].legend(fontsize=8.5)
     return finish(
-        figure,
-        f"{WORLDS:,} lines of seed {SEED} for each time gap, {'first impacts' if count == 'first' else 'all impacts'}."
-        " Lines end where full braking does almost no harm.",
+        figure, f"{WORLDS:,} lines of seed {SEED} for each time gap. Lines end where full braking does almost no harm."
     )
 
 
@@ -70,5 +69,5 @@ if __name__ == "__main__":
             table[count][name] = np.array([each[count] for each in harms])
             for gap_s, row in zip(GAPS_S, table[count][name], strict=True):
                 saved = " ".join(f"{1.0 - harm / row[0]:6.1%}" if row[0] > LEAST else "     –" for harm in row[1:])
-                print(f"{name:20} {gap_s:.1f} s {count:5} {' '.join(f'{harm:6.2f}' for harm in row)}  saved {saved}")
-    write_picture(given.picture, draw(table["first"], "first"), force=True)
+                print(f"{name:20} {gap_s:.1f} s {count:6} {' '.join(f'{harm:6.2f}' for harm in row)}  saved {saved}")
+    write_picture(given.picture, draw(table["honest"]), force=True)

@@ -10,6 +10,8 @@ import signal
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from functools import cache
 from typing import Annotated, Any
 
 import typer
@@ -38,7 +40,6 @@ for name, command, shown in (
     ("run", run.run_command, "run --steps 200000 --seed 1"),
     ("train", train.train_command, "train --recipe sac --output runs/sac"),
     ("evaluate", evaluate.evaluate_command, "evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000"),
-    ("compare", evaluate.compare_command, "compare before/results.json after/results.json"),
     ("doctor", doctor.doctor_command, "doctor"),
 ):
     app.command(name, epilog=example(shown) + (f"\n\n{_NAMES}" if name in ("train", "evaluate") else ""))(command)
@@ -247,6 +248,20 @@ def with_installed(group: Any, name: str) -> Any:
     return group
 
 
+@cache
+def _built(*registered: object) -> Any:
+    """Return the commands of ``app``, built once (100 ms) while the same are registered. They must not be changed."""
+    return get_command(app)
+
+
+def _apart(command: Any) -> Any:
+    """Return a copy of a command whose groups can get other commands."""
+    copied = copy(command)
+    if hasattr(command, "commands"):
+        copied.commands = {name: _apart(each) for name, each in command.commands.items()}
+    return copied
+
+
 def whole_command() -> Any:
     """Return the program with all commands: the core's, those of installed packages, and those of ``add_command``.
 
@@ -259,13 +274,15 @@ def whole_command() -> Any:
             raise AlreadyExists(
                 f"command {name!r} already exists; give your command another name: app.command('my-{name}')"
             )
-    whole: Any = get_command(app)
+    groups = [each.typer_instance for each in app.registered_groups if each.typer_instance]
+    registered = [command for group in (app, *groups) for command in group.registered_commands]
+    whole: Any = _apart(_built(*registered, *app.registered_groups))
     for name in _OURS:
         with_installed(whole.commands[name], name)
     installed = [name for name in points(COMMANDS.group) if "." not in name]
     whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
-    groups = dict.fromkeys(entry.partition(".")[0] for entry in points(COMMANDS.group))
-    for name in (each for each in groups if each not in whole.commands):
+    others = dict.fromkeys(entry.partition(".")[0] for entry in points(COMMANDS.group))
+    for name in (each for each in others if each not in whole.commands):
         group = get_group(typer.Typer(name=name, help="Commands of installed packages.", add_completion=False))
         whole.commands[name] = with_installed(group, name)
     whole.commands["doctor"] = whole.commands.pop("doctor")  # the last one of the help

@@ -1,4 +1,4 @@
-"""The commands ``evaluate`` and ``compare``."""
+"""The command ``evaluate``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.cli.settings import Settings
     from ethbrake_marl.evaluation.compared import Compared
 
-GROUP_EPISODES = 400  # worlds of each scenario of a group; best known harms exist for these worlds of `benchmark`
+GROUP_EPISODES = 2_000  # worlds of each scenario of a group, except the three tests
 REPORT = "report.html"
 FILES = ("results.json", "worlds.csv", "worlds.parquet", REPORT)
 
@@ -60,13 +60,13 @@ def evaluate_command(
     `ethbrake agent list` shows all agents; the name ladder is short for those that need no training, from bad to good.
     A name can be followed by a shield, +episode or +step; for instance full_brake+step or policy@PATH+step, where PATH
     is the folder of a run or of a policy bundle. With --set harm_count=total, agents minimise
-    total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving
-    before the first impact and for motion at the horizon. --set measures=injury,pushed_m adds measures to the
+    total harm instead of first-impact harm; with --set rules=honest, total harm and a price for pushes, for driving and
+    for motion at the horizon. --set measures=pushed_mps,pushed_m adds measures to the
     results.
     """
     with Out(as_json=as_json, force=force) as out:
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.worlds.catalogue import group_of_scenarios
+        from ethbrake_marl.worlds.catalogue import THREE_TESTS, group_of_scenarios
 
         chosen = read_settings(settings, of_command=("harm_count", "measures"))
         _check_outputs(out, output, per_world, report=report)
@@ -80,8 +80,11 @@ def evaluate_command(
             raise InvalidInput(
                 f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
             )
-        count = (GROUP_EPISODES if names else 10_000) if episodes is None else episodes
-        every = {name: _compared(out, name, chosen, agents, count, seed, jobs) for name in names or [scenario]}
+        every = {}
+        for name in names or [scenario]:
+            usual = GROUP_EPISODES if names and name not in THREE_TESTS else 10_000
+            count = usual if episodes is None else episodes
+            every[name] = _compared(out, name, chosen, agents, count, seed, jobs)
         if report and output is not None:
             write = page_of("evaluation", "--report")
             output.mkdir(parents=True, exist_ok=True)
@@ -98,7 +101,7 @@ def _compared(
 
     harm_count, measures = chosen.command.get("harm_count", "first"), chosen.command.get("measures", "")
     if not isinstance(measures, str):
-        raise InvalidInput("--set measures: must be names with commas between them, for instance measures=injury")
+        raise InvalidInput("--set measures: must be names with commas between them, for instance measures=pushed_m")
     loaded = chosen.change_scenario(scenario)
     return Compared.of(
         loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
@@ -139,21 +142,3 @@ def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, repo
     if per_world == "parquet":
         need("pyarrow")
     check_folder(output, FILES, force=out.force)
-
-
-FILE = typer.Argument(metavar="RESULTS.json", help="File results.json of `evaluate --output`.")
-
-
-def compare_command(first: Annotated[Path, FILE], second: Annotated[Path, FILE], as_json: JsonOption = False) -> None:
-    """Show how harm differs between two results.
-
-    Shows the harm in the second result minus the harm in the first, for each agent that both results contain. The two
-    results must come from the same worlds of the same scenario. Confidence intervals are paired by world if both
-    folders contain the file that --per-world writes.
-    """
-    with Out(as_json=as_json) as out:
-        from ethbrake_marl.evaluation.compare import compare_results
-        from ethbrake_marl.evaluation.results import read_result
-
-        comparison = compare_results(read_result(first), read_result(second))
-        out.result(comparison.to_json(), comparison.sheet())

@@ -12,7 +12,6 @@ import typer
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
 from ethbrake_marl.cli.pages import page_of
-from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.sheet import Sheet
 
 if TYPE_CHECKING:
@@ -47,13 +46,14 @@ def scenario_list(as_json: JsonOption = False) -> None:
 
 @scenario_group.command("show", epilog=example("scenario show paper-random"))
 def scenario_show(scenario: NameArgument) -> None:
-    """Print the YAML file of a scenario."""
-    from ethbrake_marl.files.yaml import SIZE_LIMIT
-    from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path
+    """Print the YAML file of a scenario, with all values.
+
+    A file that is based on another scenario is printed without its comments.
+    """
+    from ethbrake_marl.worlds.explain import whole_text
 
     with Out() as out:
-        load_scenario(scenario)
-        out.show(read_plain(scenario_path(scenario), SIZE_LIMIT).decode("utf-8"), end="")
+        out.show(whole_text(scenario), end="")
 
 
 @scenario_group.command("validate", epilog=example("scenario validate my-scenario.yaml"))
@@ -176,23 +176,16 @@ def scenario_new(
     output: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for the new scenario file.")] = Path(),
     force: ForceOption = False,
 ) -> None:
-    """Write a new scenario file with comments.
+    """Write a new scenario file that is based on another one.
 
-    The file NAME.yaml has every key of a scenario. If the scenario has a table in a CSV file, this file is copied to
-    NAME.csv in the same folder.
+    The file is NAME.yaml. All other keys stand there as comments with their values.
     """
-    from ethbrake_marl.files.yaml import read_yaml
-    from ethbrake_marl.worlds.catalogue import scenario_path
     from ethbrake_marl.worlds.explain import new_scenario_text
 
     with Out(force=force) as out:
-        file, rows = output / f"{name}.yaml", output / f"{name}.csv"
-        text = new_scenario_text(name, based_on, rows_file=rows.name)
-        base = scenario_path(based_on)
-        table = read_yaml(base).content.get("table", {})
+        file = output / f"{name}.yaml"
+        text = new_scenario_text(name, based_on, folder=output)
         out.check(file)
-        if "file" in table:
-            out.write(rows, (base.parent / table["file"]).read_text("utf-8"), what="rows")
         out.write(file, text)
         out.note(f"written: {file}; change the file, then run: ethbrake scenario validate {file}")
 

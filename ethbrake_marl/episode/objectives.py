@@ -11,12 +11,11 @@ maximin             ``max_j H_j``
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``, one weight per vehicle, 0 or from 1e-6 to 1e6
 preference          as ``weighted``, with the scenario's ``harm_weight``
-injury:curve        expected injuries in 1,000 lines (``episode.injury``), as if one impact had done each pair's harm
 first:A,then:B      ``1000 A + B`` for two other objectives: nearly their lexicographic order
 ==================  ================================================================================================
 
-All are weighted sums of the vehicles' harm, except ``maximin``, ``injury``, registered ones, and a ``first`` that
-contains one of these.
+All are weighted sums of the vehicles' harm, except ``maximin``, registered ones, and a ``first`` that contains one of
+these.
 
 ``first:A,then:B`` lets B break ties of A. The order is lexicographic if two actions differ in A by more than a
 thousandth of their difference in B. Other objectives may give an impact no weight (``free_pairs``); then causing it
@@ -36,7 +35,6 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import own_amounts, pair_amounts
 from ethbrake_marl.episode.functions import called, described
-from ethbrake_marl.episode.injury import CURVES, injured_by_harm
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
@@ -85,7 +83,8 @@ class Kind(NamedTuple):
     about: str
     amount: Callable[[Harm, int, Objective], Floats]  # (harm, vehicle from 0, what is written) -> [n]
     weights: Callable[[Floats, int, Objective], Floats] | None = None  # of sums: (car, vehicle, written) -> [n, N]
-    function: Callable[[Harm, int], Floats] | None = None  # of a registered objective
+    function: Callable[..., Floats] | None = None  # of a registered objective
+    arguments: tuple[str, ...] = ()  # that a registered objective may have
 
     @property
     def name(self) -> str:
@@ -101,7 +100,7 @@ class Objective(NamedTuple):
 
     kind: Kind
     numbers: tuple[float, ...] = ()
-    curve: str = ""
+    argument: str = ""  # of a registered objective
     parts: tuple[Objective, ...] = ()  # of first:...,then:...
 
     @property
@@ -150,10 +149,10 @@ def parse_objective(text: str) -> Objective:
         if colon:
             raise InvalidInput(f"objective {text!r}: {name} takes no argument")
         return Objective(kind)
-    if name == "injury":
-        if argument not in CURVES:
-            raise unknown_name("injury curve", argument, CURVES)
-        return Objective(kind, curve=argument)
+    if kind.arguments:
+        if argument not in kind.arguments:
+            raise unknown_name(f"argument of the objective {name}", argument, kind.arguments)
+        return Objective(kind, argument=argument)
     written = [parse_numeral(part.strip()) for part in argument.split(",")]
     numbers = tuple(number for number in written if number is not None) if None not in written else ()
     if name == "social":
@@ -273,11 +272,12 @@ def _joined(first_and_then: Sequence[Floats]) -> Floats:
     return FIRST_WEIGHT * first_and_then[0] + first_and_then[1]
 
 
-def register_objective(name: str, function: Callable[[Harm, int], Floats]) -> None:
+def register_objective(name: str, function: Callable[..., Floats], *, arguments: Sequence[str] = ()) -> None:
     """Register an objective for scenarios and rewards. Entry points: ``ethbrake_marl.objectives``.
 
     ``function(harm, vehicle)`` returns what ``vehicle`` (from 0) should minimise, [n]; its docstring describes this
-    amount. Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a
+    amount. With ``arguments`` the objective is written ``name:argument``, and the function gets the argument third.
+    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a
     docstring.
     """
     form = "a-z, 0-9, - and _, beginning with a letter or digit, and no name of a vehicle"
@@ -285,12 +285,14 @@ def register_objective(name: str, function: Callable[[Harm, int], Floats]) -> No
 
     def amount(harm: Harm, vehicle: int, written: Objective) -> Floats:
         what = f"objective {name!r} of vehicle_{vehicle + 1}"
-        value = called(what, function, (harm, vehicle), harm.whole.shape)
+        given = (harm, vehicle, written.argument) if arguments else (harm, vehicle)
+        value = called(what, function, given, harm.whole.shape)
         if not np.isfinite(value).all():
             raise InvalidInput(f"{what}: its value is not finite in row {int(np.argmin(np.isfinite(value)))}")
         return value.astype(np.float64)
 
-    kind = Kind(name, meaning, amount, function=function)
+    form = f"{name}:{'|'.join(arguments)}" if arguments else name
+    kind = Kind(form, meaning, amount, function=function, arguments=tuple(arguments))
     OBJECTIVES.add(name, kind, lambda other: other.function is function)
 
 
@@ -329,10 +331,6 @@ OBJECTIVES: Registry[Kind] = Registry(
             "preference", "harm of all vehicles, with the weights harm_weight of the scenario",
             lambda harm, i, written: harm.weighted(harm.car[:, WEIGHT, 1:]),
             lambda car, i, written: _shares(car[:, WEIGHT, 1:]),
-        ),
-        "injury": Kind(
-            "injury:CURVE", "expected injuries in 1,000 lines, by the impact with the largest risk for each vehicle",
-            lambda harm, i, written: injured_by_harm(harm.pairs, harm.car, written.curve),
         ),
         "vehicle_K": Kind(
             "vehicle_K", "harm that Vehicle K bears",

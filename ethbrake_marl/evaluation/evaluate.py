@@ -117,7 +117,7 @@ def evaluate(
         worlds: worlds at the alert: ``scenario.draw(n, seed)``, or a ``State`` (without recordings).
         agents: name in tables -> team, which drives all learners of the game.
         game: game of the worlds' scenario.
-        measures: further measures, for instance ``measures_called("pushed_m,injury")``.
+        measures: further measures, for instance ``measures_called("pushed_m,pushed_mps")``.
         jobs: number of processes.
         about: further entries for tables and files (``identity.about_scenario``).
         on_done: function that is called with the number of worlds that all teams have driven so far.

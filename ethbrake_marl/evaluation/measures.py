@@ -193,7 +193,7 @@ DEFAULT = (
     ),
     Measure(
         "honest_cost", partial(harm, "honest"),
-        "Total harm, harm that contacts pass on, and a price for pushes, for driving before the first impact and for"
+        "Total harm, harm that contacts pass on, and a price for pushes, for driving and for"
         " motion at the horizon (docs/game.md).", "m2/s2",
         (
             Statistic("honest_cost", "mean", "Honest cost", "Honest\ncost"),

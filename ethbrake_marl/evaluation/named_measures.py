@@ -114,7 +114,7 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
     ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
     """
     if not isinstance(names, Iterable):
-        raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'injury,pushed_m'")
+        raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'pushed_mps,pushed_m'")
     called: list[tuple[str, Measure]] = []
     for name in dict.fromkeys(split_names(names) if isinstance(names, str) else names):
         called += [(name, each) for each in _called(name) if each not in [measure for _, measure in called]]

@@ -8,43 +8,20 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.errors import InvalidInput, naming_extras
-from ethbrake_marl.evaluation.evaluate import Columns, Result
+from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.summary import SummaryTable
 from ethbrake_marl.files.plain import parse_strict_json, read_plain
-from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.files.store import check_target, write_output
 
 RESULTS, WORLDS = "results.json", "worlds"  # names of files in the folder of an evaluation
-HARMS = tuple(HARM.values())
-PAIRED = {"agent": np.str_, "world": np.int64, "recording": np.str_} | dict.fromkeys(HARMS, np.float64)
-MOST_BYTES, MOST_ROWS_BYTES = 64 << 20, 4 << 30
+MOST_BYTES = 64 << 20
 
 Rows = Literal["csv", "parquet"]
-
-
-class Saved(NamedTuple):
-    """Content of ``results.json`` and of its table."""
-
-    path: Path
-    agents: Mapping[str, Mapping[str, Any]]  # team -> its object
-    rows: Columns | None  # what ``compare`` needs of the table with one row per team and world: column -> values
-    no_rows_because: str  # "" if there are rows
-
-    @property
-    def about(self) -> Mapping[str, Any]:
-        """Entries that are the same for all teams."""
-        return next(iter(self.agents.values()))
-
-    def estimate(self, agent: str, key: str) -> Estimate:
-        own = self.agents[agent]
-        ends = own[f"{key}_interval"]
-        return Estimate(own[key], ends and (ends[0], ends[1]), own[f"{key}_error"], own[f"{key}_freedom"])
 
 
 def write_results(
@@ -104,8 +81,8 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
     write_output(path, data, force=force)
 
 
-def read_result(path: str | Path) -> Saved:
-    """Read ``results.json``, and its table if there is one.
+def read_result(path: str | Path) -> dict[str, dict[str, Any]]:
+    """Return team -> its object in ``results.json``.
 
     Raises ``InvalidInput`` for any other file, and for one that was edited or damaged.
     """
@@ -121,29 +98,8 @@ def read_result(path: str | Path) -> Saved:
     plain = [{key: value for key, value in each.items() if key != "results_sha256"} for each in objects]
     if {each.get("results_sha256") for each in objects} != {_digest(plain)}:
         raise InvalidInput(f"{file}: was edited after it was written, or is of another version; evaluate again")
-    rows, because = _beside(file, plain[0].get("per_world"))
-    return Saved(file, {each["agent"]: each for each in plain}, rows, because)
+    return {each["agent"]: each for each in plain}
 
 
 def _digest(objects: Sequence[Mapping[str, Any]]) -> str:
     return hashlib.sha256(json.dumps(objects, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def _beside(file: Path, beside: Mapping[str, str] | None) -> tuple[Columns | None, str]:
-    if beside is None:
-        return None, f"{file} was written without a file that has one row per world; evaluate again with --per-world"
-    rows = file.parent / beside["file"]
-    if not rows.is_file():
-        return None, f"{rows}, the file with one row per world of {file}, does not exist"
-    data = read_plain(rows, MOST_ROWS_BYTES)
-    if hashlib.sha256(data).hexdigest() != beside["sha256"]:
-        return None, f"{rows} was changed after {file} was written; evaluate again"
-    table: Mapping[str, Sequence[Any]]
-    if rows.suffix == ".parquet":
-        with naming_extras():
-            from pyarrow.parquet import read_table
-        table = read_table(io.BytesIO(data)).to_pydict()
-    else:
-        heads, *lines = csv.reader(io.StringIO(data.decode(), newline=""))
-        table = dict(zip(heads, zip(*lines, strict=True), strict=True))
-    return {name: np.array(table[name], kind) for name, kind in PAIRED.items() if name in table}, ""

@@ -38,7 +38,7 @@ HEAD = {
 
 
 class SummaryTable(list[SummaryRow]):
-    """The table of results. ``print`` and notebooks show it.
+    """The table of results. ``print`` shows it; ``to_pandas`` is for notebooks and documents.
 
     >>> import ethbrake_marl as eb
     >>> table = eb.summarise(eb.evaluate("paper-random", "full_brake,coast", episodes=3))
@@ -59,14 +59,8 @@ class SummaryTable(list[SummaryRow]):
     def __str__(self) -> str:
         return terminal_text(*self.tables())
 
-    def _repr_html_(self) -> str:
-        note = "Harm: means per world in m²/s². In brackets: 95 % intervals. Decrease: of the baseline's harm."
-        sheet = replace(self.sheet(), title=caption(self.parameters).partition("; ")[0], note=note)
-        names = {"Agent", *FIRST_COLUMNS, "harm_decrease_first"}
-        return sheet.only(k for k, name in enumerate(sheet.names) if name in names).html()
-
     def sheet(self) -> Sheet:
-        """Return the table for documents: all columns that have a heading."""
+        """Return the table with all columns that have a heading."""
         columns = [
             Column(each.heading, key, short=each.short, **_FORMATS.get(each.kind, {}))
             for key, (_, each) in self.shown.items()
@@ -133,14 +127,6 @@ class SummaryTable(list[SummaryRow]):
             if not each.heading and measure not in DEFAULT:
                 told[measure.name] = measure.meaning
         return HEAD | {name: text.replace("``", "") for name, text in told.items() if not name.startswith("Decrease")}
-
-    def to_markdown(self) -> str:
-        """Return the table as Markdown, with the texts below it."""
-        return f"{self.sheet().markdown()}\n\n{self._below()}\n"
-
-    def to_latex(self) -> str:
-        """Return the table as LaTeX ``tabular`` for the package ``booktabs``."""
-        return self.sheet().latex()
 
     def to_json(self) -> list[dict[str, Any]]:
         """Return one object per team, with the result's digests, versions and ``parameters``."""

@@ -14,10 +14,9 @@ from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import last_step
 from ethbrake_marl.errors import check_one_learner
-from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import Metadata
-from ethbrake_marl.faces.spaces import feature_box, reward_box
+from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box, reward_box
 from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario

@@ -13,10 +13,9 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import ENDED, State
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import Metadata
-from ethbrake_marl.faces.spaces import feature_box, reward_box
+from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box, reward_box
 from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game

@@ -17,9 +17,8 @@ from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State, put
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.face import Face
-from ethbrake_marl.faces.spaces import feature_box
+from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box
 from ethbrake_marl.faces.stream import chosen_seed
 from ethbrake_marl.motion.layout import Bools
 from ethbrake_marl.names import open_game

@@ -1,4 +1,4 @@
-"""Spaces of observations and vector rewards."""
+"""Spaces of observations, actions and vector rewards; actions from callers."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Discrete
+from numpy.typing import ArrayLike
 
 from ethbrake_marl.episode.features import Feature
+from ethbrake_marl.errors import InvalidInput, check_whole_number
+from ethbrake_marl.motion.layout import Floats
 
 
 def feature_box(features: Sequence[Feature]) -> Box:
@@ -27,4 +30,36 @@ def reward_box(components: Sequence[Any]) -> Box:
     return Box(-np.inf, np.inf, (len(components),), np.float64)
 
 
-FeatureBox = Box  # the name of the class in models that were saved by 1.0.0
+def action_space(count: int | None) -> Any:
+    """Return one learner's action space: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices.
+
+    Indices stand for evenly spaced actions, as the attribute ``evenly_spaced`` of their space says.
+    """
+    if count is None:
+        return Box(-1.0, 1.0, (1,), np.float32)
+    check_whole_number("actions", count, 2)
+    space = Discrete(int(count))
+    space.evenly_spaced = True  # type: ignore[attr-defined]  # saved with a model
+    return space
+
+
+def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:
+    """Return actions as float64 of ``shape``; the input may lack axes of length 1, or have more.
+
+    Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape or
+    index, and for values that are not numbers. The range [-1, 1] is checked later, in ``Game.step``.
+    """
+    try:
+        given = np.asarray(actions)
+    except ValueError:  # lists of different lengths
+        given = np.empty(0, object)
+    right, kinds = ("a number in [-1, 1]", "fiu") if count is None else (f"an index from 0 to {count - 1}", "iu")
+    if given.dtype.kind not in kinds or (count is not None and not ((given >= 0) & (given < count)).all()):
+        raise InvalidInput(f"action of {whose}: {actions!r:.60}: must be {right}")
+    if count is not None:
+        given = (2 * given.astype(np.int64) - (count - 1)) / (count - 1)
+    if given.shape != shape:
+        if [length for length in given.shape if length != 1] != [length for length in shape if length != 1]:
+            raise InvalidInput(f"action of {whose}: has shape {given.shape}; must have shape {shape}")
+        given = given.reshape(shape)
+    return given.astype(np.float64)

@@ -14,9 +14,9 @@ from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State, put
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.faces.actions import checked_actions
 from ethbrake_marl.faces.gymnasium import OneLearner
 from ethbrake_marl.faces.rendering import render_metadata
+from ethbrake_marl.faces.spaces import checked_actions
 from ethbrake_marl.faces.stream import Stream
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.worlds.game import AnyScenario

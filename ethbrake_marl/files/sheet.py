@@ -1,13 +1,11 @@
-"""``Sheet``: a table of numbers, intervals and texts for terminal, Markdown, LaTeX, HTML, CSV and JSON."""
+"""``Sheet``: a table of numbers, intervals and texts for terminal, CSV and JSON."""
 
 from __future__ import annotations
 
 import csv
 import io
-import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ethbrake_marl.errors import plain_text
@@ -16,7 +14,6 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 
 DASH = "–"  # shown for a missing value
-_AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,10 +109,8 @@ class Sheet:
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
-    >>> print(sheet.markdown())
-    | Agent | Total |
-    | --- | ---: |
-    | coast | 1.50 [1.00, 2.00] |
+    >>> [cell.in_words for row in sheet.shown() for cell in row]
+    ['coast', '1.50 [1.00, 2.00]']
     >>> sheet.json()
     [{'Agent': 'coast', 'total_harm': 1.5, 'total_harm_interval': [1.0, 2.0]}]
 
@@ -128,20 +123,22 @@ class Sheet:
     gap: Literal[1, 2, 3] = 3  # spaces between two columns in a terminal
     keep: int | None = None  # number of first columns that every terminal shows, others only if they fit; None: all
 
-    def _columns(self) -> list[Column]:
+    @property
+    def formats(self) -> list[Column]:
+        """The columns, each with its format."""
         return [column if isinstance(column, Column) else Column(column, text=True) for column in self.columns]
 
     @property
     def headings(self) -> list[str]:
-        return [column.heading for column in self._columns()]
+        return [column.heading for column in self.formats]
 
     @property
     def names(self) -> list[str]:
-        return [column.name for column in self._columns()]
+        return [column.name for column in self.formats]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
         """Yield each row as formatted cells, and each section as its name."""
-        columns = self._columns()
+        columns = self.formats
         for row in self.rows:
             if isinstance(row, str):
                 yield row
@@ -176,7 +173,7 @@ class Sheet:
             box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(self.gap > 1), 0, int(self.gap > 2)),
             title=Text(self.title, "table.title") if self.title else None, title_justify="left",
         )  # fmt: skip
-        columns = self._columns()
+        columns = self.formats
         rows = [
             row if isinstance(row, str) else [each.in_terminal(cell) for each, cell in zip(columns, row, strict=True)]
             for row in self.shown()
@@ -204,7 +201,7 @@ class Sheet:
 
     def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
         """Return how many columns fit into ``width`` characters, and the number of each name that does not fit."""
-        columns = self._columns()
+        columns = self.formats
         texts = [[each.short or each.heading, *(row[k] for row in rows)] for k, each in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
         wide[0] = min(wide[0], width // 2)
@@ -216,57 +213,6 @@ class Sheet:
         names = [text.partition("\n")[0] for text in texts[0][1:]]
         long = dict.fromkeys(name for name in names if len(name) > room and columns[0].text)
         return shown, {name: f"[{number}]" for number, name in enumerate(long, 1)}
-
-    def markdown(self) -> str:
-        """Return the table as Markdown, without title and note.
-
-        Markdown tables have no sections, so the first cell of a row begins with its section: ``Section: cell``.
-        """
-        columns, section = self._columns(), ""
-        lines = [[column.heading for column in columns], ["---" if column.text else "---:" for column in columns]]
-        for row in self.shown():
-            if isinstance(row, str):
-                section = f"{row}: "
-                continue
-            words = [shown.in_words.replace("|", "\\|").replace("\n", " ") for shown in row]
-            lines.append([section + words[0], *words[1:]])
-        return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-    def latex(self) -> str:
-        """Return a LaTeX ``tabular`` for the package ``booktabs``, without title and note."""
-        columns = self._columns()
-        lines = [" & ".join(_latex(column.heading) for column in columns) + r" \\", r"\midrule"]
-        for row in self.shown():
-            words = [row] if isinstance(row, str) else [shown.in_words.replace("\n", " ") for shown in row]
-            lines.append(" & ".join(map(_latex, words)) + r" \\")
-        kinds = "".join("l" if column.text else "r" for column in columns)
-        return "\n".join([rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", *lines, r"\bottomrule", r"\end{tabular}"])
-
-    def html(self) -> str:
-        """Return the table as HTML, with title and note. Content is escaped, unless it has a method ``__html__``."""
-        columns, label = self._columns(), self.title or f"Table: {self.headings[0]}"
-        kinds = [' class="words"' if k and self.rows and column.text else "" for k, column in enumerate(columns)]
-        heads = zip(kinds, self.headings, strict=True)
-        lines = [
-            f'<div class="wide" tabindex="0" role="region" aria-label="{_html(label)}"><table>',
-            *([f"<caption>{_html(self.title)}</caption>"] if self.title else []),
-            *("<thead><tr>", *(f'<th scope="col"{kind}>{_html(each)}</th>' for kind, each in heads)),
-            *("</tr></thead>", "<tbody>"),
-        ]
-        for row in self.shown():
-            if isinstance(row, str):
-                lines.append(f'<tr class="block"><th colspan="{len(columns)}" scope="rowgroup">{_html(row)}</th></tr>')
-                continue
-            name = row[0].in_words  # allow line breaks after signs, as in e_v2x_bm:pairwise
-            if not hasattr(row[0].value, "__html__"):
-                name = "<wbr>".join(map(_html, _AFTER_SIGN.split(name)))
-            lines.append(f'<tr><th scope="row">{name}</th>')
-            for kind, (value, interval) in zip(kinds[1:], row[1:], strict=True):
-                below = f' <span class="interval">[{_html(interval)}]</span>' if interval else ""
-                lines.append(f"<td{kind}>{_html(value)}{below}</td>")
-            lines.append("</tr>")
-        note = [f"<p>{_html(self.note)}</p>"] if self.note else []
-        return "\n".join([*lines, "</tbody>", "</table></div>", *note])
 
     def json(self) -> list[dict[str, Any]]:
         """Return one mapping per row, column name -> cell, without sections. An interval has an entry of its own."""
@@ -314,19 +260,3 @@ def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
     writer.writeheader()
     writer.writerows(lines)
     return text.getvalue()
-
-
-_LATEX = {
-    **{each: rf"\{each}" for each in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "²": "$^2$", "≥": r"$\geq$", "–": "--", "†": r"\dag{}", "‡": r"\ddag{}",
-    "\u00a0": "~", "[": "{[}", "]": "{]}",
-}  # fmt: skip
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX.get(each, each) for each in plain_text(text, keep="\u00a0"))
-
-
-def _html(value: object) -> str:
-    known: Callable[[], str] | None = getattr(value, "__html__", None)
-    return escape(plain_text(str(value), keep="\u00a0")) if known is None else known()

@@ -6,7 +6,9 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -125,10 +127,13 @@ def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT)
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise InvalidInput(f"{file}, line {line}: byte 0x{data[error.start]:02x} is not valid UTF-8 text") from None
-    return _parse(decoded, file)
+    content, found = _parse(decoded, file)
+    return Document(file, deepcopy(content), dict(found))
 
 
-def _parse(text: str, file: str) -> Document:
+@lru_cache(maxsize=128)
+def _parse(text: str, file: str) -> tuple[Any, Mapping[YamlPath, int]]:
+    """Return content and lines, which are kept for the next reader of the same text (10 ms) and must not be changed."""
     lines: dict[YamlPath, int] = {}
     try:
         node = yaml.compose(text, Loader=_Loader)
@@ -144,7 +149,7 @@ def _parse(text: str, file: str) -> Document:
         raise InvalidInput(f"{file}, line {line}: not valid YAML: {character} is not allowed") from None
     except (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError) as error:
         raise InvalidInput(f"{file}: not valid YAML: {error}") from None
-    return Document(file, content, lines)
+    return content, lines
 
 
 class _Refused(yaml.MarkedYAMLError):

@@ -146,14 +146,17 @@ class StepShield:
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
         return first_plans(game, alert, state, self.count)
 
+    def cheapest(self, game: Game, states: State, plans: list[Floats]) -> tuple[Floats, Floats]:
+        """Return the plan with the smallest price in each world, and this price, [n] m2/s2."""
+        prices = np.stack([self.price(game, states, plan) for plan in plans])
+        return np.stack(plans)[prices.argmin(axis=0), np.arange(prices.shape[1])], prices.min(axis=0)
+
     def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
         """Return the memory at the first decision; its plan is the best constant actions or the agents' rollout.
 
         ``states`` are the possible states (``seen``), ``agents`` body -> memory at the alert.
         """
-        rows, plans = np.arange(state.n), self.plans(game, alert, state, states)
-        prices = np.stack([self.price(game, states, plan) for plan in plans])
-        plan, harm = np.stack(plans)[prices.argmin(axis=0), rows], prices.min(axis=0)
+        plan, harm = self.cheapest(game, states, self.plans(game, alert, state, states))
         caps = played(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
         if agents:
             check_learners(game, agents)

@@ -16,7 +16,7 @@ import torch
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.files.plain import read_object
-from ethbrake_marl.names import open_game
+from ethbrake_marl.names import check_path, open_game
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.progress import Progress, Told
@@ -115,12 +115,14 @@ def train(
         on_progress: function that is called with each ``Progress``; ``show``: print it on stderr; None: no reports.
 
     Raises ``AlreadyExists`` for a directory that exists, ``InvalidInput`` if recipe, scenario and device do not fit
-    each other or another thread is training, ``TrainingDiverged`` if a loss or a weight is not finite.
+    each other, another thread is training or the directory has a comma or a plus, ``TrainingDiverged`` if a loss or a
+    weight is not finite.
 
     """
     changes = {"scheme": scheme, "seed": seed, "total_steps": steps, "device": device}
     training = Training.of(recipe, scenario, **{key: value for key, value in changes.items() if value is not None})
     folder = RunFolder(directory)
+    check_path(directory)
     with _prepared(training, folder, measure, on_progress) as updates:
         folder.create(training.config(settings), force=force)
         with folder.held():

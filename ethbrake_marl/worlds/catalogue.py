@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
-from ethbrake_marl.files.yaml import Document, YamlPath, read_yaml
+from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
+from ethbrake_marl.worlds.mixture import WORDS, changed_content
 from ethbrake_marl.worlds.scenario import Scenario, plain
 from ethbrake_marl.worlds.table import read_rows
 
@@ -17,8 +18,9 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 FOLDERS: dict[str, Path] = {}  # registered folders: path as text -> path
 
+THREE_TESTS = ("paper-random", "paper-random-brake-only", "paper-random-obstacle")
 BENCHMARK = (  # scenarios that ship with a table of best known harm, which the share of the possible reduction needs
-    *("paper-random", "paper-random-brake-only", "paper-random-obstacle", "paper-delay-high", "paper-distance"),
+    *(*THREE_TESTS, "paper-delay-high", "paper-distance"),
     *("realistic-motorway", "realistic-mixed", "stress-wide", "cooperation-2-blocked", "cooperation-2-five"),
 )
 
@@ -69,10 +71,14 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
     if isinstance(scenario, Scenario):
         return scenario
     if isinstance(scenario, Mapping):
-        return Scenario(**_whole(Document("scenario", plain(scenario), {}), Path()).content)
-    path = scenario_path(scenario)
+        return _built(Document("scenario", plain(scenario), {}), Path(), ())
+    return _load(scenario_path(scenario), ())
+
+
+def _load(path: Path, above: tuple[Path, ...]) -> Scenario:
+    """``above``: the files that are based on this one, each on the next."""
     document = read_yaml(path)
-    loaded = Scenario.from_document(_whole(document, path.parent))
+    loaded = _built(document, path.parent, (*above, path))
     if loaded.name != path.stem:
         raise InvalidInput(
             f"{document.where(('name',))}: name = {loaded.name}: must be the file's name without ending, {path.stem};"
@@ -122,12 +128,38 @@ def _known_paths() -> dict[str, Path]:
     return {path.stem: path for path in (*registered, *shipped_folder().rglob("*.yaml"))}
 
 
-def _whole(document: Document, folder: Path) -> Document:
-    content = _with_rows(document, (), document.content, folder)
+def _built(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenario:
+    content, base = document.content, None
+    if isinstance(content, dict) and "based_on" in content:
+        base = _base(document, content["based_on"], folder, above)
+        own = {key: value for key, value in content.items() if key != "based_on"}
+        inherited = {key: value for key, value in base.declared().items() if key not in ("name", *WORDS)}
+        content = changed_content(inherited, own)
+    content = _with_rows(document, (), content, folder)
     listed = content.get("mixture") if isinstance(content, dict) else None
     if isinstance(listed, list | tuple):
         content = {**content, "mixture": [_member(document, i, entry, folder) for i, entry in enumerate(listed)]}
-    return Document(document.file, content, document.lines)
+    scenario = Scenario.from_document(Document(document.file, content, document.lines))
+    if base is not None:
+        for key in document.content.keys() - {"name", *WORDS, "based_on"}:
+            with document.refusing_at((key,)):
+                here, there = ([getattr(each, key) for each in one.members or (one,)] for one in (scenario, base))
+                if here == there and key != "mixture":
+                    raise InvalidInput(f"{key}: has the same value in {base.name}; leave it out")
+    return scenario
+
+
+def _base(document: Document, name: Any, folder: Path, above: tuple[Path, ...]) -> Scenario:
+    with document.refusing_at(("based_on",)):
+        if not isinstance(name, str):
+            right = "must be the name of a scenario or the path of its file"
+            raise InvalidInput(f"based_on = {flow_text(name, 60)}: {right}")
+        path = scenario_path(name, folder)
+        places = [each.resolve() for each in above]
+        if path.resolve() in places:
+            circle = " -> ".join(each.stem for each in (*above[places.index(path.resolve()) :], path))
+            raise InvalidInput(f"based_on = {name}: {circle} is a circle; base one of them on another scenario")
+        return _load(path, above)
 
 
 def _member(document: Document, i: int, entry: Any, folder: Path) -> Any:

@@ -134,6 +134,8 @@ class ScenarioWording(Wording):
             hints = [suggestion(str(key), DISTRIBUTIONS) for key in given] if isinstance(given, dict) else []
             load = "; with_load is allowed only in vehicle_types" * (isinstance(given, dict) and "with_load" in given)
             return f"must be a number or a distribution, {_DISTRIBUTION}{load}" + "".join(f"; {h}" for h in hints if h)
+        if kind == "none_required":
+            return "works only in a file and with load_scenario"
         if kind == "string_type" and detail["loc"][0] == "roles":
             return "must be learner or the name of a script, such as full_brake, coast or constant:3"
         return ""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.json_schema import FileSchema, schema_lines
 from ethbrake_marl.files.model import NAME_PATTERN
-from ethbrake_marl.files.yaml import flow_text, read_yaml
+from ethbrake_marl.files.plain import read_plain
+from ethbrake_marl.files.yaml import SIZE_LIMIT, flow_text, parse_yaml
 from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path
+from ethbrake_marl.worlds.mixture import WORDS
 from ethbrake_marl.worlds.roles import LEARNER
 from ethbrake_marl.worlds.rules import ALTERNATIVES, RULES
 from ethbrake_marl.worlds.scenario import Scenario
@@ -56,7 +60,8 @@ def sentences(scenario: Scenario) -> Iterator[str]:
 # ---- a new file
 
 _HEAD = """\
-# Scenario {name}, started from {based_on}.
+# The scenario {base} with other values: remove the # in front of a key and change its value; null takes the key away.
+# All values: ethbrake scenario show {name}.yaml
 # A quantity is a fixed number, or a distribution from which every world draws a value:
 #   {{uniform: [low, high]}}, {{loguniform: [low, high]}}
 #   {{normal: {{mean: 20, sd: 1, low: 18, high: 22}}}}    truncated to [low, high]
@@ -64,7 +69,15 @@ _HEAD = """\
 #   {{choice: [6, 7, 8]}}    optionally with weights: [1, 2, 1]
 # A single entry is for all vehicles, each of which draws its own value. A list has one entry per vehicle.
 """
+_WORDS = """
+name: {name}
+title: One-line title for lists and figures
+description: What the scenario is for.
+source: Where the values come from.
+based_on: {based_on}
+"""
 _EXAMPLES = {
+    "based_on": "paper-random",
     "observation": "[own, front_1, rear_1]",
     "vehicle_types": "{car: {weight: 9, mass_t: 1.5}, truck: {mass_t: {with_load: [14, 40]}}}",
     "types": "[car, any, truck]",
@@ -83,26 +96,29 @@ def check_file_name(kind: str, name: str) -> None:
         )
 
 
-def new_scenario_text(name: str, based_on: str = "paper-random", *, rows_file: str = "") -> str:
-    """Text of a new scenario file, with comments and the values of ``based_on``.
-
-    Unused keys are comments with an example. ``rows_file``: name of a copy of the table's CSV file.
-    """
+def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path = Path()) -> str:
+    """Text of a new scenario file for ``folder``, with the values of ``based_on`` as comments."""
     check_file_name("scenario", name)
-    base, values = load_scenario(based_on), dict(read_yaml(scenario_path(based_on)).content)
-    values |= {
-        "name": name,
-        "title": "One-line title for lists and figures",
-        "description": "What the scenario is for.",
-    }
-    values["source"] = f"Values of {base.name}, to be changed. Its own source: {base.source}"
-    if rows_file and "file" in values.get("table", {}):
-        values["table"] |= {"file": rows_file}
-    text = _HEAD.format(name=name, based_on=base.name) + schema_lines("scenario", "scenario schema")
+    base = load_scenario(based_on)
+    values, path = base.declared(), scenario_path(based_on)
+    if path.suffix and path == Path(based_on).expanduser():  # a path, and no name
+        based_on = Path(os.path.relpath(path, folder)).as_posix()
+    head = _HEAD.format(name=name, base=base.name) + schema_lines("scenario", "scenario schema")
+    text = head + _WORDS.format(name=name, based_on=flow_text(based_on))
     for key in listed_keys():
-        line = f"{key.name}: {flow_text(values[key.name])}" if key.name in values else f"# {key.name}: {key.example}"
-        text += f"\n# {key.comment}\n{line}\n"
+        if key.name not in ("name", *WORDS, "based_on"):
+            short = key.name in values and key.name not in ("mixture", "table")
+            text += f"\n# {key.comment}\n# {key.name}: {flow_text(values[key.name]) if short else key.example}\n"
     return text
+
+
+def whole_text(scenario: str | Path) -> str:
+    """Text of a scenario's file; if it is based on another scenario, with all values."""
+    path, loaded = scenario_path(scenario), load_scenario(scenario)
+    text = read_plain(path, SIZE_LIMIT).decode("utf-8")
+    if "based_on" not in parse_yaml(text).content:
+        return text
+    return "".join(f"{key}: {flow_text(value)}\n" for key, value in loaded.declared().items())
 
 
 def scenario_json_schema() -> dict[str, Any]:
@@ -110,5 +126,8 @@ def scenario_json_schema() -> dict[str, Any]:
     for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
         for key in properties.keys() & RULES.keys():
             properties[key]["allOf"] = [{"$ref": f"#/$defs/range_{key}"}]
+    for key, described in schema["properties"].items():
+        if key not in ("name", *WORDS, "based_on"):  # null takes the key of another scenario away
+            schema["properties"][key] = {"anyOf": [described, {"type": "null"}]}
     ranges = {f"range_{key}": rule.schema for key, rule in RULES.items()}
     return FileSchema.publish({**schema, "$defs": {**schema["$defs"], **ranges}})

@@ -91,6 +91,12 @@ class Scenario(Part):
     title: str = Field(default="", description="one-line title for lists and figures")
     description: str = Field(default="", description="what the scenario is for")
     source: str = Field(default="", description="where the values come from")
+    based_on: Annotated[None, WithJsonSchema({"type": "string"})] = Field(
+        default=None,
+        exclude=True,
+        description="scenario whose values this one has, except those of the keys in this file: its name, or the path"
+        " of its file; null as a value takes a key away",
+    )
     vehicles: int = Field(default=3, ge=2, le=64, description="number of vehicles N, with vehicle_1 in front")
     vehicle_types: VehicleTypes | None = Field(
         default=None,

@@ -1,4 +1,4 @@
-"""What commands print, byte for byte, as listed in ``tests/cli/printed/*.txt``: each list is one story in one folder.
+"""What commands print, byte for byte, as listed in ``tests/cli/printed/story.txt``: one story in one folder.
 
 Below a command line stand its stdout, its stderr behind ``! ``, and its exit status unless it is 0; progress
 (``500 of 2,000``) is left out. ``$ cat FILE`` shows a file, ``$ sed -i`` changes one, ``$ rm`` removes one. ``HERE``
@@ -19,7 +19,7 @@ from ethbrake_marl.cli.app import run_command
 from tests.fixtures.snapshots import check_snapshot
 
 ROOT = Path(__file__).resolve().parents[2]
-STORIES = sorted((Path(__file__).parent / "printed").glob("*.txt"))
+STORY = Path(__file__).parent / "printed" / "story.txt"
 PROGRESS = re.compile(r"^.*: [\d,]+ of [\d,]+(, about .* left)?\n", re.MULTILINE)
 
 
@@ -39,10 +39,9 @@ def told_again(story: Path) -> str:
     return parts[0] + "\n".join(f"$ {line}\n{printed(line)}" for line in parts[1::2]).replace(str(ROOT), "ROOT")
 
 
-@pytest.mark.parametrize("story", STORIES, ids=lambda story: story.stem)
 @pytest.mark.usefixtures("core_alone", "empty_folder")
-def test_commands__print_what_is_listed(story: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    check_story(story, monkeypatch)
+def test_commands__print_what_is_listed(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_story(STORY, monkeypatch)
 
 
 def check_story(story: Path, monkeypatch: pytest.MonkeyPatch) -> None:

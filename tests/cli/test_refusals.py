@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ethbrake_marl.worlds.explain import new_scenario_text
+from ethbrake_marl.worlds.catalogue import scenario_path
 from tests.fixtures.commands import Refuse
 
 USAGE = [
@@ -69,8 +69,8 @@ EVALUATIONS = [
         "runs/nothing-here: is not a folder; give the folder of a policy bundle (manifest.json, weights.safetensors)",
     ),
     (
-        "evaluate --scenario cooperation-0-sensors --agents vine-pair",
-        "scenario 'cooperation-0-sensors' has no learner that the agents could drive; choose the scenario",
+        "evaluate --scenario level-0-sensors --agents vine-pair",
+        "scenario 'level-0-sensors' has no learner that the agents could drive; choose the scenario",
     ),
     ("evaluate --agents team@.", ".: contains no policy; give the folder of a policy bundle"),
     ("evaluate --output /proc/out", "/proc/out: cannot be written to (No such file or directory)"),
@@ -98,7 +98,8 @@ def test_run_training_export_shield_or_film__is_refused(line: str, message: str,
 
 
 def write_scenario(old: str, new: str) -> None:
-    text = new_scenario_text("mine").replace("early_impacts: reject", "early_impacts: keep")
+    text = scenario_path("paper-random").read_text("utf-8").replace("name: paper-random", "name: mine")
+    text = text.replace("early_impacts: reject", "early_impacts: keep")
     assert text.count(old) == 1
     Path("mine.yaml").write_text(text.replace(old, new))
 
@@ -106,11 +107,11 @@ def write_scenario(old: str, new: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("\nmass_t: ", "\nmass_kg: ", "mine.yaml, line 67: mass_kg: unknown key; did you mean mass_t (tonnes)?"),
+        ("\nmass_t: ", "\nmass_kg: ", "mine.yaml, line 12: mass_kg: unknown key; did you mean mass_t (tonnes)?"),
         (
             "\nrestitution: 0.1",
             "\nrestitution: .nan",
-            "mine.yaml, line 76: restitution = .nan: must be a finite number",
+            "mine.yaml, line 24: restitution = .nan: must be a finite number",
         ),
         ("vehicle_3: full_brake", "vehicle_3: coast:4", "agent 'coast:4': coast takes no argument"),
     ],
@@ -123,7 +124,7 @@ def test_validate__names_the_line_of_the_mistake(old: str, new: str, message: st
 @pytest.mark.parametrize("command", ["run --output new", "evaluate"])
 def test_role_that_cannot_drive__is_refused_before_anything_is_written(command: str, refuse: Refuse) -> None:
     write_scenario("vehicle_1: full_brake", "vehicle_1: coast:4")
-    refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 79: roles.vehicle_1 = coast:4: agent 'coast:4'")
+    refuse(f"{command} --scenario mine.yaml", "mine.yaml, line 28: roles.vehicle_1 = coast:4: agent 'coast:4'")
 
 
 def test_run__needs_a_learner(refuse: Refuse) -> None:
@@ -173,7 +174,7 @@ def test_output__is_a_folder_of_its_own(line: str, message: str, refuse: Refuse)
             "--agents bad.py:worst",
             "file 'bad.py': 'worst' is not a function; write FILE.py:FUNCTION, where FUNCTION makes the agent",
         ),
-        ("", "--set measures=injur", "unknown measure 'injur'; did you mean 'injury'?"),
+        ("", "--set measures=pushed_n", "unknown measure 'pushed_n'; did you mean 'pushed_m'?"),
         (
             "import ethbrake_marl as eb\ndef slow(): return eb.policy_agent(lambda seen: exit(0))\n",
             "--agents bad.py:slow --episodes 3",

@@ -78,7 +78,7 @@ def test_run__by_default_trains_what_is_installed() -> None:
 
 
 def test_run__is_refused(refuse: Refuse) -> None:
-    refuse("run --scenario cooperation-0-sensors", "has no learner that the agents could drive")
+    refuse("run --scenario level-0-sensors", "has no learner that the agents could drive")
     refuse("run --episodes 0", "--episodes", "1")
     refuse("run --recipe nobody", "unknown recipe 'nobody'")
     refuse("run --set gamma=2", "gamma")

@@ -220,7 +220,7 @@ def change(file: Path, block: Block) -> None:
     """Replace lines of a YAML file by the lines of a block with the same keys."""
     text = file.read_text()
     for line in block.text.splitlines():
-        text, count = re.subn(rf"(?m)^{line.partition(':')[0]}: .*$", line, text)
+        text, count = re.subn(rf"(?m)^(?:# )?{line.partition(':')[0]}: .*$", line, text)
         assert count == 1, f"{block.place}: {file} has no line {line.partition(':')[0]}"
     file.write_text(text)
 

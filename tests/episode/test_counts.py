@@ -161,11 +161,3 @@ def test_other_count__is_refused_and_the_three_are_listed(message: str) -> None:
     for count in COUNTS:
         assert count in str(error.value)
     assert RewardParams(harm_count="honest").harm_count == "honest"
-
-
-def test_injuries__of_the_honest_cost_are_those_of_impacts() -> None:
-    """A kilometre apart and driving at full force, a vehicle pays for driving and motion, and nobody is hurt."""
-    state = state_of([1000.0], [20.0, 20.0])
-    last = later(state, [-6.0, 7.0], 2.0)
-    injuries = objectives_of("injury:lr4s", 2)
-    assert amounts(injuries, state, last, "honest").tolist() == [[0.0, 0.0]] and last.harm("honest")[0] > 100.0

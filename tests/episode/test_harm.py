@@ -1,4 +1,4 @@
-"""Harm: shares by mass, both counts, the obstacle, objectives and injuries, by hand and as properties."""
+"""Harm: shares by mass, both counts, the obstacle, objectives, by hand and as properties."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.episode.injury import injured, risks, speed_changes
 from ethbrake_marl.episode.objectives import amounts, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput
@@ -122,7 +121,7 @@ def test_objective__by_hand(objective: Any, harm: list[float]) -> None:
 @pytest.mark.parametrize(
     "objective",
     [
-        "own", "maximin", "social:30", "weighted:1,4,2", "injury:lr4s", "first:own,then:maximin",
+        "own", "maximin", "social:30", "weighted:1,4,2", "first:own,then:maximin",
         "first:maximin,then:own", "first:vehicle_3,then:own",
     ],
 )  # fmt: skip
@@ -146,7 +145,7 @@ def test_weights__of_a_weighted_sum_give_the_objective(objective: str) -> None:
         assert (parsed.weights(state.car, vehicle) * state.borne_harm()).sum() == pytest.approx(amount)
 
 
-@pytest.mark.parametrize("objective", ["maximin", "injury:lr4s", "first:own,then:maximin"])
+@pytest.mark.parametrize("objective", ["maximin", "first:own,then:maximin"])
 def test_weights__of_another_objective_are_refused(objective: str) -> None:
     with pytest.raises(
         InvalidInput, match="is not a weighted sum of the vehicles' harm; use one of total, own, social"
@@ -169,58 +168,9 @@ def test_objective__is_the_same_after_a_pickle() -> None:
         assert pickle.loads(pickle.dumps(parsed)) == parsed
 
 
-# ---------------------------------------------------------------- injuries
-
-
-def test_injuries__by_hand() -> None:
-    # Vehicle 1's speed changes by 2 / 3 1.5 sqrt(12) at its rear, Vehicle 2's by 1 / 3 1.5 sqrt(12) at its front and by
-    # 1 / 3 1.5 3 at its rear, of which the front is worse, and Vehicle 3's by 2 / 3 1.5 3 at its front.
-    logits = np.array([4.888 - 0.177 * 12**0.5, 4.457 - 0.177 * 3**0.5, 4.457 - 0.177 * 3])
-    expected = (1000 / (1 + np.exp(logits))).sum()
-    assert of_objective("injury:lr4s", met()) == pytest.approx([expected] * 3, abs=1e-8)
-
-
-@pytest.mark.parametrize(
-    ("curve", "side", "dv", "probability"),
-    [
-        ("lr4s", 0, 10.0, 1 / (1 + np.exp(4.457 - 1.77))),
-        ("lr4s", 1, 10.0, 1 / (1 + np.exp(4.888 - 1.77))),
-        ("gidas", 0, 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
-        ("gidas", 1, 10.0, 1 / (1 + np.exp(5.82 - 2.92))),
-        ("reference", 0, 10.0, (10 / 51.287) ** 1.531),
-        ("reference", 1, 10.0, (10 / 66.956) ** 1.531),
-        ("reference", 0, 60.0, 1.0),
-        ("reference", 1, 0.0, 0.0),
-    ],
-)
-def test_probability__of_an_injury_by_hand(curve: str, side: int, dv: float, probability: float) -> None:
-    changes = np.zeros((1, 2, 1))
-    changes[0, side] = dv
-    assert risks(changes, curve)[0, :, 0].tolist() == pytest.approx(
-        [0.0] * side + [probability] + [0.0] * (1 - side), rel=1e-12
-    )
-
-
-def test_injured__by_the_larger_change_of_each_vehicle() -> None:
-    changes = np.array([[[0.0, 2.0, 3.0, 0.0], [4.0, 3.0, 3.0, 0.0]]])  # front, rear
-    front, rear = (
-        (lambda dv: 1000 / (1 + np.exp(4.457 - 0.177 * dv))),
-        (lambda dv: 1000 / (1 + np.exp(4.888 - 0.177 * dv))),
-    )
-    assert injured(changes, "lr4s")[0] == pytest.approx([rear(4.0), rear(3.0), rear(3.0), 0.0])
-    assert injured(changes[:, ::-1], "lr4s")[0] == pytest.approx([front(4.0), front(3.0), rear(3.0), 0.0])
-
-
-def test_changes_of_speed__between_two_states_by_hand() -> None:
-    # 10 m/s into a vehicle of three times the mass at rest, e = 0.2: 1.2 x 10 are shared 3 : 9; the other world is calm
-    before = state_of([[1.0], [500.0]], [[0.0, 10.0]] * 2, mass_t=[3.0, 1.0], restitution=0.2)
-    changes = speed_changes(before, later(before, 0.0, 0.5))
-    assert changes[0] == pytest.approx(np.array([[0.0, 9.0], [3.0, 0.0]])) and not changes[1].any()
-
-
 # ---------------------------------------------------------------- the harm of an episode
 
-OBJECTIVES = ["total", "own", "social:30", "maximin", "mass-weighted", "weighted:1,4,2", "injury:lr4s"]
+OBJECTIVES = ["total", "own", "social:30", "maximin", "mass-weighted", "weighted:1,4,2"]
 
 
 @pytest.mark.parametrize("count", ["first", "total"])

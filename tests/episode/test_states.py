@@ -15,7 +15,6 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.names import open_game
-from tests.fixtures.scenarios import VARIED
 
 N = 7
 REWARDS: dict[str, Any] = {
@@ -23,13 +22,13 @@ REWARDS: dict[str, Any] = {
     "paper-random-obstacle": {"harm": 1.0, "harm_count": "total", "terminal": 1.0},
     "cooperation-3-pair": {"harm": 0.05, "shaping": 0.05, "jerk": 1e-4, "objective": "own"},
     "paper-random-buildup": "paper",
-    "varied": "total-harm",
+    "realistic-mixed": "total-harm",
 }
 
 
 @pytest.fixture(params=REWARDS)
 def game(request: pytest.FixtureRequest) -> Game:
-    return open_game(VARIED if request.param == "varied" else request.param, reward=REWARDS[request.param])[1]
+    return open_game(request.param, reward=REWARDS[request.param])[1]
 
 
 def actions(game: Game, seed: int, n: int = N) -> np.ndarray:

@@ -39,18 +39,12 @@ from tests.refused import refused
 
 
 def test_measures__of_one_impact_by_hand() -> None:
-    result = evaluated(PAIR, 2, [FULL_BRAKE], ["pushed_m", "injury_lr4s", "own", "maximin"])
+    result = evaluated(PAIR, 2, [FULL_BRAKE], ["pushed_m", "own", "maximin"])
     # 10.6458 m to the impact, 27.9533 m after it; alone 33.3333 m
-    changes = {
-        1: 4.888 - 0.177 * 1.815,
-        2: 4.457 - 0.177 * 1.485,
-    }  # Vehicle 1 is hit at its rear, Vehicle 2 at its front
-    injuries = {body: 1000.0 / (1.0 + math.exp(exponent)) for body, exponent in changes.items()}
     expected = {
         "collided": 1.0, "impacts": 1.0, "first_impact_harm": 9.0, "total_harm": 9.0, "total_harm_1": 4.95,
         "total_harm_2": 4.05, "hardest_impact_mps": 3.0, "pushed_m_1": 5.26575,
-        "pushed_m_1_far": 1.0, "injury_lr4s_1": injuries[1], "injury_lr4s_2": injuries[2],
-        "injury_lr4s": sum(injuries.values()), "own_first_1": 4.95, "own_total_2": 4.05, "maximin_total": 4.95,
+        "pushed_m_1_far": 1.0, "own_first_1": 4.95, "own_total_2": 4.05, "maximin_total": 4.95,
         "end_s": 3.7,
     }  # fmt: skip
     row = {name: float(result["full_brake"][name][1]) for name in expected}
@@ -59,7 +53,7 @@ def test_measures__of_one_impact_by_hand() -> None:
 
 
 def test_objectives__are_measured_in_every_count_and_once_unless_vehicles_differ() -> None:
-    asked = "first:vehicle_2,then:total,weighted:1, 3,vehicle_2,first:own,then:total,injury"
+    asked = "first:vehicle_2,then:total,weighted:1, 3,vehicle_2,first:own,then:total,pushed_mps"
     result = evaluated(PAIR, 1, [FULL_BRAKE, COAST], asked)
     row = {name: column[0] for name, column in result["full_brake"].items()}
     expected = {
@@ -67,7 +61,7 @@ def test_objectives__are_measured_in_every_count_and_once_unless_vehicles_differ
         "first:vehicle_2,then:total_total": 4059.0, "first:own,then:total_total_1": 4959.0,
     }  # fmt: skip
     assert {name: row[name] for name in expected} == pytest.approx(expected, rel=1e-9)
-    assert "vehicle_2_first_1" not in row and "injury_lr4s" in row
+    assert "vehicle_2_first_1" not in row and "pushed_mps" in row
     coasts = result["coast"]
     assert coasts["vehicle_2_honest"] == coasts["honest_cost_2"] > coasts["vehicle_2_total"]
 
@@ -295,7 +289,7 @@ def test_measures__with_one_statistic_are_refused() -> None:
     ],
 )
 def test_measures__that_are_not_asked_for_or_not_defined_have_no_column(scenario: Any, pushed: set[str]) -> None:
-    asked = ["injury_lr4s", "pushed_m"]
+    asked = ["still_moving", "pushed_m"]
     result = eb.evaluate(scenario, "full_brake", episodes=2, measures=asked)
     names = {each.name for each in result.measures if each.name not in result["full_brake"]}
     assert names == {"predicted_harm", "replaced", "pushed_m"}  # pushed_m has columns of vehicles alone
@@ -319,8 +313,8 @@ def test_terms_of_ones_own__are_summed_and_names_are_used_once(monkeypatch: pyte
     register_term("still", doc(lambda before, step, after: step.time_step_s * ~after.collided))
     with refused("measure 'still': a measure and a term of the reward have this name", AlreadyExists):
         measures_called("still")
-    assert [each.name for each in measures_called("injury,injury_gidas,total_harm")] == [
-        "injury_lr4s", "injury_reference", "injury_gidas", "total_harm",
+    assert [each.name for each in measures_called("pushed_m,pushed_mps,pushed_m,total_harm")] == [
+        "pushed_m", "pushed_mps", "total_harm",
     ]  # fmt: skip
     with refused("unknown measure 'pushed_n'; did you mean 'pushed_m'?", UnknownName):
         measures_called(["pushed_n"])
@@ -537,4 +531,4 @@ def test_evaluate__refuses_measures_that_are_no_names_and_a_list_beside_worlds()
             eb.evaluate(worlds, "coast", scenario="paper-random", **given)
     with pytest.raises(UnknownName) as told:
         eb.evaluate("paper-random", "coast", episodes=1, measures="harmm")
-    assert str(told.value).count(" injury,") <= 1
+    assert str(told.value).count(" pushed_m,") <= 1

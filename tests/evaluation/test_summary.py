@@ -1,4 +1,4 @@
-"""The table of results: its estimates, its looks in terminals, documents and notebooks, and the texts below it."""
+"""The table of results: its estimates, its looks in terminals, and the texts below it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.summary import SummaryTable, summarise, summarise_by, summarise_lists
 from ethbrake_marl.files.sheet import terminal_text
 from tests.evaluation.lines import COAST, FULL_BRAKE, GENTLE, PAIR, Foreteller, evaluated, recorded
-from tests.fixtures.scenarios import VARIED
 from tests.refused import refused
 
 EXPENSIVE = ["pushed_mps", "pushed_m"]
@@ -113,18 +112,6 @@ def test_text__is_plain_wherever_it_is_made(where: str, result: Result, monkeypa
     if where == "redirected":
         monkeypatch.setattr(sys, "stdout", None)
     assert str(table) == usual and "\x1b" not in usual and len(usual) > 500
-
-
-def test_documents(result: Result) -> None:
-    table = summarise(result)
-    harm = table[1]["total_harm"].in_words()  # type: ignore[union-attr]
-    markdown, latex, html = table.to_markdown(), table.to_latex(), table._repr_html_()
-    assert markdown.splitlines()[0].startswith("| Agent | Knows | Collisions | First-impact harm | Total harm |")
-    assert f" {harm} " in markdown and "Worlds: paper-random: 100 worlds, seed 7" in markdown
-    assert latex.startswith(r"\begin{tabular}{llrrr") and r"full\_brake & own sensors & " in latex
-    assert harm.replace("[", "{[}").replace("]", "{]}") in latex and latex.count(r"\\") == 4
-    assert "<caption>paper-random: 100 worlds, seed 7</caption>" in html and "Push" not in html
-    assert "Decrease" in table.meanings() and "closing speed" in table.meanings()["Push (m/s)"]
 
 
 def test_meanings__also_of_measures_without_a_column_and_without_marks() -> None:
@@ -256,5 +243,7 @@ def test_lists__of_worlds_that_differ_show_the_worst_impact_and_the_mean_harm() 
 
 
 def test_summary__of_one_scenario_of_a_mixture_has_no_range_of_what_is_not_there() -> None:
-    tables = eb.summarise_by(eb.evaluate(VARIED, "coast", episodes=8), "scenario")
+    both = [{"scenario": "paper-random"}, {"scenario": "paper-random-obstacle"}]
+    mixture = eb.load_scenario({"name": "both", "mixture": both})
+    tables = eb.summarise_by(eb.evaluate(mixture, "coast", episodes=8), "scenario")
     assert any("obstacle_gap_m" not in table.parameters for table in tables.values())

@@ -72,7 +72,7 @@ THERE: dict[str, Callable[[], object]] = {
     "term 'harm': this name is already in": lambda: eb.register_term("harm", gives(0.0)),
     "term 'intervention' is registered already;": lambda: eb.register_term("intervention", gives(0.0)),
     "measure 'total_harm': this name is": lambda: eb.register_measure("total_harm", gives(0.0)),
-    "measure 'injury' is registered already;": lambda: eb.register_measure("injury", gives(0.0)),
+    "measure 'pushed_m' is registered already;": lambda: eb.register_measure("pushed_m", gives(0.0)),
     "agent 'coast' is registered already;": lambda: eb.register_agent("coast", gives(0.0)),
     "shield or search 'step' is registered already;": lambda: eb.register_shield("step", gives(0.0)),
     "preset 'paper': another channel is already registered": lambda: eb.register_preset("paper", {"preset": "nominal"}),
@@ -89,7 +89,7 @@ NAMES: dict[str, Callable[[], object]] = {
     "unknown feature 'zzz'; known: ": lambda: eb.View(["own", "zzz"]),
     "unknown setting of a reward 'jrek'; did you": lambda: eb.parallel_env(scenario=PAPER, reward={"jrek": 1.0}),
     "unknown objective 'onw'; did you mean": lambda: PAPER.replace(objective="onw"),
-    "unknown measure 'injur'; did you mean": lambda: eb.evaluate(PAPER, "coast", episodes=2, measures="injur"),
+    "unknown measure 'pushed_n'; did you mean": lambda: eb.evaluate(PAPER, "coast", episodes=2, measures="pushed_n"),
     "unknown agent 'caost'; did you mean": lambda: eb.make_agent("caost"),
 }
 

@@ -1,12 +1,11 @@
 """As tests/test_same_bits.py, of extensions."""
 
-from tests.test_same_bits import PACKAGE, SQUARES, TRAINED, calls_in
+from tests.test_same_bits import PACKAGE, TRAINED, calls_in
 
 SEARCHED = "a search, whose finds are written down as numbers"
 ROUNDED = "degrees to a direction; what is made of it is rounded to millimetres"
 DRAWN = "corners of a star in a picture, in half pixels"
 REMAINS = {
-    ("cooperation/equilibria.py", "**"): SQUARES,
     ("learners/rollout_classification.py", "**"): TRAINED,
     ("learners/vine.py", "**"): TRAINED,
     ("recorded/states.py", "np.cos"): ROUNDED,

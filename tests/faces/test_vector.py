@@ -8,8 +8,8 @@ import pytest
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.sb3 import make_sb3_vec_env
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
+from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.contract.interfaces import SCENARIOS, actions
-from tests.fixtures.scenarios import VARIED
 from tests.refused import refused
 
 N, STEPS = 3, 160
@@ -70,17 +70,20 @@ def test_infos__are_those_of_the_single_environment(scenario: Any) -> None:
 
 
 def test_description__has_columns_that_only_some_of_the_worlds_have() -> None:
-    env = EthBrakeVectorEnv(4, VARIED)
-    env.reset(seed=4)
+    members = [{"scenario": "paper-random-obstacle"}, {"scenario": "realistic-mixed"}]
+    env = EthBrakeVectorEnv(4, load_scenario({"name": "two", "mixture": members}))
+    env.reset(seed=2)
     worlds = env.describe_worlds()
-    assert worlds["world"].tolist() == [0, 1, 2, 3] and worlds["world_seed"].tolist() == [4] * 4
-    assert worlds["vehicle_1_type"].tolist() == ["", "", "unequipped", "equipped"]
-    assert np.isnan(worlds["obstacle_gap_m"]).tolist() == [False, True, True, True]
+    assert worlds["world"].tolist() == [0, 1, 2, 3] and worlds["world_seed"].tolist() == [2] * 4
+    mixed = worlds["scenario"] == "realistic-mixed"
+    assert mixed.any() and not mixed.all() and ((worlds["vehicle_1_type"] != "") == mixed).all()
+    assert (np.isnan(worlds["obstacle_gap_m"]) == mixed).all()
     assert worlds["scenario"].shape == (4,)
 
 
 def test_description__of_worlds_of_a_list_and_of_those_that_follow() -> None:
-    env = EthBrakeVectorEnv(3, "engineering-wet-road", autoreset_mode="SameStep")
+    wet = load_scenario("realistic-motorway").replace(friction={"uniform": [0.2, 0.9]})
+    env = EthBrakeVectorEnv(3, wet, autoreset_mode="SameStep")
     env.reset(seed=2, options={"listed_world": {"seed": 7, "number": 3}})
     drawn, over = env.scenario.draw(3, 7, first=3), np.zeros(3, bool)
     assert env.describe_worlds()["friction"].tolist() == drawn.friction.tolist()

@@ -118,6 +118,11 @@ def test_document__knows_the_line_of_each_value_or_of_what_is_around_it() -> Non
         raise InvalidInput("too large")
 
 
+def test_document__shares_nothing_with_another_reader_of_the_same_text() -> None:
+    parse_yaml("a: {b: [1]}").content["a"]["b"].append(2)
+    assert parse_yaml("a: {b: [1]}").content == {"a": {"b": [1]}}
+
+
 @pytest.mark.parametrize(("opening", "closing"), ["[]", ("{a: ", "}"), ("- ", "")])
 def test_depth_and_size__the_limits_are_allowed(opening: str, closing: str) -> None:
     parse_yaml(opening * DEPTH_LIMIT + "1" + closing * DEPTH_LIMIT)

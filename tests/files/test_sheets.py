@@ -1,4 +1,4 @@
-"""One table, written in five ways."""
+"""One table, in a terminal and as data."""
 
 import sys
 from dataclasses import replace
@@ -59,55 +59,6 @@ def test_narrow_terminal__leaves_out_columns_from_the_right_and_numbers_long_nam
         assert " ".join(text.split("\n")[0].split()) == head and name in text and text.endswith("Means.\n")
         assert (f"\n[1] {name}\n" in text) == (width == 25)
     assert "Column 2" in printed(replace(sheet, keep=None), 40, capsys)
-
-
-def test_sheet__in_a_document() -> None:
-    assert SHEET.markdown().split("\n") == [
-        "| Agent | Collisions | Change |",
-        "| --- | ---: | ---: |",
-        r"| a\|b knows | 25.0 % [12.5, 50.0] | -0.00 |",
-        "| paper, <test>: Non-E | – | +2.00 |",
-        "| paper, <test>: last |  |  |",
-    ]
-
-
-def test_sheet__in_latex() -> None:
-    assert SHEET.latex().split("\n")[2:7] == [
-        r"Agent & Collisions & Change \\",
-        r"\midrule",
-        r"a|b knows & 25.0 \% {[}12.5, 50.0{]} & -0.00 \\",
-        r"paper, <test> \\",
-        r"Non-E & -- & +2.00 \\",
-    ]
-
-
-def test_sheet__in_a_notebook() -> None:
-    assert SHEET.html().split("\n") == [
-        '<div class="wide" tabindex="0" role="region" aria-label="Two agents"><table>',
-        "<caption>Two agents</caption>",
-        "<thead><tr>",
-        '<th scope="col">Agent</th>',
-        '<th scope="col">Collisions</th>',
-        '<th scope="col">Change</th>',
-        "</tr></thead>",
-        "<tbody>",
-        '<tr><th scope="row">a|b\\nknows</th>',
-        '<td>25.0 % <span class="interval">[12.5, 50.0]</span></td>',
-        "<td>-0.00</td>",
-        "</tr>",
-        '<tr class="block"><th colspan="3" scope="rowgroup">paper, &lt;test&gt;</th></tr>',
-        '<tr><th scope="row">Non-E</th>',
-        "<td>–</td>",
-        "<td>+2.00</td>",
-        "</tr>",
-        '<tr><th scope="row">last</th>',
-        "<td></td>",
-        "<td></td>",
-        "</tr>",
-        "</tbody>",
-        "</table></div>",
-        "<p>In m²/s².</p>",
-    ]
 
 
 def test_sheet__as_data() -> None:

@@ -1,4 +1,7 @@
-"""On a GPU: the bits of a processor, speed, search and training. Without one the same code runs on a processor.
+"""On a GPU, in fifteen minutes: all tests of the extension, the bits of a processor, speed and training.
+
+If all is good, it writes the table of docs/extensions/cuda.md. Without a GPU the same code runs on a processor, and
+nothing is written.
 
 A GPU needs torch alone if the folder of the machine code (``NUMBA_CACHE_DIR``) comes from a machine with numba-cuda
 on which ``--only "machine code"`` has filled it: the kernels are compiled there for the GPU ``--capability``.
@@ -6,8 +9,11 @@ on which ``--only "machine code"`` has filled it: the kernels are compiled there
 
 from __future__ import annotations
 
+import sys
 import tempfile
 import time
+from collections.abc import Callable
+from datetime import date
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -17,13 +23,16 @@ import torch
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.cuda.device import like
 from ethbrake_marl.extensions.cuda.machine_code import ptx_of
-from ethbrake_marl.extensions.cuda.profiles import search, searched_worlds, started
 from ethbrake_marl.extensions.cuda.worlds import Worlds
-from ethbrake_marl.extensions.search.pricing import problem_of
-from ethbrake_marl.extensions.search.search import PROFILES
 from tests.extensions.cuda.test_worlds import SIX, whole_episodes
-from tests.programmes import Cases, Given, Told
+from tests.programmes import ROOT, Cases, Given, Told, watched
 
+LIMIT_S = 900.0  # no case begins later
+PAGE, HEADING = "docs/extensions/cuda.md", "## How fast\n"
+UNTRIED = {  # file -> what it says until this programme has run on a GPU
+    "README.md": "; experimental: not run on a GPU since a prototype in November 2026",
+    PAGE: "Experimental: not run on a GPU since a prototype in November 2026.\n\n",
+}
 OPTIONS = {
     "--device": {"default": "cuda" if torch.cuda.is_available() else "cpu"},
     "--worlds": {"type": int, "default": 20_000, "help": "in which bits are compared"},
@@ -32,15 +41,28 @@ OPTIONS = {
 
 
 def cases(given: Given) -> Cases:
+    given.until, found = min(given.until, time.monotonic() + LIMIT_S), dict[str, Told]()
+    for name, run in checks(given):
+        found[name] = Told(False)
+        yield name, partial(noted, found, name, run)
+    if given.device != "cpu":
+        yield "table of the page", partial(write, found)
+
+
+def noted(found: dict[str, Told], name: str, run: Callable[[], Told]) -> Told:
+    found[name] = run()
+    return found[name]
+
+
+def checks(given: Given) -> Cases:
     yield "machine", partial(machine, given.device)
+    yield "tests", partial(tested, given)
     for name in SIX.values():
         yield f"machine code: {name}", partial(code_of, name, given.capability)
     for kind, name in SIX.items():
         yield f"bits: {kind} ({name})", partial(same_bits, name, given)
     for name in SIX.values():
         yield f"speed: {name}", partial(speed, name, given.device)
-    for restarts, rounds in ((2, 1), (4, 2), (16, 4)):
-        yield f"search: {restarts} threads a world, {rounds} rounds", partial(searched, restarts, rounds, given.device)
     yield "vine", partial(trained, given)
 
 
@@ -51,27 +73,23 @@ def machine(device: str) -> Told:
     return Told(True, f"{name}, {count} of them, torch {torch.__version__}, CUDA {torch.version.cuda}")
 
 
+def tested(given: Given) -> Told:
+    """Run all tests of the extension, those that need a GPU and the twins on a processor, too."""
+    command = (sys.executable, "-m", "pytest", "-q", "--all", "tests/extensions/cuda")
+    status, told = watched(command, given.until - time.monotonic())
+    return Told(status == 0, told.strip().rpartition("\n")[2] or "not finished in time")
+
+
 def code_of(name: str, capability: str) -> Told:
-    """Make the code of both kernels, if there is a compiler, and keep it."""
+    """Make the machine code, if there is a compiler, and keep it."""
     if find_spec("numba_cuda") is None:
         return Told(None, "numba-cuda is not installed")
     major, minor = (int(part) for part in capability.split("."))
-    scenario, game = eb.open_game(name)
-    worlds = Worlds(scenario, 2, 4, "cpu")
-    problem = problem_of(game, scenario.sample(2, seed=7), [int(game.rules.learners[0])])
-    actions = torch.zeros(2, len(game.rules.learners))
-    on, sizes = torch.device("cpu"), []
-    asked, kernel = searched_worlds(problem, on)
-    plans = started(problem, None, 2, 0, on)
-    for each, arguments in (
-        (worlds.kernel, worlds.arguments(actions, 0)),
-        (kernel, (asked, plans, torch.from_numpy(PROFILES.copy()), 1, 1)),
-    ):
-        code = ptx_of(each.name, each.thread, (*like(arguments), 0), (major, minor))
-        sizes.append(f"{each.name} {len(code) >> 10:,} KiB, {code.count('fma.rn.f64')} fused multiply-adds")
-        if "fma.rn.f64" in code:
-            return Told(False, "; ".join(sizes))
-    return Told(True, "; ".join(sizes))
+    worlds = Worlds(name, 2, 4, "cpu")
+    arguments = worlds.arguments(torch.zeros(2, len(worlds.game.rules.learners)), 0)
+    code = ptx_of(worlds.kernel.name, worlds.kernel.thread, (*like(arguments), 0), (major, minor))
+    fused = code.count("fma.rn.f64")
+    return Told(not fused, f"{worlds.kernel.name} {len(code) >> 10:,} KiB, {fused} fused multiply-adds")
 
 
 def same_bits(name: str, given: Given) -> Told:
@@ -99,18 +117,6 @@ def speed(name: str, device: str) -> Told:
     return Told(True, ", ".join(parts))
 
 
-def searched(restarts: int, rounds: int, device: str) -> Told:
-    scenario, game = eb.open_game("paper-random")
-    n = 10_000 if device != "cpu" else 500
-    problem = problem_of(game, scenario.sample(n, seed=7))
-    asked = {"restarts": restarts, "device": device}
-    search(problem.take(slice(0, 1)), rounds=1, drawn=1, changes=1, **asked)
-    wait(device)
-    begun = time.perf_counter()
-    _, values = search(problem, rounds=rounds, **asked)
-    return Told(True, f"{n:,} worlds, mean {values['first'].mean():.4f} after {time.perf_counter() - begun:.2f} s")
-
-
 def trained(given: Given) -> Told:
     """Train a policy by the recipe for a GPU, and evaluate it on 1,000 worlds."""
     with tempfile.TemporaryDirectory() as folder:
@@ -127,3 +133,21 @@ def trained(given: Given) -> Told:
 def wait(device: str) -> None:
     if device != "cpu":
         torch.cuda.synchronize(device)
+
+
+def write(found: dict[str, Told]) -> Told:
+    """Write the table of the page, and take away what page and README say of a version that has not run on a GPU."""
+    failed = [name for name, told in found.items() if told.good is False]
+    if failed:
+        return Told(False, f"not written: {', '.join(failed)} failed or did not run")
+    for file, untried in UNTRIED.items():
+        text = (ROOT / file).read_text("utf-8").replace(untried, "")
+        (ROOT / file).write_text(with_table(text, found) if file == PAGE else text, "utf-8")
+    return Told(True, f"written to {PAGE}")
+
+
+def with_table(page: str, found: dict[str, Told]) -> str:
+    """Return the page with a table of what was found in place of its last section."""
+    rows = "\n".join(f"| {name} | {told.text} |" for name, told in found.items() if told.good)
+    measured = f"Measured: {date.today()}, by `make programme NAME=cuda`."
+    return f"{page.partition(HEADING)[0]}{HEADING}\n| check | result |\n|---|---|\n{rows}\n\n{measured}\n"

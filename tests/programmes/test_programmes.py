@@ -1,9 +1,9 @@
-"""The programmes: their runner, the page of libraries, samples of long ones, the cage of hostile files, bugs."""
+"""The programmes: their runner, the page of libraries, bounds, bugs."""
 
-import os
 import re
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,14 +11,7 @@ import pytest
 
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.printed import rows
-from tests.programmes import ROOT, Told, __main__ as runner, bounds, bugs, hostile, libraries
-
-
-def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "tests.programmes", *words]
-    given = {**os.environ, "PYTHONPATH": str(ROOT), **variables}
-    return subprocess.run(command, cwd=ROOT, env=given, capture_output=True, text=True, check=False)
-
+from tests.programmes import ROOT, Told, __main__ as runner, bounds, bugs, libraries
 
 # ---------------------------------------------------------------- the runner
 
@@ -46,9 +39,28 @@ def test_runner__says_how_the_cases_ended_and_exits_by_it(words, status, end, mo
 
 
 def test_runner__lists_every_programme_and_knows_no_other(capsys):
-    assert runner.main([]) == 0 and {"motion", "shields", "wheel"} <= runner.programmes().keys()
+    assert runner.main([]) == 0 and {"bugs", "core", "wheel"} <= runner.programmes().keys()
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [*runner.programmes()]
     assert runner.main(["nobody"]) == 2
+
+
+# ---------------------------------------------------------------- cuda
+
+
+def test_page_of_the_gpu__says_that_nothing_was_measured_or_has_the_table(tmp_path, monkeypatch):
+    cuda = import_module("tests.programmes.cuda")
+    monkeypatch.setattr(cuda, "ROOT", tmp_path)
+    texts = {file: (ROOT / file).read_text("utf-8") for file in cuda.UNTRIED}
+    told = [untried in texts[file] for file, untried in cuda.UNTRIED.items()]
+    assert told == 2 * ["| check |" not in texts[cuda.PAGE]]
+    for file, text in texts.items():
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).write_text(text, "utf-8")
+    assert not cuda.write({"bits": Told(True), "vine": Told(False)}).good
+    assert cuda.write({"machine code": Told(None, "no compiler"), "bits": Told(True, "the same")}).good
+    page = (tmp_path / cuda.PAGE).read_text("utf-8")
+    assert "| bits | the same |\n\nMeasured: " in page and page.count("## ") == texts[cuda.PAGE].count("## ")
+    assert not any(untried in (tmp_path / file).read_text("utf-8") for file, untried in cuda.UNTRIED.items())
 
 
 # ---------------------------------------------------------------- bounds
@@ -99,36 +111,6 @@ def test_way__runs_in_the_projects_own_environment(way, tmp_path, monkeypatch):
     names: dict[str, object] = {}
     exec(re.sub(r"n_steps=\d+", "n_steps=32", re.sub(r"\b\d+_000\b", "64", way.code)), names)
     assert names["agent"].act is not None
-
-
-# ---------------------------------------------------------------- hostile files, proofs, attacks
-
-
-@pytest.mark.slow
-def test_hostile_files__are_all_refused_as_they_should_be():
-    done = run("hostile")
-    assert done.stdout.splitlines()[-1].startswith("PASS: 72 of 72 good"), done.stdout + done.stderr
-
-
-@pytest.mark.parametrize(
-    ("fault", "command"),
-    [
-        ("DEED: os.mkdir", lambda: os.mkdir("/tmp/of-a-test")),
-        ("DEED: executed os.system", lambda: os.system("true")),
-        ("exit status 0", lambda: None),
-        ("code was executed", lambda: Path("pwned").touch()),
-    ],
-)
-def test_judge__tells_what_breaks_a_rule(fault, command, tmp_path):
-    good, told = hostile.judge(hostile.Case("x", command, lambda folder: None), tmp_path / "case")
-    assert not good and fault in told
-
-
-@pytest.mark.slow
-def test_proofs__every_statement_and_every_planted_bug():
-    pytest.importorskip("z3")
-    done = run("proofs", NUMBA_DISABLE_JIT="1")
-    assert done.stdout.splitlines()[-1] == "PASS: 15 of 15 good, 0 failed, 0 without a verdict", done.stdout
 
 
 # ---------------------------------------------------------------- planted bugs

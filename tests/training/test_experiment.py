@@ -43,9 +43,9 @@ def test_one_learner__is_compared_alone_and_in_the_hybrid(count: str, tmp_path: 
     for name, spec in specs.items():
         assert found.compared.result[name][COLUMN[count]].tolist() == again[spec][COLUMN[count]].tolist()
     saved = eb.read_result(run / "results.json")
-    assert [*saved.agents] == names and saved.rows is not None and len(saved.rows["world"]) == len(names) * EPISODES
-    assert ("pushed_mps" in saved.agents["hybrid"]) == (count == "honest")
-    assert "pushed_m_1" in saved.agents["hybrid"]
+    assert [*saved] == names and len((run / "worlds.csv").read_text().splitlines()) == 1 + len(names) * EPISODES
+    assert ("pushed_mps" in saved["hybrid"]) == (count == "honest")
+    assert "pushed_m_1" in saved["hybrid"]
     end = status(run)
     assert (end["status"], end["stage"], end["steps"], end["reason"]) == ("finished", "evaluation", UPDATE, None)
     assert end["written"] == ["results.json", "worlds.csv"] and end["started_utc"]
@@ -68,7 +68,7 @@ def test_several_learners__are_compared_whole_without_each_and_shielded(scheme: 
 
 def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_path: Path) -> None:
     class Mine:
-        measures: tuple[str, ...] = ("injury_lr4s", "nobody_has_this")
+        measures: tuple[str, ...] = ("pushed_mps", "nobody_has_this")
 
         def write(self, experiment: Experiment, tell: Callable[[Progress], None]) -> tuple[list[str], str]:
             (experiment.trained.directory / "mine.txt").write_text("x")
@@ -81,7 +81,7 @@ def test_report__gets_the_measures_that_there_are_and_writes_into_the_run(tmp_pa
         SHORT, eb.load_scenario("paper-random-buildup"), run, episodes=10, list_seed=3, report=Mine(),
         on_progress=lambda progress: notes.append(progress.note),
     )  # fmt: skip
-    assert (found.measures, tables, where) == (("injury_lr4s",), ["table"], "there")
+    assert (found.measures, tables, where) == (("pushed_mps",), ["table"], "there")
     assert found.compared.result.about["seed"] == 3 and "mine.txt" in status(run)["written"]
     (said,) = filter(None, notes)
     assert said.startswith("e_v2x_bm:pairwise is left out: e_v2x_bm:pairwise: brakes build up gradually")
@@ -121,7 +121,7 @@ def test_report__that_fails_says_so(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"), [({"scenario": "cooperation-0-sensors"}, "has no learner"), ({"list_seed": -1}, "seed")]
+    ("settings", "said"), [({"scenario": "level-0-sensors"}, "has no learner"), ({"list_seed": -1}, "seed")]
 )
 def test_refused__before_anything_is_written(settings: dict[str, Any], said: str, tmp_path: Path) -> None:
     with refused(said):

@@ -483,6 +483,13 @@ def test_train__is_refused(message: str, tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("name", ["a,b", "a+b"])
+def test_train__into_a_folder_that_no_agent_could_name_is_refused(name: str, tmp_path: Path) -> None:
+    with refused(f"{tmp_path / name}: a path in the name of an agent must have no comma and no plus; rename it"):
+        train(TINY, "paper-random", tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
 @pytest.fixture
 def begun(tmp_path: Path) -> Path:
     """A run that was killed before its first update."""

@@ -3,7 +3,6 @@
 import copy
 import json
 import pickle
-import shutil
 from collections import UserDict, UserList, deque
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
 from ethbrake_marl.worlds.game import Pool, views_of
 from ethbrake_marl.worlds.rules import RULES
 from ethbrake_marl.worlds.scenario import Scenario
-from tests.fixtures.scenarios import SHIPPED, VARIED
+from tests.fixtures.scenarios import SHIPPED
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")
@@ -45,8 +44,7 @@ def bits(state: Any) -> list[bytes]:
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["paper-random", "engineering-loaded-lorries", "cooperation-4-congested", "mixture-three-tests", "standards-r157"],
+    "name", ["paper-random", "realistic-mixed", "cooperation-4-congested", "mixture-three-tests", "standards-r157"]
 )
 def test_world_k__is_the_same_alone_and_in_any_batch(name: str) -> None:
     scenario = load_scenario(name)
@@ -203,12 +201,11 @@ def test_shipped_scenario__goes_round(name: str, empty_folder: Path) -> None:
     for key in scenario.model_fields_set - {"vehicles"}:
         assert scenario.replace(**{key: getattr(scenario, key)}) == scenario, key
     assert next(explain.sentences(scenario)).startswith(f"{name}: ")
-    Path("mine.yaml").write_text(explain.new_scenario_text("mine", name, rows_file="rows.csv"))
-    if scenario.table is not None:
-        file = catalogue.scenario_path(name)
-        shutil.copy(file.parent / read_yaml(file).content["table"]["file"], "rows.csv")
-    again = load_scenario("mine.yaml")
-    assert bits(again.sample(5, 7)) == bits(scenario.sample(5, 7))
+    Path("mine.yaml").write_text(explain.new_scenario_text("mine", name))
+    assert bits(load_scenario("mine.yaml").sample(5, 7)) == bits(scenario.sample(5, 7))
+    Path(f"{name}.yaml").write_text(explain.whole_text(name))
+    table = {} if scenario.table is None else {"table": scenario.table}
+    assert table or load_scenario(f"{name}.yaml") == scenario
 
 
 def test_what_users_hand_over__becomes_plain() -> None:
@@ -238,12 +235,13 @@ def test_columns__are_all_that_was_drawn() -> None:
     wet = line(friction={"uniform": [0.2, 0.4]})
     of_mixture, of_types, of_wet = (
         columns_of(scenario.draw(3, 7, first=5))
-        for scenario in (load_scenario("mixture-delays"), load_scenario("engineering-loaded-lorries"), wet)
+        for scenario in (load_scenario("mixture-delays"), load_scenario("realistic-mixed"), wet)
     )
     assert [*of_mixture][:3] == ["world", "scenario", "gap_1_m"]
     assert [*of_types][:5] == ["world", "vehicle_1_type", "vehicle_2_type", "vehicle_3_type", "gap_1_m"]
     assert of_types["world"].tolist() == [5, 6, 7]
-    some = VARIED.draw(30, 7)
+    both = [{"scenario": "paper-random"}, {"scenario": "paper-random-obstacle"}]
+    some = load_scenario({"name": "both", "mixture": both}).draw(30, 7)
     assert set(columns_of(some)["obstacle_gap_m"][some.worlds.obstacle_gap_m == np.inf].astype(str)) == {"nan"}
     assert (of_wet["braking_capacity_1_mps2"] == of_wet["friction"] * 9.81).all()
     fixed = {f"{name}_{i}_{unit}" for name, unit in (("mass", "t"), ("latency", "s")) for i in (1, 2, 3)}
@@ -260,7 +258,7 @@ def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
 
 
 def test_catalogue__has_groups_names_and_paths(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert len(list_scenarios()) == 52
+    assert len(list_scenarios()) == 46
     assert len(group_of_scenarios("benchmark")) == 10
     assert group_of_scenarios("stress") == ["stress-wide", "stress-wide-obstacle"]
     assert group_of_scenarios("nothing") == []
@@ -314,3 +312,51 @@ def test_json_schema__accepts_what_the_reader_accepts() -> None:
     heavy = {"car": {"mass_t": {"with_load": [1, 1001]}}}
     for wrong in ({"vehicle_types": heavy}, {"v2x": "nominl"}, {"zzz": 1}, {"name": "Bad Name"}):
         assert not editor.is_valid({"name": "x", **wrong}), wrong
+
+
+def write(name: str, text: str, folder: str = ".") -> Path:
+    path = Path(folder) / f"{name}.yaml"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(f"name: {name}\n{text}")
+    return path
+
+
+def test_based_on__takes_all_values_but_the_words_and_what_the_file_says(empty_folder: Path) -> None:
+    write("near", "based_on: paper-random-obstacle\ntime_gaps_s: 0.4\nobstacle_margin_m: null\n", "sub")
+    far = write("far", "title: Far\nbased_on: sub/near.yaml\nlatency_s: [0, 0.2, 0.8]\nearly_impacts: keep\n")
+    paper = load_scenario("paper-random")
+    expected = paper.replace(name="far", title="Far", time_gaps_s=0.4, latency_s=[0, 0.2, 0.8], early_impacts="keep")
+    found = load_scenario(far)
+    assert found == expected.replace(description="", source="") and not found.has_obstacle
+    assert load_scenario({"name": "far", "title": "Far", "based_on": far}) == found
+    assert load_scenario({**found.declared(), "name": "far"}) == found
+
+
+def test_based_on__a_mixture_changes_every_member(empty_folder: Path) -> None:
+    changed = load_scenario(write("slow", "based_on: mixture-delays\nmass_t: 3\n"))
+    assert {member.mass_t for member in changed.members} == {3.0}
+
+
+BASED = {
+    "a.yaml, line 3: mass_t: has the same value in paper-random; leave it out": "paper-random\nmass_t: [4.5, 5.5, 5.9]",
+    "a.yaml, line 3: early_impacts: has the same value in paper-random; leave": "paper-random\nearly_impacts: reject",
+    "a.yaml, line 3: friction: has the same value in paper-random; leave it": "paper-random\nfriction: null",
+    "a.yaml, line 2: unknown scenario 'paper-randon'; did you mean 'paper-random'?": "paper-randon",
+    "a.yaml, line 2: based_on = [b]: must be the name of a scenario or the path of its file": "[b]",
+    "a.yaml, line 2: based_on = a.yaml: a -> a is a circle; base one of them on another scenario": "a.yaml",
+    "based_on = a.yaml: a -> b -> a is a circle; base one of them on another scenario": "b.yaml",
+    "a.yaml, line 3: mass_kg: unknown key; did you mean mass_t (tonnes)?": "paper-random\nmass_kg: 3",
+    "missing.yaml: the file does not exist": "missing.yaml",
+}
+
+
+@pytest.mark.parametrize("message", BASED)
+def test_based_on__refuses(message: str, empty_folder: Path) -> None:
+    write("b", "based_on: a.yaml\n")
+    with refused(message):
+        load_scenario(write("a", f"based_on: {BASED[message]}\n"))
+
+
+def test_based_on__works_only_in_files() -> None:
+    with refused("based_on = paper-random: works only in a file and with load_scenario"):
+        PAPER.replace(based_on="paper-random")

@@ -15,10 +15,9 @@ import numpy as np
 from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, naming_extras
-from ethbrake_marl.faces.actions import action_space, checked_actions
 from ethbrake_marl.faces.rendering import RENDERERS, make_renderer
 from ethbrake_marl.faces.shield import NOBODY, guarded
-from ethbrake_marl.faces.spaces import feature_box
+from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box
 from ethbrake_marl.faces.stream import Stream, chosen_seed
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.catalogue import load_scenario

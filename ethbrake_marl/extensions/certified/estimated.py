@@ -1,17 +1,14 @@
-"""What one vehicle can know of its line: *estimated lines*, made from its messages and the scenario's ranges.
+"""What one vehicle can know of its line: its *median line*, made from its messages and the scenario's ranges.
 
-A value of another vehicle that has not been received is its median in the *median line*, and an end of its range in
-every *corner*. Each estimated line is simulated beside the episode, from the alert on, with the vehicle's own actions;
-the others follow their scripts. It is dropped when the vehicle receives or measures something that contradicts it. If
-all are contradicted, the truth lies between the corners: then received values replace assumed ones in all of them, and
-the rest goes on as before.
+A value of another vehicle that has not been received is the median of its range. The line is simulated beside the
+episode, from the alert on, with the vehicle's own actions; the others follow their scripts. Where the vehicle receives
+or measures something else than the line foretold, received values replace assumed ones, and the rest goes on as before.
 
-Nothing else of the true state is read, so what was not received cannot change an estimated line.
+Nothing else of the true state is read, so what was not received cannot change the median line.
 """
 
 from __future__ import annotations
 
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +16,6 @@ import numpy as np
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.uncertainty import MOST_CORNERS
 from ethbrake_marl.extensions.messages.belief import known_pieces
 from ethbrake_marl.extensions.messages.links import (
     AT,
@@ -67,7 +63,6 @@ from ethbrake_marl.worlds.sampling import draw_once
 from ethbrake_marl.worlds.scenario import Scenario
 
 SURPRISE = 1e-6  # by which a quantity (SI units, t) may differ from its prediction: messages are moved on with rounding
-RANGES = {"speeds_mps": SPEED, "braking_capacity_mps2": BRAKING, "mass_t": MASS, "latency_s": OWN_LATENCY}
 TOLD = {  # rows of `State.car` -> the piece of a message that tells them
     BRAKING: P_BRAKING,
     DRIVING: P_BRAKING,
@@ -80,22 +75,19 @@ TOLD = {  # rows of `State.car` -> the piece of a message that tells them
 OF_IMPACTS = [HIT, FIRST, TOTAL, COUNT]
 
 
-class Lines(NamedTuple):
-    """The M estimated lines of the vehicle ``body`` before it has received anything, the median line first."""
+class MedianLine(NamedTuple):
+    """The line that the vehicle ``body`` assumes before it has received anything."""
 
     body: int
-    alert: State  # [M] at the alert
-    news_s: Floats  # [M, N + 1] when each vehicle has received the alert (s)
+    alert: State  # [1] at the alert
+    news_s: Floats  # [1, N + 1] when each vehicle receives the alert (s)
     roles: tuple[str, ...]  # of the vehicles, front to rear
 
     @classmethod
-    def of(cls, scenario: Scenario, body: int, *, corners: bool) -> Lines:
-        """Return the median line of a scenario and, with ``corners``, lines with unknown quantities at the ends of
-        their ranges.
+    def of(cls, scenario: Scenario, body: int) -> MedianLine:
+        """Return the line of a scenario in which every quantity has its median.
 
-        Unknown to the vehicle ``body`` are the gaps and, of each other vehicle, speed, braking capacity, mass, latency,
-        and when it receives the alert. Raises ``InvalidInput`` for a mixture of scenarios, for other vehicles with
-        unknown commands, and for too many corners.
+        Raises ``InvalidInput`` for a mixture of scenarios, and for other vehicles with unknown commands.
         """
         where = f"scenario {scenario.name!r}: estimated agents and shields need"
         if scenario.members:
@@ -104,30 +96,10 @@ class Lines(NamedTuple):
         for other, (name, role) in enumerate(scenario.roles.items(), 1):
             if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
                 raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
-        N, channel, of = scenario.vehicles, scenario.v2x, scenario.unheard()
-        median = draw_once(scenario, lambda width, stream: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
-        late = channel.latest_reaction_s(np.zeros((1, N)), of)
-        usual = channel.news(np.zeros((1, N)), np.full((1, PER_LINK * N * N), 0.5), of)[0] if late.any() else late
-        sides = [("gaps_m", p, *ends) for p, ends in enumerate(scenario.bounds("gaps_m"), 1)]
-        sides += [(key, j, *ends) for key in RANGES for j, ends in enumerate(scenario.bounds(key), 1) if j != body]
-        sides += [("news_s", j, 0.0, float(late[0, j - 1])) for j in range(1, N + 1) if j != body]
-        sides = [side for side in sides if side[2] < side[3]] if corners else []
-        if 2 ** len(sides) > MOST_CORNERS:
-            raise InvalidInput(
-                f"robust:estimated: scenario {scenario.name!r} has {len(sides)} unknown quantities; their smallest and"
-                f" largest values make {2 ** len(sides)} combinations (corners), but at most {MOST_CORNERS} are"
-                " allowed; give fewer quantities a range"
-            )
-        ends = [side[2:] for side in sides]
-        values = np.array([*product(*ends)]).reshape(-1, len(sides)) if sides else np.zeros((0, 0))
-        alert = median.take(np.zeros(1 + len(values), np.int64))
-        news = np.zeros((alert.n, N + 1))
-        news[:, 1:] = usual
-        for (key, column, *_), each in zip(sides, values.T, strict=True):
-            array = news if key == "news_s" else alert.line[:, GAP] if key == "gaps_m" else None
-            if array is None:
-                array = (alert.line if key == "speeds_mps" else alert.car)[:, RANGES[key]]
-            array[1:, column] = each
+        N = scenario.vehicles
+        alert = draw_once(scenario, lambda width, stream: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
+        news = np.zeros((1, N + 1))
+        news[:, 1:] = scenario.v2x.news(np.zeros((1, N)), np.full((1, PER_LINK * N * N), 0.5), scenario.unheard())[0]
         alert.car[:, LATENCY] = np.maximum(alert.car[:, OWN_LATENCY], news)
         return cls(body, alert, news, tuple(scenario.roles.values()))
 
@@ -144,25 +116,22 @@ class Lines(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the estimated lines at the alert, M rows for each world.
+        """Return the median lines at the alert.
 
         They use what ``state`` shows at the first decision. Vehicles of which everything is known by then start as in
-        the true world ``alert``, and so does the gap between two of them.
+        the true worlds ``alert``, and so does the gap between two of them.
         """
-        M, (pieces, news) = self.alert.n, self.received(state)
-        lines, true = self.alert.take(np.tile(np.arange(M), alert.n)), alert.take(np.arange(alert.n).repeat(M))
-        whole = np.asarray(pieces[:, :, :P_INTENT].all(axis=2))
-        whole[:, 0] = whole[:, 1]
-        acts = (whole & (news[:, SAMPLE_FORCE] != 0.0)).repeat(M, axis=0)
+        pieces, news = self.received(state)
+        known = np.asarray(pieces[:, :, :P_INTENT].all(axis=2))
+        known[:, 0] = known[:, 1]
+        acts = known & (news[:, SAMPLE_FORCE] != 0.0)
         acts[:, self.body] = True
-        known = whole.repeat(M, axis=0)
-        line, car = (np.where(known[:, np.newaxis], *each) for each in zip(true[:2], lines[:2], strict=True))
+        line, car = (np.where(known[:, np.newaxis], *each) for each in zip(alert[:2], self.alert[:2], strict=True))
         both = known[:, :-1] & known[:, 1:]
-        line[:, GAP, :-1] = np.where(both, true.line[:, GAP, :-1], lines.line[:, GAP, :-1])
-        car[:, RESTITUTION] = true.car[:, RESTITUTION]
-        heard = np.maximum(car[:, OWN_LATENCY], np.tile(self.news_s, (alert.n, 1)))
-        car[:, LATENCY] = np.where(acts, true.car[:, LATENCY], heard)
-        return true._replace(line=line, car=car, wanted=self.commands(car, true.wanted))
+        line[:, GAP, :-1] = np.where(both, alert.line[:, GAP, :-1], self.alert.line[:, GAP, :-1])
+        car[:, RESTITUTION] = alert.car[:, RESTITUTION]
+        car[:, LATENCY] = np.where(acts, alert.car[:, LATENCY], np.maximum(car[:, OWN_LATENCY], self.news_s))
+        return alert._replace(line=line, car=car, wanted=self.commands(car, alert.wanted))
 
     def received(self, state: State) -> tuple[Bools, Floats]:
         """Return which quantities of each body the vehicle has received, [n, N + 1, PIECES], and the newest values.
@@ -180,36 +149,27 @@ class Lines(NamedTuple):
         pieces[:, 0, P_PLACE] = pieces[:, 1, P_PLACE]
         return pieces, news
 
-    def heard(self, state: State, lines: State) -> tuple[State, Bools, Bools]:
-        """Return the estimated lines after news, and in which worlds any, and not all, agreed with it, [n] each.
+    def heard(self, state: State, median: State) -> tuple[State, Bools]:
+        """Return the median lines after news, and in which worlds they had foretold it, [n].
 
-        ``state``: the truth now. ``lines``: the lines now, M rows for each world. A contradicted line becomes a copy of
-        one that agrees; if none agrees, ``overwritten`` corrects all of them.
+        ``state``: the truth now. ``median``: the lines now; they are corrected where they are contradicted.
         """
-        n, M = state.n, lines.n // state.n
-        possible = self.agrees(state, lines)
-        some = np.asarray(possible.any(axis=1))
-        kept = np.where(possible | ~some[:, np.newaxis], np.arange(M), possible.argmax(axis=1)[:, np.newaxis])
-        changed = ~np.asarray(possible.all(axis=1))
-        if changed.any():
-            lines = lines.take((np.arange(n)[:, np.newaxis] * M + kept).ravel())
-        if not some.all():
-            rows = (~some).repeat(M).nonzero()[0]
-            lines = lines.put(rows, self.overwritten(state.take(rows // M), lines.take(rows)), donate=True)
-        return lines, some, changed
+        foretold = self.agrees(state, median)
+        rows = (~foretold).nonzero()[0]
+        if len(rows):
+            median = median.put(rows, self.overwritten(state.take(rows), median.take(rows)))
+        return median, foretold
 
-    def agrees(self, state: State, lines: State) -> Bools:
-        """Return in which estimated lines the vehicle would have received and measured the same, [n, M].
+    def agrees(self, state: State, median: State) -> Bools:
+        """Return in which worlds the vehicle would have received and measured the same in the ``median`` line, [n].
 
-        ``state``: the truth now. ``lines``: the lines now, M rows for each world.
+        ``state``: the truth now.
         """
         pieces, news = self.received(state)
-        mine, theirs = self.told(state, news), self.told(lines, self.received(lines)[1])
-        far = np.abs(theirs.reshape(state.n, -1, *mine.shape[1:]) - mine[:, np.newaxis]) > SURPRISE
-        hit = state.line[:, HIT, self.body - 1 : self.body + 1]
-        struck = lines.line[:, HIT, self.body - 1 : self.body + 1].reshape(state.n, -1, 2) != hit[:, np.newaxis]
-        wrong = (far & pieces[:, np.newaxis, :, :P_INTENT]).any(axis=(2, 3)) | struck.any(axis=2)
-        return np.asarray(~wrong)
+        far = np.abs(self.told(median, self.received(median)[1]) - self.told(state, news)) > SURPRISE
+        impacts = slice(self.body - 1, self.body + 1)
+        struck = median.line[:, HIT, impacts] != state.line[:, HIT, impacts]
+        return np.asarray(~((far & pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
 
     def told(self, state: State, news: Floats) -> Floats:
         """Return what a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
@@ -222,21 +182,21 @@ class Lines(NamedTuple):
         sample = np.stack([news[:, PLACE] - own, news[:, SAMPLE_SPEED], news[:, SAMPLE_FORCE]], axis=1)
         return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
 
-    def overwritten(self, state: State, lines: State) -> State:
-        """Return ``lines`` [n] with received values in place of assumed ones; ``state`` [n] is the truth now.
+    def overwritten(self, state: State, median: State) -> State:
+        """Return median lines with received values in place of assumed ones; ``state`` is the truth now.
 
         A received place and speed are moved on to the present by the sender's script, without contact. A sender that
         was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to
         this vehicle, within the order of the line. This vehicle measures its own motion and its own impacts.
         """
         body, (pieces, news), time = self.body, self.received(state), state.time_s[:, np.newaxis]
-        line, car = lines.line.copy(), lines.car.copy()
+        line, car = median.line.copy(), median.car.copy()
         for row, piece in TOLD.items():
             car[:, row, 1:] = np.where(pieces[:, 1:, piece], state.car[:, row, 1:], car[:, row, 1:])
         known, acts = np.asarray(pieces[:, :, [P_PLACE, P_SPEED]].all(axis=2)), pieces[:, :, P_ACCELERATION]
         known[:, 0] = False
         at = np.where(known, news[:, AT], 0.0)
-        late = np.maximum(np.maximum(car[:, OWN_LATENCY], np.resize(self.news_s, car[:, LATENCY].shape)), at)
+        late = np.maximum(np.maximum(car[:, OWN_LATENCY], self.news_s), at)
         late = np.where(known & acts & (news[:, SAMPLE_FORCE] != 0.0), at, np.where(known, late, car[:, LATENCY]))
         car[:, LATENCY], car[:, LATENCY, body] = late, state.car[:, LATENCY, body]
         wanted = self.commands(car, state.wanted)
@@ -259,18 +219,18 @@ class Lines(NamedTuple):
         line[:, OF_IMPACTS, body - 1 : body + 1] = state.line[:, OF_IMPACTS, body - 1 : body + 1]
         if body > 1:
             line[:, HIT, 0] = np.where(pieces[:, 1, P_PLACE], news[:, OBSTACLE_HIT, 1], line[:, HIT, 0])
-        return lines._replace(line=line, car=car, wanted=wanted)
+        return median._replace(line=line, car=car, wanted=wanted)
 
 
-def without_channel(game: Game, lines: State) -> tuple[Game, State]:
-    """Return the game and estimated lines in which every vehicle knows everything, for agents that drive there.
+def without_channel(game: Game, median: State) -> tuple[Game, State]:
+    """Return the game and median lines in which every vehicle knows everything, for agents that drive there.
 
-    An estimated line does not say when the truth would be received, so each vehicle's own latency ends when it reacts.
+    A median line does not say when the truth would be received, so each vehicle's own latency ends when it reacts.
     """
-    car = lines.car.copy()
+    car = median.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
-    memories = {name: memory for name, memory in lines.memories.items() if name != NAME}
-    return Game._make(game), lines._replace(car=car, know=np.zeros_like(lines.know), memories=memories)
+    memories = {name: memory for name, memory in median.memories.items() if name != NAME}
+    return Game._make(game), median._replace(car=car, know=np.zeros_like(median.know), memories=memories)
 
 
 def in_order(place: Floats, known: Bools) -> Floats:

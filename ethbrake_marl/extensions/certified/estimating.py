@@ -1,21 +1,12 @@
-"""Shields and E-V2X-BM that use only what their vehicle has received: they decide in estimated lines (``estimated``).
+"""Shields and E-V2X-BM that use only what their vehicle has received: they decide in its median line (``estimated``).
 
-**Claim of the shield with corners**, ``robust:estimated``. Let B be its bound at the first decision. If the true world
-is one of the estimated lines that are possible then, the harm of the episode is at most B, to the last bit, whatever is
-proposed and whatever messages are lost.
-
-**Proof.** Each estimated line is simulated by the episode's own step with the actions that are applied, so the one that
-is the true world is the true episode, and it never becomes impossible. The proof of the step shield holds in each line
-that remains; with fewer lines the price of the plan does not rise, and another plan is held only if it costs less. ∎
-
-Without corners, in the median line alone, nothing is promised. Between the corners the harm may be above the bound. The
-info ``trusted`` is false once every estimated line is contradicted.
+They promise nothing: the true line may do more harm than the bound in the median line. The info ``trusted`` is false
+once something was received or measured that the median line had not foretold.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,72 +18,76 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.certified.estimated import SURPRISE, Lines, without_channel
-from ethbrake_marl.extensions.certified.robust import Members, MembersShield, apart, joined, opened
+from ethbrake_marl.extensions.certified.estimated import SURPRISE, MedianLine, without_channel
+from ethbrake_marl.extensions.certified.robust import opened
 from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield, Memory as EpisodeMemory
 from ethbrake_marl.shields.named import NamedShield
-from ethbrake_marl.shields.step import Memory, part
+from ethbrake_marl.shields.step import Memory, StepShield
 from ethbrake_marl.worlds.scenario import Scenario
 
 
-class EstimatedShield(MembersShield):
-    """Shield of one learner that certifies actions in its estimated lines (``estimated.Lines``).
+class MedianMemory(NamedTuple):
+    median: State  # line at the last decision
+    trusted: Bools  # [n] whether it has foretold everything that was received
+
+
+class EstimatedShield(StepShield):
+    """The step shield of one learner in its median line (``estimated.MedianLine``). It promises nothing.
+
+    Its bound is that of the plan in the median line, and may rise when that line is corrected.
 
     Args:
         drivers: body -> agent, as for ``StepShield``.
         scenario: the scenario of the worlds.
         harm_count: which count of harm is bounded (``episode.counts``).
-        corners: certify also in the corners of the ranges, not only in the median line.
 
     """
 
     knows = ESTIMATED
 
     def __init__(
-        self,
-        drivers: Mapping[int, Agent] | None = None,
-        *,
-        scenario: Scenario,
-        harm_count: str = "first",
-        corners: bool = False,
+        self, drivers: Mapping[int, Agent] | None = None, *, scenario: Scenario, harm_count: str = "first"
     ) -> None:
         super().__init__(drivers, harm_count=harm_count)
-        self.lines = lines_of_learner(scenario, corners)
+        self.line = line_of_learner(scenario)
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        lines, possible, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
-        median = lines.take(np.arange(0, lines.n, self.lines.alert.n))
-        memory = self.first_memory(game, median, median, lines, self.agents_at(game, alert))
-        return memory._replace(members=Members(apart(lines, state.n), possible))
+        median, trusted = self.line.heard(state, opened(game, self.line.at_alert(alert, state)))
+        memory = self.first_memory(game, median, median, median, self.agents_at(game, alert))
+        return memory._replace(members=MedianMemory(median, trusted))
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
         memory: Memory = state.memories["shield"]
-        lines, possible, changed = self.lines.heard(state, joined(memory.members.states))
-        trusted = memory.members.trusted & (possible | state.ended)
-        rows = (changed & ~state.ended).nonzero()[0]
+        median, foretold = self.line.heard(state, memory.members.median)
+        foretold |= state.ended
+        rows = (~foretold).nonzero()[0]
         if len(rows):
-            memory = self.planned_again(game, memory, lines, rows)
-        memory = memory._replace(members=Members(apart(lines, state.n), trusted))
+            memory = self.planned_again(game, memory, median.take(rows), rows)
+        memory = memory._replace(members=MedianMemory(median, memory.members.trusted & foretold))
         state = state._replace(memories={**state.memories, "shield": memory})
-        return super().decide(game, state, proposed, donate=donate)
+        applied, memory = super().decide(game, state, proposed, donate=donate)
+        after, _ = game.follow(median, applied)
+        return applied, memory._replace(members=memory.members._replace(median=after))
+
+    def seen(self, state: State, memory: Memory) -> State:
+        """Return the median lines, with the present memories of the agents in ``state``."""
+        median: State = memory.members.median
+        own = {body: state.memories[body] for body in self.drivers if body in state.memories}
+        return median._replace(memories={**median.memories, **own})
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
         return super().rolled_out(*without_channel(game, state), plans, most)
 
-    def planned_again(self, game: Game, memory: Memory, lines: State, rows: Ints) -> Memory:
-        """In the worlds ``rows``, replace the plan in ``memory`` by the cheapest of itself and newly made plans.
-
-        ``lines``: the estimated lines, M rows for each world.
-        """
-        here = part(lines, rows, self.lines.alert.n)
-        median = here.take(np.arange(0, here.n, self.lines.alert.n))
+    def planned_again(self, game: Game, memory: Memory, median: State, rows: Ints) -> Memory:
+        """In the worlds ``rows``, replace the plan in ``memory`` by the cheapest of itself and newly made plans."""
         plan, price = memory.plan.copy(), memory.price.copy()
-        plans = [plan[rows], *self.plans(game, median, median, here)]
-        prices = np.stack([self.price(game, here, each) for each in plans])
-        plan[rows], price[rows] = np.stack(plans)[prices.argmin(axis=0), np.arange(len(rows))], prices.min(axis=0)
+        plan[rows], price[rows] = self.cheapest(game, median, [plan[rows], *self.plans(game, median, median, median)])
         return memory._replace(plan=plan, price=price)
+
+    def infos(self, game: Game, state: State) -> dict[str, Any]:
+        return {**super().infos(game, state), "trusted": state.memories["shield"].members.trusted}
 
 
 class EstimatedEpisodeShield(EpisodeShield):
@@ -113,15 +108,15 @@ class EstimatedEpisodeShield(EpisodeShield):
         bound: str = "coupled",
     ) -> None:
         super().__init__(drivers, harm_count=harm_count, bound=bound)
-        self.lines = lines_of_learner(scenario, corners=False)
+        self.line = line_of_learner(scenario)
 
     def begin(self, game: Game, alert: State, state: State) -> EpisodeMemory:
-        median, _, _ = self.lines.heard(state, opened(game, self.lines.at_alert(alert, state)))
+        median, _ = self.line.heard(state, opened(game, self.line.at_alert(alert, state)))
         game, median = without_channel(game, median)
         return super().begin(game, median, median)
 
 
-class Estimate(NamedTuple):
+class ChoiceMemory(NamedTuple):
     median: State  # line at the last decision
     command: Floats  # [n] m/s2; NaN: none yet
 
@@ -137,16 +132,16 @@ class EstimatedEV2XBM:
     def __init__(self, scenario: Scenario, is_pairwise: bool = False, count: str = "first") -> None:
         self.scenario, self.is_pairwise, self.count = scenario, is_pairwise, count
         self.name = f"e_v2x_bm{':pairwise' if is_pairwise else ''}:estimated"
-        self.lines: dict[int, Lines] = {}  # body -> its median line
+        self.lines: dict[int, MedianLine] = {}  # of each body
 
-    def begin(self, alert: State, body: int) -> Estimate:
+    def begin(self, alert: State, body: int) -> ChoiceMemory:
         check_exact(alert, self.name)
         if body not in self.lines:
-            self.lines[body] = Lines.of(self.scenario, body, corners=False)
+            self.lines[body] = MedianLine.of(self.scenario, body)
         median = self.lines[body].at_alert(alert, alert)._replace(memories={})
-        return Estimate(median, np.full(alert.n, np.nan))
+        return ChoiceMemory(median, np.full(alert.n, np.nan))
 
-    def act(self, state: State, memory: Estimate, body: int) -> tuple[Floats, Estimate]:
+    def act(self, state: State, memory: ChoiceMemory, body: int) -> tuple[Floats, ChoiceMemory]:
         wanted = memory.median.wanted.copy()
         wanted[:, body] = state.wanted[:, body]
         foretold = advanced(memory.median._replace(wanted=wanted), state.time_s)
@@ -157,7 +152,7 @@ class EstimatedEV2XBM:
             choice = pairwise(here, body) if self.is_pairwise else None
             choice = choice or coupled(here, body, self.count, self.scenario.horizon_s)
             command[rows] = -choice.deceleration_mps2
-        return command, Estimate(median, command)
+        return command, ChoiceMemory(median, command)
 
 
 def differ(one: State, other: State) -> Bools:
@@ -174,13 +169,13 @@ def differ(one: State, other: State) -> Bools:
     return np.asarray(~np.all(near, axis=0))
 
 
-def lines_of_learner(scenario: Scenario, corners: bool) -> Lines:
+def line_of_learner(scenario: Scenario) -> MedianLine:
     if len(scenario.learners) != 1:
         raise InvalidInput(
             f"shield: scenario {scenario.name!r} has {len(scenario.learners)} learners; an estimated shield needs"
             " exactly one: make the environment with learners=['vehicle_2'], or use mode step"
         )
-    return Lines.of(scenario, scenario.learners[0], corners=corners)
+    return MedianLine.of(scenario, scenario.learners[0])
 
 
 def make_e_v2x_bm(argument: str | None, settings: Any) -> EstimatedEV2XBM:
@@ -194,11 +189,6 @@ def _entry(make: Any, form: str, about: str) -> Part:
 
 
 STEP = _entry(NamedShield(EstimatedShield), "step:estimated", "certified in the median line that its vehicle estimates")
-CORNERS = _entry(
-    NamedShield(partial(EstimatedShield, corners=True)),
-    "robust:estimated",
-    "also in the corners of the ranges of what was not received",
-)
 EPISODE = _entry(
     NamedShield(EstimatedEpisodeShield, "bound"),
     "episode[:pairwise]:estimated",

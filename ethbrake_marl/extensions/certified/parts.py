@@ -4,7 +4,6 @@ PARTS = {
     "agents": {"e_v2x_bm.estimated": "estimating:E_V2X_BM"},
     "shields": {
         "robust": "robust:ROBUST",
-        "robust.estimated": "estimating:CORNERS",
         "step.estimated": "estimating:STEP",
         "episode.estimated": "estimating:EPISODE",
     },

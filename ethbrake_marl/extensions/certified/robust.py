@@ -34,50 +34,7 @@ class Members(NamedTuple):
     trusted: Bools  # [n] whether everything that was observed was possible
 
 
-class MembersShield(StepShield):
-    """Step shield for worlds whose true state may be any of M states, the *members*."""
-
-    def seen(self, state: State, memory: Memory) -> State:
-        """Return the stored members, M rows for each world, with the present memories of the agents in ``state``."""
-        states = joined(memory.members.states)
-        rows = np.arange(state.n).repeat(states.n // state.n)
-        own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
-        return states._replace(memories={**states.memories, **own})
-
-    def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2; or more than ``most``.
-
-        ``plans``: one for each world. ``caps`` is unused.
-        """
-        M = states.n // len(plans)
-        each = np.broadcast_to(most, len(plans)).repeat(M)
-        return np.asarray(super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1))
-
-    def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Return the step shield's plans, and the constant plan that is best in the worst member.
-
-        ``states``: the members, M rows for each world of ``state``.
-        """
-        learners, n, plans = game.rules.learners, state.n, super().plans(game, alert, state, states)
-        if states.n == n:
-            return plans
-        actions = np.repeat(SHARES[:, np.newaxis], len(learners), axis=1)
-        commands = actions * states.car[:, np.newaxis, BRAKING, learners]
-        harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.count)[0]
-        best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
-        return [*plans, held(game, actions[best])]
-
-    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        applied, memory = super().decide(game, state, proposed, donate=donate)
-        states = joined(memory.members.states)
-        after, _ = game.follow(states, applied.repeat(states.n // state.n, axis=0))
-        return applied, memory._replace(members=memory.members._replace(states=apart(after, state.n)))
-
-    def infos(self, game: Game, state: State) -> dict[str, Any]:
-        return {**super().infos(game, state), "trusted": state.memories["shield"].members.trusted}
-
-
-class RobustShield(MembersShield):
+class RobustShield(StepShield):
     """Shield whose bound holds in the nominal world and in every corner of the intervals around it.
 
     The bound does not hold between the corners. The info ``trusted`` is false once a gap or speed was observed, before
@@ -118,11 +75,45 @@ class RobustShield(MembersShield):
         memory = self.first_memory(game, alert, state, states, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
 
+    def seen(self, state: State, memory: Memory) -> State:
+        """Return the stored members, M rows for each world, with the present memories of the agents in ``state``."""
+        states = joined(memory.members.states)
+        rows = np.arange(state.n).repeat(states.n // state.n)
+        own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
+        return states._replace(memories={**states.memories, **own})
+
+    def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
+        """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2; or more than ``most``.
+
+        ``plans``: one for each world. ``caps`` is unused.
+        """
+        M = states.n // len(plans)
+        each = np.broadcast_to(most, len(plans)).repeat(M)
+        return np.asarray(super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1))
+
+    def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
+        """Return the step shield's plans, and the constant plan that is best in the worst member.
+
+        ``states``: the members, M rows for each world of ``state``.
+        """
+        learners, n, plans = game.rules.learners, state.n, super().plans(game, alert, state, states)
+        if states.n == n:
+            return plans
+        actions = np.repeat(SHARES[:, np.newaxis], len(learners), axis=1)
+        commands = actions * states.car[:, np.newaxis, BRAKING, learners]
+        harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.count)[0]
+        best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
+        return [*plans, held(game, actions[best])]
+
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        members: Members = state.memories["shield"].members
-        trusted = members.trusted & may_be_in(state, members.states)
+        before: Members = state.memories["shield"].members
+        trusted, states = before.trusted & may_be_in(state, before.states), joined(before.states)
         applied, memory = super().decide(game, state, proposed, donate=donate)
-        return applied, memory._replace(members=memory.members._replace(trusted=trusted))
+        after, _ = game.follow(states, applied.repeat(states.n // state.n, axis=0))
+        return applied, memory._replace(members=Members(apart(after, state.n), trusted))
+
+    def infos(self, game: Game, state: State) -> dict[str, Any]:
+        return {**super().infos(game, state), "trusted": state.memories["shield"].members.trusted}
 
 
 def opened(game: Game, alerts: State) -> State:

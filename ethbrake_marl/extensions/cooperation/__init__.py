@@ -1,17 +1,16 @@
-"""What a level of cooperation is worth (``ethbrake study ablate``), and equilibria of several learners."""
+"""What cooperation is worth (``study ablate``), and what sparing one vehicle costs the others (``study front``)."""
 
 from typing import TYPE_CHECKING
 
 from ethbrake_marl.doors import front_door
 
 if TYPE_CHECKING:
-    from ethbrake_marl.extensions.cooperation.equilibria import (
-        Equilibrium as Equilibrium,
-        Spread as Spread,
-        best_joint_harm as best_joint_harm,
-        compare_starts as compare_starts,
-        find_equilibria as find_equilibria,
-        price_of_anarchy as price_of_anarchy,
+    from ethbrake_marl.extensions.cooperation.front import (
+        Front as Front,
+        corners as corners,
+        least_largest as least_largest,
+        search_front as search_front,
+        weight_grid as weight_grid,
     )
     from ethbrake_marl.extensions.cooperation.seeds import (
         mean_over_seeds as mean_over_seeds,

@@ -1,8 +1,13 @@
-"""An ablation: train teams at every level with several seeds, and let all of them drive the same worlds."""
+"""An ablation: train teams at every level with several seeds, drive the same worlds with all, search the optimum.
+
+The *joint optimum* of a level is, in each world, the least known harm or cost that its learners can cause together. It
+depends on worlds, learners and scripts, but not on what the learners know or minimise, so levels that differ only in
+this share one search. A level also uses the best commands of every other level whose commands its learners can give.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import partial
@@ -14,9 +19,10 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, amounts, objectives_of
-from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.evaluate import evaluate
@@ -24,8 +30,11 @@ from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.measures import Given, Measure
 from ethbrake_marl.evaluation.statistics import Clusters
 from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds
+from ethbrake_marl.extensions.search.best_harm import search_list
+from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.extensions.studies.folder import work_in
-from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.motion.layout import FAR_M, GAP, OWN_LATENCY, WEIGHT, Bools, Floats
 from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.progress import OnProgress, Progress
@@ -34,10 +43,12 @@ from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.training import Training
 from ethbrake_marl.worlds.mixture import WORDS
 from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.scenario import Scenario
 
 SETTINGS, JSON, CSV, FIGURE = "settings.json", "ablation.json", "ablation.csv", "ablation.png"
 FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_episodes": 600, "budget": 20_000}
 QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
+ON_GRID = 1e-9  # part of a step by which decisions of two levels may differ
 
 
 @dataclass(frozen=True)
@@ -169,3 +180,83 @@ def minimised(declared: Declared, count: str, game: Game, alert: State, last: St
     """
     each = amounts(objectives_of(declared, last.vehicles), None, last, count)
     return np.asarray(each[:, game.rules.learners - 1].mean(axis=1))
+
+
+class Answer(NamedTuple):
+    scenario: Scenario
+    game: Game
+    worlds: State  # at the alert, in which the joint optimum was searched, [m]
+    searched: BestHarmTable
+    driven: Mapping[str, Sequence[Floats]]  # count -> harm of each trained team, [m]
+
+
+def with_optima(plan: Ablation, measured: Sequence[Measured], threads: int, tell: OnProgress) -> list[Measured]:
+    """Add the joint optimum to the results of each level with a learner. Finished parts of the search are read back."""
+    tables: dict[bytes, BestHarmTable] = {}
+    answers: dict[str, Answer] = {}
+    for one in measured:
+        name, scenario = one.level.name, one.level.scenario
+        if scenario.learners and name not in answers:
+            game, worlds = open_game(scenario)[1], one.worlds.take(slice(plan.search_episodes))
+            identity = problem_of(game, worlds).identity.tobytes()
+            if identity not in tables:
+                say = partial(_tell, tell, f"joint optimum of {name}")
+                folder = plan.folder / "optimum" / name
+                tables[identity] = search_list(
+                    game, worlds, chunks=folder, on_progress=say, counts=[*COLUMN], budget=plan.budget, threads=threads
+                )
+            teams = [each.reached for each in measured if each.level.name == name]
+            driven = {
+                count: [row[: worlds.n] for own in teams for row in own[column]] for count, column in COLUMN.items()
+            }
+            answers[name] = Answer(scenario, game, worlds, tables[identity], driven)
+    best = {
+        name: {count: least_known(answer, answers.values(), count)[np.newaxis] for count in COLUMN}
+        for name, answer in answers.items()
+    }
+    return [each._replace(best=best.get(each.level.name)) for each in measured]
+
+
+def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
+    tell(Progress(name, done, total))
+
+
+def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
+    """Return the least known harm in each world of ``own``, [m] m2/s2. ``answers`` are the results of all levels."""
+    best = np.full(own.worlds.n, np.inf)
+    for other in answers:
+        can = can_imitate(own, other)
+        rows = np.flatnonzero(can)
+        if rows.size:
+            line = other.worlds.line.copy()
+            line[:, :, 0] = own.worlds.line[:, :, 0]  # the obstacle
+            problem = problem_of(other.game, other.worlds._replace(line=line).take(rows))
+            for profiles in other.searched.profiles.values():
+                harm = problem.follow(profiles.take(rows)).harm(count)
+                best[rows] = np.minimum(best[rows], harm)
+            same = rows[other.worlds.line[rows, GAP, 0] == own.worlds.line[rows, GAP, 0]]
+            for driven in other.driven[count]:
+                best[same] = np.minimum(best[same], driven[same])
+    return best
+
+
+def can_imitate(own: Answer, other: Answer) -> Bools:
+    """Return in which worlds the learners of ``own`` can give the commands of the learners of ``other``, [m].
+
+    They can if each learner of ``other`` learns in ``own``, the other vehicles of ``own`` have the same roles, lines
+    and latencies are the same, and each decision time of ``other`` is also one of ``own``. Only ``own`` may have an
+    obstacle, because the commands are simulated again in its worlds.
+    """
+    mine, theirs = own.scenario, other.scenario
+    scripted = [name for name, role in mine.roles.items() if role != "learner"]
+    if not set(theirs.learners) <= set(mine.learners) or any(mine.roles[n] != theirs.roles[n] for n in scripted):
+        return np.zeros(own.worlds.n, np.bool_)
+    rows = [row for row in range(own.worlds.car.shape[1]) if row not in (OWN_LATENCY, WEIGHT)]
+    same = (own.worlds.line[:, :, 1:] == other.worlds.line[:, :, 1:]).all(axis=(1, 2))
+    same &= (own.worlds.car[:, rows, 1:] == other.worlds.car[:, rows, 1:]).all(axis=(1, 2))
+    first, later = (problem_of(each.game, each.worlds).state.clock[:, FIRST_DECISION] for each in (own, other))
+    steps = (later - first) / mine.time_step_s
+    ahead = other.worlds.line[:, GAP, 0]
+    return np.asarray(
+        same & (np.abs(steps - np.rint(steps)) < ON_GRID) & ((ahead == own.worlds.line[:, GAP, 0]) | (ahead >= FAR_M))
+    )

@@ -6,31 +6,57 @@ compares copies of one level that differ in the value of one key.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from decimal import Decimal
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ethbrake_marl.cli.settings import Settings
 from ethbrake_marl.errors import InvalidInput, count_of
-from ethbrake_marl.extensions.cooperation.sweep import Swept, parse_sweep
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.worlds.describe import quantities_of
-from ethbrake_marl.worlds.mixture import WORDS
 from ethbrake_marl.worlds.sampling import Drawn
 from ethbrake_marl.worlds.scenario import Scenario
 
-LADDER = (
-    *("cooperation-0-sensors", "cooperation-1-front", "cooperation-2-paper", "cooperation-3-pair"),
-    "cooperation-4-all",
-)
-STANDARD = (*LADDER, "cooperation-2-blocked")
+STANDARD = ("level-0-sensors", "level-1-messages", "level-2-own", "level-3-line", "level-4-pair", "level-5-all")
 SWEPT = "cooperation-3-pair"  # default level of a sweep
 
 SHARED = ("vehicles", "time_step_s", "horizon_s", "observation")  # keys that are the same at all levels
 MAY_DIFFER = ("obstacle_gap_m", "harm_weight")  # beginnings of columns of the worlds
 SAME_VEHICLES = ("objective", "obstacle_gap_m", "roles", "v2x")  # keys whose sweep leaves the vehicles as they are
+
+MOST = 100  # values of a sweep, such as ``objective=social:0..90:15`` (0, 15, ..., 90 degrees)
+NUMBER = r"-?\d+(?:\.\d+)?"
+ITEM = re.compile(rf"(?P<low>{NUMBER})(?:\.\.(?P<high>{NUMBER}):(?P<step>{NUMBER}))?", re.ASCII)
+WORD = re.compile(r"\s*([A-Za-z][\w-]*:)?", re.ASCII)
+
+
+class Swept(NamedTuple):
+    """The key of a scenario that a sweep varies, with one of its values."""
+
+    key: str  # such as v2x.lost
+    word: str  # text before the number in the value, such as ``social:``; usually empty
+    text: str  # the number
+
+    @property
+    def number(self) -> float:
+        return float(self.text)
+
+    @property
+    def setting(self) -> str:
+        return f"{self.key}={self.word}{self.text}"
+
+    @property
+    def axis(self) -> str:
+        return f"{self.key} = {self.word}…" if self.word else self.key
+
+    @property
+    def label(self) -> str:
+        """Suffix of the level's name, such as ``social-15`` or ``v2x.lost-0.1``."""
+        return f"{self.word.rstrip(':') or self.key}-{self.text}"
 
 
 class Level(NamedTuple):
@@ -46,31 +72,19 @@ class Level(NamedTuple):
 
 
 def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
-    """Load the levels of an ablation, and choose for each the earlier level with which it is compared.
+    """Load the levels of an ablation; each is compared with the previous one.
 
-    A level that differs from an earlier one only in ``v2x`` is compared with that one. The other levels form a ladder,
-    in which each is compared with the previous one. Raises ``InvalidInput`` for fewer than two levels, or one given
-    twice.
+    Raises ``InvalidInput`` for fewer than two levels, or one given twice.
     """
     levels: list[Level] = []
-    ladder: list[Level] = []
     for name in names:
         scenario = settings.change_scenario(name)
         if any(level.name == scenario.name for level in levels):
             raise InvalidInput(f"levels: {scenario.name!r} is given twice; give each level once")
-        clear = next((each for each in ladder if _is_other_channel(scenario, each.scenario)), None)
-        before = clear or (ladder[-1] if ladder else None)
-        levels.append(Level(scenario.name, scenario, before and before.name))
-        if clear is None:
-            ladder.append(levels[-1])
+        levels.append(Level(scenario.name, scenario, levels[-1].name if levels else None))
     if len(levels) < 2:
         raise InvalidInput(f"levels: {count_of(len(levels), 'level')} given; give at least two levels to compare")
     return levels
-
-
-def _is_other_channel(one: Scenario, other: Scenario) -> bool:
-    contents = [each.content(without=("name", *WORDS, "v2x")) for each in (one, other)]
-    return one.v2x != other.v2x and contents[0] == contents[1]
 
 
 def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[TrainingRecipe]) -> list[Level]:
@@ -106,6 +120,38 @@ def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[Tr
         before = levels[-1].name if levels else None
         levels.append(Level(f"{scenario.name}-{value.label}", scenario, before, value))
     return levels
+
+
+def parse_sweep(text: str) -> list[Swept]:
+    """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
+
+    A word may precede the numbers, as in ``objective=social:0..90:15``. Numbers and ranges may be mixed. Raises
+    ``InvalidInput`` for any other text, a range that its step does not divide, a repeated number, and fewer than 2 or
+    more than ``MOST`` numbers.
+    """
+    key, equals, values = (part.strip() for part in text.partition("="))
+    match = WORD.match(values)
+    word, numbers = (match[1] or "" if match else ""), list[Decimal]()
+    for item in values.split(","):
+        parsed = ITEM.fullmatch(item.strip().removeprefix(word).strip())
+        if not (key and equals and parsed):
+            raise InvalidInput(
+                f"--sweep {text!r:.200}: must be KEY=LOW..HIGH:STEP or KEY=A,B,... with numbers, for instance"
+                " objective=social:0..90:15 or v2x.lost=0,0.1,0.3; for other values, give scenarios with --levels"
+            )
+        low, high, step = (Decimal(part or 0) for part in parsed.group("low", "high", "step"))
+        steps = (high - low) / step if step > 0 else Decimal(0)
+        if parsed["step"] is not None and (not 0 < steps < MOST or steps % 1):
+            raise InvalidInput(
+                f"--sweep {key}: range {item.strip()}: a range LOW..HIGH:STEP must go up from LOW to HIGH in 1 to"
+                f" {MOST - 1} equal steps, for instance 0..90:15"
+            )
+        numbers += [low + k * step for k in range(int(steps) + 1)]
+    if not 2 <= len(numbers) <= MOST:
+        raise InvalidInput(f"--sweep {key}: has {count_of(len(numbers), 'number')}; give 2 to {MOST} numbers")
+    if twice := [number for number in numbers if numbers.count(number) > 1]:
+        raise InvalidInput(f"--sweep {key}: {twice[0]} is given twice; give each number once")
+    return [Swept(key, word, f"{number.normalize():f}") for number in sorted(numbers)]
 
 
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Drawn]:

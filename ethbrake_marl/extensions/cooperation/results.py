@@ -1,23 +1,143 @@
-"""Output of an ablation: ``ablation.json``, ``ablation.csv``, the figure, and tables for the terminal."""
+"""Results of an ablation: a comparison of its levels, ``ablation.json``, ``ablation.csv``, the figure, and tables."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from ethbrake_marl.episode.counts import COLUMN, IN_WORDS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, Measured
-from ethbrake_marl.extensions.cooperation.comparison import Json, compare, place_of
-from ethbrake_marl.extensions.cooperation.figures import ablation_figure
-from ethbrake_marl.extensions.report.style import write_picture
+from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
+from ethbrake_marl.extensions.report.style import (
+    GREY,
+    TITLES,
+    finish,
+    in_our_style,
+    new_panels,
+    plain,
+    series_style,
+    write_picture,
+)
 from ethbrake_marl.extensions.studies.machine import this_machine
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
+from ethbrake_marl.motion.layout import Floats
+
+TOLERANCE = 1e-6  # m2/s2; a vehicle counts as worse off if its harm rises by more than this
+LINEAR = 0.1  # m2/s2; axes are linear below this harm and logarithmic above it, because harm varies by a factor of 100
+LEVEL_IN, NARROWEST_IN, WIDEST_IN = 1.05, 5.0, 10.5  # width of a level, and of the figure
+PANEL_IN = 2.8  # height of a panel
+
+Json = dict[str, Any]
+
+
+def compare(measured: Sequence[Measured], searched: int) -> Json:
+    """Return the comparison as plain data.
+
+    - ``levels``: results of each level and algorithm;
+    - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
+    - ``undertrained``: a sentence that names the levels whose trained policies do worse than full braking, if any.
+
+    The joint optimum is known only in the first ``searched`` worlds; comparisons with it use only these.
+    """
+    steps = []
+    for algorithm in dict.fromkeys(each.algorithm for each in measured if each.algorithm is not None):
+        own = {each.level.name: each for each in measured if each.algorithm in (None, algorithm)}
+        steps += [_change(own[each.level.before], each, algorithm) for each in own.values() if each.level.before]
+    goals = [
+        (each, *(own["goal"].mean() for own in (each.reached, each.braking))) for each in measured if each.algorithm
+    ]
+    named = [
+        f"{each.level.name} ({each.algorithm}) with {reached:.2f} ({braking:.2f} with full braking)"
+        for each, reached, braking in goals
+        if reached > braking + TOLERANCE
+    ]
+    return {
+        "kind": "ablate",
+        "levels": [_level(each, searched) for each in measured],
+        "steps": steps,
+        "undertrained": [f"Not trained enough to say anything: {'; '.join(named)}."] if named else [],
+    }
+
+
+def place_of(one: Measured) -> Json:
+    swept = one.level.swept
+    return {"level": one.level.name} | ({} if swept is None else {"swept_number": swept.number})
+
+
+def _level(one: Measured, searched: int) -> Json:
+    scenario = one.level.scenario
+    mean = partial(mean_over_seeds, clusters=one.clusters)
+    entry: Json = {
+        **one.about,
+        **place_of(one),
+        "title": scenario.title,
+        "algorithm": one.algorithm,
+        "before": one.level.before,
+        "learners": [scenario.vehicle_names[body - 1] for body in scenario.learners],
+        "seeds": len(one.reached["collided"]),
+        "worlds": one.reached["collided"].shape[1],
+        "collision_rate": mean(one.reached["collided"]).to_json(),
+    }
+    for count, column in COLUMN.items():
+        reached, braking = one.reached[column], one.braking[column]
+        entry[count] = {
+            "full_brake": mean(braking).to_json(),
+            "harm": mean(reached).to_json(),
+            "each_seed": reached.mean(axis=1).tolist(),
+            "vehicles": [mean(each).to_json() for each in _borne(one, column)],
+            "searched": _beside_optimum(one, count, searched),
+        }
+    return entry
+
+
+def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
+    first = None if one.clusters is None else one.clusters[:searched]
+    reached, braking = one.reached[COLUMN[count]][:, :searched], one.braking[COLUMN[count]][:, :searched]
+    best = None if one.best is None else one.best[count]
+    mean = partial(mean_over_seeds, clusters=first)
+    share = None if best is None else share_over_seeds(reached, braking, best, first)
+    return {
+        "worlds": reached.shape[1],
+        "full_brake": mean(braking).to_json(),
+        "harm": mean(reached).to_json(),
+        "each_seed": reached.mean(axis=1).tolist(),
+        "best_known": None if best is None else mean(best).to_json(),
+        "share_of_possible_reduction": None if share is None else share.to_json(),
+    }
+
+
+def _change(before: Measured, after: Measured, algorithm: str) -> Json:
+    """Return how harm differs between two levels. Seed k is compared with seed k, or with an only seed."""
+    entry: Json = {"algorithm": algorithm}
+    for word, one in (("from", before), ("to", after)):
+        entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}
+    mean = partial(mean_over_seeds, clusters=after.clusters)
+    for count, column in COLUMN.items():
+        new, old = (np.stack(_borne(each, column), axis=2) for each in (after, before))
+        worse = new > old + TOLERANCE
+        entry[count] = {
+            "difference": mean(after.reached[column], before.reached[column]).to_json(),
+            "vehicles": [mean(new[:, :, i], old[:, :, i]).to_json() for i in range(new.shape[2])],
+            "worse_off": mean(worse.any(axis=2)).to_json(),
+            "worse_off_vehicles": worse.mean(axis=(0, 1)).tolist(),
+        }
+    return entry
+
+
+def _borne(one: Measured, column: str) -> list[Floats]:
+    return [one.reached[f"{column}_{i}"] for i in range(1, one.level.scenario.vehicles + 1)]
 
 
 def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, list[Path]]:
@@ -130,3 +250,56 @@ def sheet(title: str, rows: Sequence[Json], columns: Columns) -> Sheet:
 
 def share(heading: str) -> Column:
     return Column(heading, digits=1, scale=100.0, unit=" %")
+
+
+@in_our_style
+def ablation_figure(results: Json, caption: str) -> Figure:
+    """Draw both harms and the honest cost at each level or swept value, with 95 % intervals and a dot for each seed.
+
+    All means are over the worlds in which the joint optimum is known.
+    """
+    levels, swept = results["levels"], results["settings"]["swept"]
+    names = list(dict.fromkeys(level["level"] for level in levels))
+    at = {level["level"]: level.get("swept_number", names.index(level["level"])) for level in levels}
+    unit = (max(at.values()) - min(at.values())) / (len(at) - 1)  # mean distance between neighbours
+    width = min(max(LEVEL_IN * len(at), NARROWEST_IN), WIDEST_IN)
+    figure, panels = new_panels((width, PANEL_IN * len(COLUMN)), rows=len(COLUMN))
+    for axes, count in zip(panels, COLUMN, strict=True):
+        points = [(at[level["level"]], level["algorithm"], level[count]["searched"]) for level in levels]
+        _draw_bounds(axes, points, 0.3 * unit)
+        for number, algorithm in enumerate(results["settings"]["recipes"]):
+            own = [(x + 0.06 * unit * number, each) for x, name, each in points if name in (None, algorithm)]
+            _draw_algorithm(axes, own, unit, algorithm, series_style(1 if number == 0 else number + 3))
+        if swept is None:
+            words = [name.removeprefix("cooperation-").replace("-", "\n", 1) for name in names]
+            axes.set_xticks([at[name] for name in names], words, fontsize=8)
+        if axes.dataLim.ymin < 1.0:
+            axes.set_yscale("symlog", linthresh=LINEAR)
+        axes.yaxis.set_major_formatter(FuncFormatter(plain))
+        axes.set_ylim(0.0, (1.5 if axes.get_yscale() == "symlog" else 1.1) * axes.get_ylim()[1])
+        axes.set(title=TITLES[count], xlabel=swept or "")
+    return finish(figure, " ".join([*results["undertrained"], caption]), panels[0], columns=2, fontsize=8.5)
+
+
+def _draw_bounds(axes: Axes, points: list[tuple[float, str | None, Json]], half: float) -> None:
+    for key, label, colour in (
+        ("full_brake", "full braking", GREY),
+        ("best_known", "joint optimum", series_style(3)["color"]),
+    ):
+        shown = [(x, each[key]["value"]) for x, _, each in points if each[key] is not None]
+        for number, (x, value) in enumerate(shown):
+            name = "" if number else label
+            axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
+
+
+def _draw_algorithm(
+    axes: Axes, own: list[tuple[float, Json]], unit: float, algorithm: str, style: dict[str, Any]
+) -> None:
+    harms = [Estimate(**each["harm"]) for _, each in own]
+    errors = list(zip(*((h.value - h.ends[0], h.ends[1] - h.value) for h in harms), strict=True))
+    look = style | {"linestyle": "none"}
+    axes.errorbar([x for x, _ in own], [h.value for h in harms], yerr=errors, capsize=3, label=algorithm, **look)
+    for x, each in own:
+        dots = each["each_seed"]
+        if len(dots) > 1:
+            axes.scatter([x + 0.05 * unit] * len(dots), dots, s=6, color=style["color"], alpha=0.5, linewidths=0)

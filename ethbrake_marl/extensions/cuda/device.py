@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.cuda.kernels import Mine, play_each
 from ethbrake_marl.extensions.cuda.machine_code import ptx_of
 
 OLDEST = (7, 0)  # compute capability that torch supports, and with it this package
@@ -19,31 +20,27 @@ BLOCK = 128  # threads that a GPU starts together
 
 
 class Kernel(NamedTuple):
-    """A computation for n worlds, one thread for each: its GPU form and its processor form."""
+    """``kernels.play`` for n worlds, one thread for each: its GPU form and its processor form."""
 
-    work: str  # ``play`` or ``search``
-    size: tuple[int, ...]  # which decides ``shapes``
-    shapes: Any  # of a thread's own memory
-    each: Callable[..., None]  # does the work of all threads on a processor, with memory ``mine``
-    mine: Any  # of one thread, arrays
+    size: tuple[int, ...]  # bodies, learners, features, neighbours in view
+    mine: Mine  # memory of one thread, arrays
 
     @property
     def name(self) -> str:
         """Name of the stored machine code: everything that decides it, except the sources."""
-        return "-".join([self.work, *map(str, self.size)])
+        return "-".join(["play", *map(str, self.size)])
 
     def thread(self) -> Callable[..., None]:
-        from ethbrake_marl.extensions.cuda import threads  # numba.cuda is slow to import
+        from ethbrake_marl.extensions.cuda.threads import play_thread  # numba.cuda is slow to import
 
-        made: Callable[..., None] = getattr(threads, f"{self.work}_thread")(self.shapes)
-        return made
+        return play_thread(Mine(*(array.shape for array in self.mine)))
 
     def launch(self, device: torch.device, n: int, *given: Any) -> None:
         """Run n threads. ``given``: tensors on this device, numbers, and tuples of both."""
         if device.type == "cuda":
             _driver(device.index or 0).launch(self, n, given)
         else:
-            self.each(self.mine, *as_arrays(given), n)
+            play_each(self.mine, *as_arrays((*given, n)))  # type: ignore[no-untyped-call]
 
 
 def device_named(name: str) -> torch.device:

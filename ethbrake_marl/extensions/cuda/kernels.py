@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ethbrake_marl.episode.observe import N_NEIGHBOUR, N_OBSTACLE, N_OWN, N_ROLE, observe_worlds
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED
 from ethbrake_marl.episode.step import OUT_ROWS, step_worlds
@@ -74,19 +76,20 @@ class Mine(NamedTuple):
     seen: Any  # float32, all others float64
 
 
-def shapes_of(bodies: int, learners: int, features: int, neighbours: int) -> Mine:
+def memory_of(bodies: int, learners: int, features: int, neighbours: int) -> Mine:
+    """Return the memory of one thread, for a processor."""
     return Mine(
-        line=(1, LINE_ROWS, bodies),
-        car=(1, CAR_ROWS, bodies),
-        clock=(1, CLOCK_COLUMNS),
-        know=(1, bodies, bodies),
-        wanted=(1, bodies),
-        actions=(1, learners),
-        scratch=(ROWS, bodies),
-        out=(OUT_ROWS, 1),
-        reward=(1, bodies - 1),
-        value=(N_OWN + N_NEIGHBOUR * neighbours + N_ROLE + N_OBSTACLE,),
-        seen=(1, learners, features),
+        line=np.zeros((1, LINE_ROWS, bodies)),
+        car=np.zeros((1, CAR_ROWS, bodies)),
+        clock=np.zeros((1, CLOCK_COLUMNS)),
+        know=np.zeros((1, bodies, bodies)),
+        wanted=np.zeros((1, bodies)),
+        actions=np.zeros((1, learners)),
+        scratch=np.zeros((ROWS, bodies)),
+        out=np.zeros((OUT_ROWS, 1)),
+        reward=np.zeros((1, bodies - 1)),
+        value=np.zeros(N_OWN + N_NEIGHBOUR * neighbours + N_ROLE + N_OBSTACLE),
+        seen=np.zeros((1, learners, features), np.float32),
     )
 
 

@@ -1,7 +1,6 @@
-"""GPU kernels: each thread takes memory of its own, and calls a function of ``kernels`` or ``search_kernels``.
+"""The GPU kernel: each thread takes memory of its own, and calls ``kernels.play``.
 
-numba's simulator runs them without a GPU. This module is imported only when needed, because numba.cuda is slow to
-import.
+numba's simulator runs it without a GPU. This module is imported only when needed, because numba.cuda is slow to import.
 """
 
 from __future__ import annotations
@@ -9,10 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from numba import cuda, float32, float64, int64, uint64
+from numba import cuda, float32, float64
 
 from ethbrake_marl.extensions.cuda.kernels import Mine, play
-from ethbrake_marl.extensions.cuda.search_kernels import Own, search
 
 
 def play_thread(shapes: Mine) -> Callable[..., None]:
@@ -40,34 +38,3 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
             play(t, mine, stored, pool, following, actions, results, rules, view, mode)
 
     return play_worlds
-
-
-def search_thread(shapes: Own) -> Callable[..., None]:
-    """Return the GPU kernel that runs ``search`` in n threads. ``shapes`` of their memory are constants of its code."""
-    car, clock, wanted, bounds, shares, at, scratch, lines, tried = shapes[:9]
-    commands, best_commands, change, ends, best_ends, kind, random = shapes[9:]
-
-    def search_worlds(searched: Any, plans: Any, drawing: Any, drawn: Any, budget: Any, n: Any) -> None:
-        t = cuda.grid(1)
-        if t < n:
-            own = Own(
-                cuda.local.array(car, float64),
-                cuda.local.array(clock, float64),
-                cuda.local.array(wanted, float64),
-                cuda.local.array(bounds, float64),
-                cuda.local.array(shares, float64),
-                cuda.local.array(at, float64),
-                cuda.local.array(scratch, float64),
-                cuda.local.array(lines, float64),
-                cuda.local.array(tried, float64),
-                cuda.local.array(commands, float64),
-                cuda.local.array(best_commands, float64),
-                cuda.local.array(change, float64),
-                cuda.local.array(ends, int64),
-                cuda.local.array(best_ends, int64),
-                cuda.local.array(kind, int64),
-                cuda.local.array(random, uint64),
-            )
-            search(t, own, searched, plans, drawing, drawn, budget)
-
-    return search_worlds

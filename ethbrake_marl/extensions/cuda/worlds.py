@@ -22,12 +22,10 @@ from ethbrake_marl.extensions.cuda.kernels import (
     RENEW,
     STEP,
     Looking,
-    Mine,
     Results,
     Ruling,
     Stored,
-    play_each,
-    shapes_of,
+    memory_of,
 )
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.game import AnyScenario
@@ -51,15 +49,7 @@ class Worlds:
     """n episodes on one device, with the bits of ``Game.step``.
 
     An episode that ends is replaced, in the same step, by one in the next world of a pool, which is drawn in advance.
-
-    >>> import torch
-    >>> from ethbrake_marl.extensions.cuda import Worlds
-    >>> worlds = Worlds("paper-random", 64, pool=256, device="cpu")
-    >>> observations = worlds.reset()
-    >>> step = worlds.step(torch.full((64, 1), -1.0))
-    >>> step.observations.shape, step.reward.dtype
-    (torch.Size([64, 1, 27]), torch.float64)
-
+    An example is in docs/extensions/cuda.md.
     """
 
     def __init__(
@@ -253,6 +243,4 @@ def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Lo
     )
     looking = Looking(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
     size = bodies, len(rules.learners), plan.scaling.shape[1], len(plan.offsets)
-    shapes = shapes_of(*size)
-    memory = Mine(*(np.zeros(shape, np.float32 if shape is shapes.seen else np.float64) for shape in shapes))
-    return ruling, looking, Kernel("play", size, shapes, play_each, memory)
+    return ruling, looking, Kernel(size, memory_of(*size))

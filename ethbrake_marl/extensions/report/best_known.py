@@ -12,20 +12,22 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
 
-MEASURES = ("limits", "avoidable")  # names for ``evaluate(measures=...)``
+MEASURES = ("limits", "avoidable", "proven_harm")  # names for ``evaluate(measures=...)``
 BEST = {count: f"best_known_{count}" for count in COLUMN}  # count -> column; not all lists have the honest cost
 AVOIDABLE = "avoidable"  # whether contact is proven avoidable; where it is false, proven unavoidable
+UNAVOIDABLE = "proven_harm_impact"  # whether it is proven that no command avoids an impact
 
 
 class BestKnown(NamedTuple):
     harm: Mapping[str, Floats]  # count -> [n] m2/s2: both harms and, if it is known, the honest cost
     avoidable: Bools | None  # [n] whether contact can be avoided; None: not proven
+    unavoidable: Bools | None = None  # [n] whether it is proven that no command avoids an impact; None: not asked
 
     @classmethod
     def of(cls, result: Result) -> BestKnown | None:
         columns: Mapping[str, Any] = next(iter(result.columns.values()))
         harm = {count: columns[name] for count, name in BEST.items() if name in columns}
-        return cls(harm, columns.get(AVOIDABLE)) if HARM.keys() <= harm.keys() else None
+        return cls(harm, columns.get(AVOIDABLE), columns.get(UNAVOIDABLE)) if HARM.keys() <= harm.keys() else None
 
     @property
     def in_words(self) -> str:
@@ -35,10 +37,10 @@ class BestKnown(NamedTuple):
         )
         if "honest" in self.harm:
             words += f" Mean best known honest cost: {self.harm['honest'].mean():.2f}."
-        if self.avoidable is None:
+        if self.unavoidable is None:
             return words
-        never = 100.0 * (1.0 - float(self.avoidable.mean()))
-        return f"In {never:.1f} % of the worlds, no command avoids contact (proven). {words}"
+        never = 100.0 * float(self.unavoidable.mean())
+        return f"In {never:.1f} % of the worlds, no command avoids an impact (proven). {words}"
 
     def regret(self, result: Result, agent: str, count: str) -> Floats:
         return np.asarray(result[agent][COLUMN[count]] - self.harm[count])

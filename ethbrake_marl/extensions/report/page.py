@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
@@ -27,6 +28,7 @@ SLIM_IN, BROAD_IN = 3.8, 7.5  # a phone shows a slim figure without scrolling; a
 _STYLES = ("page.css", "player.css")
 _SCRIPTS = ("player-motion.js", "player-view.js", "player.js")
 _STAY = "\u00a0"  # no-break space
+_AFTER_SIGN = re.compile(r"(?<=[:+@,/])(?=.)")
 
 
 class Section(NamedTuple):
@@ -47,7 +49,8 @@ def part(name: str, *values: object) -> Markup:
 
 
 def table(sheet: Sheet) -> Markup:
-    return Markup(sheet.html())
+    """Return the table as HTML, with title and note. Pandas, which writes plain tables, is not in the extra."""
+    return part("table", sheet)
 
 
 def drawing(figure: Figure, title: str, description: str) -> Markup:
@@ -84,6 +87,11 @@ def shown(value: object) -> str:
     return value if isinstance(value, Markup) else plain_text(str(value), keep=_STAY)
 
 
+def breakable(name: str) -> Markup:
+    """Return the text with places for line breaks after signs, as in ``e_v2x_bm:pairwise``; HTML stays unchanged."""
+    return name if isinstance(name, Markup) else Markup("<wbr>").join(map(shown, _AFTER_SIGN.split(name)))
+
+
 @cache
 def read_file(name: str) -> str:
     return files(__package__).joinpath(name).read_text("utf-8")
@@ -99,7 +107,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         finalize=shown,
     )
-    environment.filters["sha256"] = _sha256
+    environment.filters |= {"sha256": _sha256, "breakable": breakable}
     environment.filters["anchor"] = lambda title: title.lower().replace(" ", "-")
     return environment
 

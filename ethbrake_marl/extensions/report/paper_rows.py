@@ -50,14 +50,14 @@ PARAMETERS = {
 
 PAPER_NOTE = (
     "The paper's rows contradict the parameters that the paper states. In 62.3 % of the worlds of its random test, no"
-    " command of Vehicle 2 avoids an impact (in 65.1 %, none avoids contact), but the paper's hybrids collide in only"
-    " 59.0 and 59.7 %. In the paper's test of 5,000 worlds, the hybrid avoids 2,005 collisions, although its two"
-    " components together avoid at most 2,000. If Vehicle 2 could act after about 0.2 s instead of the stated 0.5 s,"
-    " full braking would come close to the paper's row (scenario paper-random-early). The paper's harm of E-V2X-BM is"
-    " close to the harm that the pairwise closed form predicts, not to the simulated harm. For the table of 5,000"
-    " worlds, this is true only at the speeds of the random test: at the speeds of the paper's figure of distances, the"
-    " closed form predicts 3.07. Nothing in this package is tuned to these rows. docs/internals/paper.md compares the"
-    " paper's equations, docs/extensions/reproduction.md its figures and tables."
+    " command of Vehicle 2 avoids an impact, but the paper's hybrids collide in only 59.0 and 59.7 %. In the paper's"
+    " test of 5,000 worlds, the hybrid avoids 2,005 collisions, although its two components together avoid at most"
+    " 2,000. If Vehicle 2 could act after about 0.2 s instead of the stated 0.5 s, full braking would come close to"
+    " the paper's row (scenario paper-random-early). The paper's harm of E-V2X-BM is close to the harm that the"
+    " pairwise closed form predicts, not to the simulated harm. For the table of 5,000 worlds, this is true only at"
+    " the speeds of the random test: at the speeds of the paper's figure of distances, the closed form predicts 3.07."
+    " Nothing in this package is tuned to these rows. docs/internals/paper.md compares the paper's equations,"
+    " docs/extensions/reproduction.md its figures and tables."
 )
 
 SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant that PAPER_NOTE mentions

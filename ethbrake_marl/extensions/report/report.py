@@ -1,11 +1,11 @@
-"""The page about compared agents: tables, figures, and episodes to watch."""
+"""The report of an evaluation: its first sentence, tables, figures and worst worlds."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from markupsafe import Markup
@@ -15,15 +15,69 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.statistics import mean, rate
-from ethbrake_marl.evaluation.summary import IDENTITY, SummaryTable
+from ethbrake_marl.evaluation.summary import BASELINE, IDENTITY, SummaryTable
+from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
-from ethbrake_marl.extensions.report.first_sentence import first_sentence
-from ethbrake_marl.extensions.report.harm_figures import harm_above, harm_by_agent
+from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
 from ethbrake_marl.extensions.report.page import Section, drawing, part, table, whole_page
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
+
+LEARNED = ("trained policy", "trained team")  # names that get an article
+COUNTED_WORDS = {  # count -> verb, noun, and what is counted
+    "first": ("does", " harm", "first impacts"),
+    "total": ("does", " harm", "all impacts"),
+    "honest": ("costs", "", "honest cost"),
+}
+
+
+def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
+    """Return the page's first sentence: the harm of the agent ``focus`` compared with full braking.
+
+    It names the tests in which the agent does about as much harm as full braking, or more. ``tests``: title -> results
+    of the same agents in another test.
+    """
+    count, harm = compared.harm_count, COLUMN[compared.harm_count]
+    rows, known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
+    row, before = rows[focus], rows.get(BASELINE)
+    name = "Full braking" if focus == BASELINE else f"The {focus}" if focus in LEARNED else focus
+    best = "" if known is None or count not in known.harm else f"; best known {known.harm[count].mean():.2f}"
+    does, of_harm, what = COUNTED_WORDS[count]
+    if before is None or row is before:
+        total = f"; total harm: {value(row, HARM['total'])}" if count == "honest" else ""
+        return (
+            f"{name} {does} {value(row, harm)} m²/s²{of_harm and ' of'}{of_harm} per emergency ({what}{total}{best})."
+        )
+    change, decrease = change_of(row, harm), row[f"harm_decrease_{count}"]
+    much = "" if decrease is None else f"{abs(100.0 * decrease.value):.0f} % "  # None: full braking does none
+    words = f"about as much{of_harm} as" if change == "as much" else f"{much}{change}{of_harm} than"
+    numbers = f"{what}: {value(row, harm)} m²/s² per emergency instead of {value(before, harm)}{best}"
+    if count == "honest":
+        numbers += f"; total harm: {value(row, HARM['total'])} instead of {value(before, HARM['total'])}"
+    fails = []
+    for title, other in tests.items():
+        there = {each.agent: each for each in other.table}
+        if {focus, BASELINE} <= there.keys() and (worse := change_of(there[focus], harm)) != "less":
+            instead = f"{value(there[focus], harm)} instead of {value(there[BASELINE], harm)}"
+            fails.append(f"{worse} in the {title.lower()} ({instead})")
+    joined = ", but " if change == "less" else ", and "
+    return f"{name} {does} {words} full braking ({numbers}){joined * bool(fails)}{' and '.join(fails)}."
+
+
+def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
+    """Return how an agent's harm differs from full braking's: "as much" if the 95 % interval contains 0."""
+    difference = row[f"{harm}_difference"]
+    if difference is None or (difference.interval is None and row.episodes > 1):
+        return "as much"
+    low, high = difference.ends
+    return "less" if high < 0.0 else "more" if low > 0.0 else "as much"
+
+
+def value(row: SummaryRow, key: str) -> str:
+    return Column("").show(row[key]).value
+
 
 SHORT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the first table, if they are shown
 WORDS = {
@@ -105,8 +159,8 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}
     if known is not None:
         columns |= {f"Best known, {count}": known.harm[count] for count in counts if count in known.harm}
-        if known.avoidable is not None:
-            columns["Contact"] = np.where(known.avoidable, "avoidable", "unavoidable")
+        if known.unavoidable is not None:
+            columns["An impact is"] = np.where(known.unavoidable, "unavoidable", "perhaps avoidable")
     columns["Impacts"] = result[focus]["impacts"]
     rows = []
     for k in worst_rows(compared, focus).tolist():
@@ -128,13 +182,13 @@ def avoidable_section(compared: Compared) -> Section:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
         return Section("World by world", [drawing(figure, "Harm", words)])
     body: list[str] = []
-    if known.avoidable is not None:
-        share = rate(known.avoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
+    if known.unavoidable is not None:
+        share = rate(known.unavoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
-            f"Contact can be avoided in {share} of the worlds. In the other worlds, no command can avoid it (both"
-            " proven for each world)."
+            f"An impact is unavoidable in {share} of the worlds: it is proven for each of them that no command avoids"
+            " an impact."
         )
-        for where, among in (("Contact avoidable", known.avoidable), ("Contact unavoidable", ~known.avoidable)):
+        for where, among in (("Impact unavoidable", known.unavoidable), ("Other worlds", ~known.unavoidable)):
             if among.any():
                 body.append(table(_harm_among(compared, known, where, among)))
     words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."

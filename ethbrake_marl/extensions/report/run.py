@@ -1,4 +1,4 @@
-"""The report of ``ethbrake run``: a page, three pictures, and the results of the policy in the other two tests."""
+"""The report of a run: training, the three tests, learners, and the paper's table."""
 
 from __future__ import annotations
 
@@ -17,12 +17,10 @@ from ethbrake_marl.evaluation.captions import caption
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.results import write_results
+from ethbrake_marl.evaluation.statistics import difference, mean
 from ethbrake_marl.evaluation.summary import BASELINE
 from ethbrake_marl.extensions.report.best_known import MEASURES
-from ethbrake_marl.extensions.report.curves import curves_figure
-from ethbrake_marl.extensions.report.episode_figure import trajectories
-from ethbrake_marl.extensions.report.harm_figures import harm_against_total_gap
-from ethbrake_marl.extensions.report.learners import learners_sheets
+from ethbrake_marl.extensions.report.figures import curves_figure, harm_against_total_gap, trajectories
 from ethbrake_marl.extensions.report.page import Section, drawing, table
 from ethbrake_marl.extensions.report.paper_rows import (
     HYBRID_TEST,
@@ -35,13 +33,12 @@ from ethbrake_marl.extensions.report.report import Report, Test
 from ethbrake_marl.extensions.report.style import TITLES, write_picture
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests, title_of
 from ethbrake_marl.files.plain import read_object
-from ethbrake_marl.files.sheet import Estimate, Sheet
+from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.names import open_game
 from ethbrake_marl.progress import OnProgress, Progress
-from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables
+from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables, without
 from ethbrake_marl.training.run import RunFolder
 
-MOST_WORLDS = 2_000  # of each of the other two tests
 PAGE = "report.html"
 
 
@@ -62,8 +59,7 @@ class RunReport:
             begin(f"the same policy in {test.name}")
             with warnings.catch_warnings():  # the page says that the policy was not trained for this test
                 warnings.simplefilter("ignore", Unfamiliar)
-                few = min(compared.result.n, MOST_WORLDS)
-                others[test.name] = experiment.in_another(test, few, TEAM_BASELINES, Tables.measures)
+                others[test.name] = experiment.in_another(test, compared.result.n, TEAM_BASELINES, Tables.measures)
             write_results(folder, others[test.name].table, name=f"results-{test.name}.json", force=True)
         learners = [] if single else learners_sheets(compared)
         begin("figures")
@@ -181,3 +177,38 @@ def page_of(
         tests={title_of(test): Test(TESTS[test], other) for test, other in others.items()},
         remarks=[stopped] if trained.status == "interrupted" else (),
     )
+
+
+def learners_sheets(compared: Compared) -> list[Sheet]:
+    return [*(_borne(compared, count) for count in _counts(compared)), _added(compared)]
+
+
+def _counts(compared: Compared) -> list[str]:
+    return [*dict.fromkeys([*HARM, compared.harm_count])]
+
+
+def _borne(compared: Compared, count: str) -> Sheet:
+    scenario, by = compared.scenario, compared.result.clusters
+    names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
+    columns = [Column("Agent", "agent", text=True)]
+    columns += [Column(heading, interval="hidden") for heading in (*names, "Whole line")]
+    endings = [*(f"_{i + 1}" for i in range(len(names))), ""]
+    rows: list[Row] = [
+        (agent, *(mean(own[COLUMN[count] + ending], by) for ending in endings))
+        for agent, own in compared.result.columns.items()
+    ]
+    learn = ", ".join(names[body - 1] for body in scenario.learners)
+    return Sheet(f"Who bears what: {IN_WORDS[count]}, mean per world (m²/s²)", columns, rows, f"{learn} learn.")
+
+
+def _added(compared: Compared) -> Sheet:
+    result, counts, rows = compared.result, _counts(compared), list[Row]()
+    for name in (compared.scenario.vehicle_names[body - 1] for body in compared.scenario.learners):
+        pairs = ((result[without(name)][COLUMN[count]], result[TEAM][COLUMN[count]]) for count in counts)
+        rows.append((name, *(difference(less, whole, result.clusters) for less, whole in pairs)))
+    columns = [Column("Learner", text=True)]
+    columns += [Column(IN_WORDS[count].capitalize(), sign="+") for count in counts]
+    about = (
+        "How much more harm there is without it: the vehicle brakes fully, and the others were not trained for that."
+    )
+    return Sheet("What each learner adds, mean per world (m²/s²)", columns, rows, about)

@@ -27,9 +27,7 @@ def reproduce_command(
     quick: Annotated[
         bool, typer.Option("--quick", help="Use shipped policies; train only one that has not converged (default).")
     ] = False,
-    full: Annotated[
-        bool, typer.Option("--full", help="Also train by the paper's own process, and search over the readings.")
-    ] = False,
+    full: Annotated[bool, typer.Option("--full", help="Also train by the paper's own process.")] = False,
     policies: Annotated[
         str, typer.Option(metavar="NAME=AGENT,...", help="Agents in place of the shipped policies: ppo=policy@RUN.")
     ] = "",
@@ -84,8 +82,7 @@ def chosen_policies(text: str) -> dict[str, str]:
     Raises ``InvalidInput`` if one cannot drive here.
     """
     from ethbrake_marl.extensions.reproduction.random_test import SHIPPED, WORLDS, drive_all
-    from ethbrake_marl.extensions.reproduction.readings import STATED
-    from ethbrake_marl.extensions.reproduction.search import NEAREST
+    from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
 
     replaced = dict[str, str]()
     for part in filter(None, text.split(",")):

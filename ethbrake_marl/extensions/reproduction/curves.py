@@ -8,13 +8,12 @@ from itertools import pairwise
 import numpy as np
 
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.report.curves import curves_figure
+from ethbrake_marl.extensions.report.figures import curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.learning import unconverged
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, WORLDS, opened
-from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
-from ethbrake_marl.extensions.reproduction.search import NEAREST
+from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import (
     COUPLED,
     MAP_STEP_S,

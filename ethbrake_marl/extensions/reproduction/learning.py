@@ -16,7 +16,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import RULES
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.report.curves import curves_figure, over_seeds
+from ethbrake_marl.extensions.report.figures import curves_figure, over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge

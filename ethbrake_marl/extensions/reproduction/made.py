@@ -22,7 +22,7 @@ POLICIES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5
 @dataclass(frozen=True)
 class Settings:
     folder: Path  # of all results, and of the trainings
-    full: bool = False  # train by the paper's own process, and search over the readings
+    full: bool = False  # train by the paper's own process
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
     tell: OnProgress = lambda progress: None
     policies: Mapping[str, str] = field(default_factory=lambda: SHIPPED)  # name -> spec

@@ -1,6 +1,6 @@
 """The paper's random test (``Table:Random``) under a reading: collision rate and mean harm of its four strategies.
 
-A row of the table depends only on some fields of a reading, so readings that share these are simulated once.
+A simulation depends only on some fields of a reading, so readings that share these are simulated once.
 """
 
 from __future__ import annotations
@@ -27,17 +27,11 @@ from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 VEHICLE_2 = 2  # body
-NON_E, E_V2X_BM, HYBRID_SAC, HYBRID_PPO = "Non-E", "E-V2X-BM", "Hybrid SAC", "Hybrid PPO"  # rows of the paper
+NON_E, E_V2X_BM, HYBRID_SAC, HYBRID_PPO = ROWS = "Non-E", "E-V2X-BM", "Hybrid SAC", "Hybrid PPO"  # of the paper
 SHIPPED: Mapping[str, str] = MappingProxyType({"PPO": "ppo", "SAC": "sac"})  # specs of the policies
 
 WORLDS = ("base", "acts_s", "rear_s", "step_s", "restitution", "others", "seed")  # fields that change worlds, physics
 PLANS = ("base", "acts_s", "rear_s", "others", "seed", "plans_as_stated", "star")  # that change what E-V2X-BM plans
-DEPENDS = {  # row -> fields on which it depends
-    NON_E: (*WORLDS, "counted", "after_impact"),
-    E_V2X_BM: (*WORLDS, *PLANS, "counted", "baseline"),
-    HYBRID_SAC: (*WORLDS, *PLANS, "counted", "hybrid"),
-    HYBRID_PPO: (*WORLDS, *PLANS, "counted", "hybrid"),
-}
 
 SHORT_STEP_S = 0.02  # between decisions, where what follows an impact begins at the next decision
 
@@ -56,14 +50,9 @@ def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIP
 
     ``policies``: agent names of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the coupled H* in the paper's map.
     """
-    specs = {HYBRID_SAC: policies["SAC"], HYBRID_PPO: policies["PPO"]}
-    return {row: estimate(row, reading.only(*DEPENDS[row]), episodes, specs.get(row, "")) for row in DEPENDS}
-
-
-@cache
-def estimate(row: str, reading: Reading, episodes: int, spec: str) -> tuple[Estimate, Estimate]:
-    collided, harm = reported(row, reading, episodes, spec)
-    return rate(collided), mean(harm)
+    specs = "", "", policies["SAC"], policies["PPO"]
+    outcomes = {row: reported(row, reading, episodes, spec) for row, spec in zip(ROWS, specs, strict=True)}
+    return {row: (rate(collided), mean(harm)) for row, (collided, harm) in outcomes.items()}
 
 
 def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
@@ -108,7 +97,7 @@ def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tu
     return collided, predicted if numbers == "predicted harm, realised collisions" else harm
 
 
-@lru_cache(16)  # a search needs the worlds of one reading, and those for which E-V2X-BM plans
+@lru_cache(16)  # a table needs the worlds of one reading, and those for which E-V2X-BM plans
 def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
     scenario, game = open_game(worlds.scenario(worlds.base))
     return scenario, game, scenario.sample(episodes, worlds.seed)

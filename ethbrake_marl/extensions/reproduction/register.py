@@ -5,15 +5,19 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
 from ethbrake_marl.extensions.reproduction.made import Made, Settings
-from ethbrake_marl.extensions.reproduction.random_test import DEPENDS, table_of
-from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
-from ethbrake_marl.extensions.reproduction.search import NEAREST, distance, numbers_of
+from ethbrake_marl.extensions.reproduction.random_test import ROWS, Table, table_of
+from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
 from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.progress import Progress
 
 WORLDS = 2_000
+PRINTED = np.array([(row.collision_rate, row.average_harm) for row in RANDOM_TEST])  # [4, 2]
 
 
 class Gap(NamedTuple):
@@ -87,6 +91,16 @@ COMBINED = Gap("several at once", "", "", (
 ))  # fmt: skip
 
 
+def numbers_of(table: Table) -> Floats:
+    """Return collision rate and mean harm of the four rows, [4, 2]; the other printed numbers follow from them."""
+    return np.array([[each.value for each in row] for row in table.values()])
+
+
+def distance(numbers: Floats, printed: Floats = PRINTED) -> float:
+    """Return the root mean square of the relative differences of a table's eight numbers, ours / printed - 1."""
+    return float(np.sqrt(np.square(numbers / printed - 1.0).mean()))
+
+
 def reproduce_gaps(settings: Settings) -> Made:
     episodes = min(WORLDS, settings.episodes)
     asked = [(DEFAULTS, STATED), *((gap, each) for gap in (*GAPS, COMBINED) for each in gap.alternatives)]
@@ -95,21 +109,19 @@ def reproduce_gaps(settings: Settings) -> Made:
         settings.tell(Progress("open quantities", number, len(asked)))
         table = table_of(reading, episodes, settings.policies)
         rates, harms = zip(*table.values(), strict=True)
-        rows.append(
-            (gap.name, reading.name, float(distance(numbers_of(table))), *harms, *(rate.value for rate in rates))
-        )
+        rows.append((gap.name, reading.name, distance(numbers_of(table)), *harms, *(rate.value for rate in rates)))
     register = [
         (gap.name, gap.paper, gap.ours, "; ".join(each.name for each in gap.alternatives) or gap.otherwise)
         for gap in GAPS
     ]
-    collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in DEPENDS]
+    collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in ROWS]
     note = (
         f"{episodes:,} worlds. Distance: root mean square of ours / printed - 1 over the eight numbers. Then mean harm"
         f" (m²/s²) with its 95 % interval, and the collision rate. {settings.who_drives} They are not trained anew for"
         " an alternative."
     )
     far = replace(PERCENT, heading="Distance")
-    columns: list[Column | str] = ["Quantity", "Value", far, *map(Column, DEPENDS), *collisions]
+    columns: list[Column | str] = ["Quantity", "Value", far, *map(Column, ROWS), *collisions]
     sheets = [
         Sheet(
             "Register of what the paper leaves open",

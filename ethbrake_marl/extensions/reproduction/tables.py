@@ -11,8 +11,7 @@ from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST,
 from ethbrake_marl.extensions.reproduction.learning import unconverged
 from ethbrake_marl.extensions.reproduction.made import Made, Settings
 from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, NON_E, SHIPPED, Outcome, reported
-from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
-from ethbrake_marl.extensions.reproduction.search import NEAREST
+from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import (
     COUPLED,
     MAP_STEP_S,

@@ -13,8 +13,7 @@ from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
 from ethbrake_marl.extensions.reproduction.learning import process
 from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
-from ethbrake_marl.extensions.reproduction.readings import STATED, Reading
-from ethbrake_marl.extensions.reproduction.search import NEAREST
+from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Outcome
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats

@@ -13,10 +13,10 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.extensions.search.best_harm import BUDGET, commands_of, e_v2x_bm_profiles
-from ethbrake_marl.extensions.search.pricing import Problem, problem_of
+from ethbrake_marl.extensions.search.pricing import Problem, problem_of, with_braking
 from ethbrake_marl.extensions.search.search import refine, search_profiles
 from ethbrake_marl.extensions.search.tables import best_known, outdated_tables
-from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import AgentSettings, make_agent
 from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.game import game_of
@@ -138,9 +138,8 @@ def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
                 f"scenario {scenario.name!r}: vehicle_{other} is driven by {role!r}, whose commands are not known at"
                 " the alert; a search needs scripts that hold one command"
             )
-    others, wanted = [each for each in scenario.learners if each != body], alert.wanted.copy()
-    wanted[:, others] = -alert.car[:, BRAKING][:, others]
-    return game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {})[1], alert._replace(wanted=wanted)
+    others = [each for each in scenario.learners if each != body]
+    return game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {})[1], with_braking(alert, others)
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:

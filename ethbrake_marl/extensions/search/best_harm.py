@@ -18,7 +18,7 @@ from ethbrake_marl.episode.objectives import Declared
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.search.extremes import extreme_profiles
-from ethbrake_marl.extensions.search.pricing import Problem, Profiles, best_of, problem_of
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, beside_braking, best_of, problem_of
 from ethbrake_marl.extensions.search.search import compact, search_profiles
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
@@ -85,12 +85,9 @@ def _searched(
     game: Game, alert: State, problem: Problem, given: Sequence[Profiles], objective: Declared, effort: dict[str, int]
 ) -> tuple[Profiles, dict[str, Floats]]:
     starts, bodies = starting_profiles(problem, alert, given), problem.bodies.tolist()
-    for c, body in enumerate(bodies if len(bodies) > 1 else ()):
-        own = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)
-        best, _ = _searched(game, alert, own, (), objective, effort)
-        commands = np.repeat(problem.bounds[:, np.newaxis, :, 0], best.ends.shape[1], axis=1)
-        commands[:, :, c] = best.commands_mps2[:, :, 0]
-        starts.append(Profiles(best.ends, commands))
+    for body in bodies if len(bodies) > 1 else ():
+        alone = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)
+        starts.append(beside_braking(problem, alone, _searched(game, alert, alone, (), objective, effort)[0]))
     return search_profiles(problem, starts, **effort)
 
 

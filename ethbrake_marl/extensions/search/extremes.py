@@ -58,16 +58,6 @@ def extreme_profiles(problem: Problem) -> Profiles:
 
 
 @large
-def meeting_of(at, kind, change):
-    """Return when (s) a vehicle that changes its command at ``change`` (s) meets its neighbour; infinite: never.
-
-    ``kind`` 0 first drives, then meets the front vehicle; 1 first brakes, then meets the rear vehicle. ``at``: one
-    world (``proofs.line``).
-    """
-    return meet_front(at, change) if kind == 0 else meet_rear(at, change)
-
-
-@large
 def write_extreme(kind, change, meeting, early, share, step, last, low, high, ends, commands):
     """Write the extreme profile that changes its command at ``change`` (s) and at ``meeting`` (s).
 
@@ -92,7 +82,7 @@ def write_extreme(kind, change, meeting, early, share, step, last, low, high, en
 def write_extremes(at, kind, changes, step, last, low, high, ends, commands):
     row = 0
     for change in changes:
-        meeting = meeting_of(at, kind, change)
+        meeting = meet_front(at, change) if kind == 0 else meet_rear(at, change)  # s; infinite: never
         for early, share in WAYS:
             write_extreme(kind, change, meeting, early, share, step, last, low, high, ends[row], commands[row])
             row += 1

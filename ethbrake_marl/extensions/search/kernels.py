@@ -2,7 +2,7 @@
 
 A profile has ``ends`` [K], the decisions at which its phases end, and ``commands`` [K, B] (m/s2). Each world has a
 random stream of its own, so its result does not depend on other worlds. *Plans* are profiles with one phase for each
-decision. No function of NumPy is used, so the kernels also compile for a GPU.
+decision.
 """
 
 from __future__ import annotations

@@ -268,8 +268,7 @@ def problem_of(
                 f"scenario {game.name!r}: vehicle_{body} is driven by {getattr(script, 'name', script)!r}, whose"
                 " commands are not known at the alert; a search needs scripts that hold one command"
             )
-    wanted = alert.wanted.copy()
-    wanted[:, game.rules.learners] = -alert.car[:, BRAKING][:, game.rules.learners]
+    wanted = with_braking(alert, game.rules.learners).wanted
     wanted[:, chosen] = 0.0
     dt, horizon_s, most_steps = game.rules.time_step_s, game.rules.horizon_s, game.rules.most_steps
     decide = chosen if deciders is None else np.array(deciders, np.int64)
@@ -278,6 +277,28 @@ def problem_of(
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST, END]]]
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack(times))
     return aimed(Problem(chosen, state, dt, count, WHOLE, shares, identity), objective)
+
+
+def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
+    """Return worlds at the alert in which some vehicles brake fully, whatever their roles say."""
+    wanted = alert.wanted.copy()
+    wanted[:, bodies] = -alert.car[:, BRAKING][:, bodies]
+    return alert._replace(wanted=wanted)
+
+
+def beside_braking(problem: Problem, alone: Problem, profiles: Profiles) -> Profiles:
+    """Return profiles of all controlled vehicles of a problem: one follows ``profiles``, the others brake fully.
+
+    ``alone``: the problem of this one vehicle, in the same worlds. Its first decision may be later, because its latency
+    is longer; if its decisions are not also decisions of ``problem``, they are rounded to the nearest ones.
+    """
+    later = alone.state.clock[:, FIRST_DECISION] - problem.state.clock[:, FIRST_DECISION]
+    last = problem.last_step[:, np.newaxis]
+    ends = np.minimum(profiles.ends + np.rint(later / problem.time_step_s).astype(np.int64)[:, np.newaxis], last)
+    ends[:, -1:] = last
+    commands = np.repeat(problem.bounds[:, np.newaxis, :, 0], ends.shape[1], axis=1)
+    commands[:, :, problem.bodies == alone.bodies[0]] = profiles.commands_mps2
+    return Profiles(ends, commands)
 
 
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:

@@ -17,10 +17,11 @@ from ethbrake_marl.motion.layout import Floats, Ints, scratch_for
 DRAWN_SHARE = 0.35  # part of the budget for given and random profiles,
 ROUNDS_SHARE = 0.50  # for rounds of improvement, each of which halves the field,
 STEPWISE_SHARE = 0.02  # for the last one, step by step, which takes several times longer,
-POLISHING_SHARE = 0.2  # and for changes at every decision
+POLISHING_SHARE = 0.2  # and for changes at every decision; half as many more of several decisions at once follow
 PER_PROFILE = 400  # the first field has one profile for this part of the budget,
 SMALLEST_FIELD, LARGEST_FIELD = 4, 128  # but at least and at most so many
 SAME = 1e-6  # profiles whose values (m2/s2) are closer count as the same
+LONGEST_TOGETHER = 50  # decisions that polishing changes at once
 ATTENTION_STEPS = 30  # phases are halved within this number of steps from the first decision
 
 # of a search around commands
@@ -41,7 +42,8 @@ def search_profiles(
 
     It is at least as good as each of the profiles ``given``, [n * Q] each: first the Q profiles of world 0, and so on.
     ``budget`` is about the number of profiles that are simulated in each world. The result does not depend on the
-    number of threads. At last the best is polished: its commands are changed at every decision.
+    number of threads. At last the best is polished: its commands are changed at every decision, of one vehicle also at
+    several decisions at once.
 
     Raises ``InvalidInput`` for a bad number, and ``PhysicsError`` for worlds in which no profile can be simulated.
     """
@@ -62,6 +64,9 @@ def search_profiles(
         world, room = prepared(problem, k, random, last, True)
         each, mine = np.arange(1, last + 1), np.ascontiguousarray(best.take([k]).stepwise(last)[0])
         _, active = improve(world, room, each, mine, polishing, PROFILES, 0.0)
+        if len(problem.bodies) == 1 and active > 0:
+            together = np.array([PLAN, last, LONGEST_TOGETHER, 1])
+            _, active = improve(world, room, each, mine, polishing // 2, together, 0.0)
         each[max(active - 1, 0) :] = last
         return compact(each, mine)
 

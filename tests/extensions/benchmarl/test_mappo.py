@@ -29,7 +29,7 @@ SMALL = {"n_envs": 16, "n_steps": 16, "batch_size": 128, "network": {"policy": [
         (["--recipe", "sac"], False, "recipe 'sac': is for SAC; MAPPO needs one for PPO"),
         (["--steps", "-5"], False, "total_steps = -5: must be greater than or equal to 1"),
         (["--output", "there"], True, "there: already exists"),
-        (["--scenario", "cooperation-0-sensors"], False, "has no learner"),
+        (["--scenario", "level-0-sensors"], False, "has no learner"),
     ],
 )
 def test_program__refuses_what_cannot_be_before_it_trains(

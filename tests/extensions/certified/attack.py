@@ -7,11 +7,8 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.certified.estimating import EstimatedShield
 from ethbrake_marl.extensions.certified.robust import RobustShield, opened
 from ethbrake_marl.names import open_game
-from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.scenario import Scenario
 from tests.shields.attack import LINES, WAYS
 
 UNCERTAINTIES = {
@@ -22,33 +19,6 @@ UNCERTAINTIES = {
     "gaps_m=1,latency_s=0.2": "follower",
     "gaps_m.pair_1=2,braking_capacity_mps2.vehicle_3=10%": "pair",
     "speeds_mps.vehicle_2=1,mass_t.vehicle_1=30%,driving_capacity_mps2=10%": "all",
-}
-
-BASE = load_scenario("cooperation-2-paper").replace(early_impacts="keep")
-NEVER_HEARD = BASE.replace(
-    gaps_m=[{"choice": [5.13, 9.71]}, {"choice": [5.37, 9.58]}],
-    speeds_mps=[{"choice": [18.23, 21.87]}, {"choice": [18.11, 21.93]}, {"choice": [18.41, 22.19]}],
-    v2x={"preset": "paper", "hears": "front"},
-    mass_t=[4.5, 5.5, {"choice": [3.0, 9.0]}],
-)
-CHANCE = {"preset": "congested", "lost": 0.0}  # vehicle_3 reacts after the latest message
-LATE = {"link_latency_s": 0.6, "senses": "front", "sensing_s": [3, 3]}
-ENDS: dict[str, Scenario] = {  # every unknown quantity is one of two numbers, so each world is a corner
-    "never heard": NEVER_HEARD,
-    "heard at the first decision": NEVER_HEARD.replace(v2x=LATE, latency_s=[0.0, 0.2, 0.6]),
-    "old news": NEVER_HEARD.replace(v2x={**LATE, "persistence": "periodic"}, latency_s=[0.0, 0.2, 0.6]),
-    "heard later": NEVER_HEARD.replace(v2x=CHANCE, latency_s=[0.0, 0.2, 6.0]),
-    "old news later": NEVER_HEARD.replace(v2x={**CHANCE, "persistence": "periodic"}, latency_s=[0.0, 0.2, 6.0]),
-    "no capacity": NEVER_HEARD.replace(
-        v2x={"preset": "paper", "tells": ["place", "speed", "acceleration", "latency"]},
-        braking_capacity_mps2=[{"choice": [5.13, 7.21]}, 7.0, {"choice": [5.41, 8.23]}],
-        speeds_mps=[{"choice": [18.23, 21.87]}, 20.3, {"choice": [18.41, 22.19]}],
-    ),
-    "early impacts": NEVER_HEARD.replace(
-        gaps_m=[{"choice": [1.13, 2.71]}, {"choice": [0.37, 0.58]}], latency_s=[0.0, 1.2, 0.5]
-    ),
-    "build-up": NEVER_HEARD.replace(brake_rate_mps3=15.0, release_rate_mps3=25.0),
-    "obstacle": NEVER_HEARD.replace(obstacle_margin_m=1.7, mass_t=[4.5, 5.5, 5.9]),
 }
 
 
@@ -111,10 +81,3 @@ def robust(intervals: str, count: str, way: str, n: int, seed: int) -> Episodes:
     shield = Wrongly(nominal, uncertainty=intervals, harm_count=count)
     truth = shield.uncertainty.draw(nominal, rng, corners=True)
     return attacked(game, truth, shield, count, way, seed)
-
-
-def estimated(name: str, count: str, way: str, n: int, seed: int, corners: bool = True) -> Episodes:
-    """True worlds that are corners of the scenario's ranges."""
-    scenario, game = open_game(ENDS[name])
-    shield = EstimatedShield(scenario=scenario, harm_count=count, corners=corners)
-    return attacked(game, scenario.sample(n, seed), shield, count, way, seed)

@@ -9,11 +9,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COLUMN
-from ethbrake_marl.extensions.cooperation.ablation import Measured
-from ethbrake_marl.extensions.cooperation.comparison import compare
+from ethbrake_marl.extensions.cooperation.ablation import Answer, Measured, can_imitate, least_known
 from ethbrake_marl.extensions.cooperation.levels import Level
-from ethbrake_marl.extensions.cooperation.optimum import Answer, can_imitate, least_known
-from ethbrake_marl.extensions.cooperation.results import levels_csv
+from ethbrake_marl.extensions.cooperation.results import compare, levels_csv
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.motion.layout import FAR_M, GAP
 from tests.fixtures.commands import Command
@@ -37,12 +35,12 @@ def measured(level: str, vehicles: list[list[float]], algorithm: str | None, bra
 
 
 def test_change__says_who_is_worse_off_and_by_how_much() -> None:
-    before = measured("cooperation-0-sensors", [[2, 4, 0], [0, 6, 0], [1, 1, 0], [0, 0, 0]], None)
+    before = measured("level-0-sensors", [[2, 4, 0], [0, 6, 0], [1, 1, 0], [0, 0, 0]], None)
     after = measured(
         "cooperation-1-front", [[1, 2, 3], [0, 2, 0], [1, 2, 0], [0, 0, 0]], "ppo", None, before.level.name
     )
     (step,) = compare([before, after], 4)["steps"]
-    assert (step["from"], step["to"], step["algorithm"]) == ("cooperation-0-sensors", "cooperation-1-front", "ppo")
+    assert (step["from"], step["to"], step["algorithm"]) == ("level-0-sensors", "cooperation-1-front", "ppo")
     for count in COLUMN:
         change = step[count]
         assert change["difference"]["value"] == pytest.approx((0 - 4 + 1 + 0) / 4)
@@ -115,7 +113,7 @@ def test_ablation__trains_compares_and_goes_on(
 ) -> None:
     draw_nothing(monkeypatch)
     small = "--seeds 2 --steps 128 --episodes 12 --search-episodes 2 --set horizon_s=7 --set rules=honest"
-    line = f"study ablate --levels cooperation-0-sensors,cooperation-2-paper,cooperation-3-pair --recipes {tiny_recipe}"
+    line = f"study ablate --levels level-0-sensors,cooperation-2-paper,cooperation-3-pair --recipes {tiny_recipe}"
     assert ethbrake(*line.split(), *small.split(), "--output", "out").status == 0
     out, found = Path("out"), json.loads(Path("out/ablation.json").read_text())
     assert {path.name for path in out.glob("ablation*")} == {"ablation.json", "ablation.csv", "ablation.png"}

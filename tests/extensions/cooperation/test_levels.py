@@ -1,5 +1,6 @@
 """Levels and sweeps: what they are, and what is refused before any work."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -7,14 +8,14 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.cli.settings import read_settings
 from ethbrake_marl.extensions.cooperation.levels import (
-    LADDER,
     STANDARD,
     Level,
     common_worlds,
+    parse_sweep,
     read_levels,
     sweep_levels,
 )
-from ethbrake_marl.extensions.cooperation.sweep import parse_sweep
+from ethbrake_marl.worlds.mixture import WORDS
 from tests.fixtures.commands import Refuse
 from tests.refused import refused
 
@@ -37,10 +38,14 @@ def test_parse__ranges_and_lists_in_ascending_order(text: str, settings: list[st
     assert [each.number for each in values] == [float(each.replace(":", "=").split("=")[-1]) for each in settings]
 
 
-def test_standard_levels__are_a_ladder_and_one_beside_the_paper() -> None:
-    assert STANDARD[: len(LADDER)] == LADDER
-    before = [None, *LADDER[:-1], "cooperation-2-paper"]
-    assert [level.before for level in read_levels(STANDARD, NOTHING)] == before
+def test_standard_levels__change_one_thing_each_in_the_same_worlds() -> None:
+    levels = read_levels(STANDARD, NOTHING)
+    assert [level.before for level in levels] == [None, *STANDARD[:-1]]
+    contents = [level.scenario.content(without=("name", *WORDS)) for level in levels]
+    changes = [{key for key in one if one[key] != other[key]} for one, other in pairwise(contents)]
+    assert changes == [{"v2x"}, {"roles", "objective"}, {"objective"}, {"roles"}, {"roles"}]  # at 1 nobody learns
+    drawn = common_worlds(levels, 20, 7)
+    assert all(each.worlds.gaps_m.tolist() == drawn[0].worlds.gaps_m.tolist() for each in drawn)
 
 
 REFUSED = {
@@ -58,9 +63,9 @@ REFUSED = {
     "--sweep objective=social:0,90 --set reward.objective=own": "has its own objective",
     "--levels cooperation-3-pair,cooperation-3-pair": "given twice",
     "--levels cooperation-3-pair": "give at least two levels",
-    "--levels cooperation-0-sensors,paper-distance": "level 'paper-distance': speed_1_mps is",
+    "--levels level-0-sensors,paper-distance": "level 'paper-distance': speed_1_mps is",
     "--levels cooperation-3-pair,cooperation-3-five": "vehicles is 5, but 3",
-    "--levels cooperation-0-sensors,cooperation-3-pair --set roles.vehicle_2=coast --set roles.vehicle_3=coast": (
+    "--levels level-0-sensors,cooperation-3-pair --set roles.vehicle_2=coast --set roles.vehicle_3=coast": (
         "no level has a learner"
     ),
     "--episodes 10 --search-episodes 11": "search-episodes = 11",

@@ -27,6 +27,7 @@ def program() -> ModuleType:
     return load("../../train/ppo_gpu")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "learners"), [("paper-random", 1), ("cooperation-4-all", 3)])
 def test_training__lowers_harm_and_saves_the_policy_that_it_has_evaluated(
     name: str, learners: int, program: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -47,6 +48,7 @@ def test_training__lowers_harm_and_saves_the_policy_that_it_has_evaluated(
         assert harm < 0.5 * result["coasting"][column].mean()
 
 
+@pytest.mark.slow
 def test_the_best_policy__is_kept_when_training_makes_it_worse(
     program: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,6 +78,7 @@ def test_advantages__by_hand(program: ModuleType) -> None:
     assert result[:, 0].tolist() == [[-1.25, 1.5], [1.0, 2.0], [3.0, 3.0]]
 
 
+@pytest.mark.slow
 def test_a_rollout__goes_on_where_the_last_one_ended(program: ModuleType) -> None:
     short = eb.load_scenario("paper-random").replace(horizon_s=3.0)  # some episodes end there, others before
     worlds, twin = (eb.cuda.Worlds(short, 6, 12, "cpu") for _ in range(2))
@@ -102,6 +105,7 @@ def test_a_rollout__goes_on_where_the_last_one_ended(program: ModuleType) -> Non
     assert torch.allclose(ppo.before, exact, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ratio", "gain", "learns"), [(1.5, 1.0, False), (1.5, -1.0, True), (0.5, -1.0, False)])
 def test_the_actor__does_not_learn_beyond_the_clip(
     ratio: float, gain: float, learns: bool, program: ModuleType
@@ -120,6 +124,7 @@ def test_the_actor__does_not_learn_beyond_the_clip(
     assert changed == [learns, True]
 
 
+@pytest.mark.slow
 def test_the_actor__learns_the_same_beside_a_critic_with_large_errors(program: ModuleType) -> None:
     actors = []
     for scale in (1.0, 1e6):
@@ -132,6 +137,7 @@ def test_the_actor__learns_the_same_beside_a_critic_with_large_errors(program: M
     assert all(torch.equal(*each) for each in zip(*(each.parameters() for each in actors), strict=True))
 
 
+@pytest.mark.slow
 def test_training__begins_in_the_worlds_of_its_seed_near_full_braking_and_the_rate_falls_as_a_cosine(
     program: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,6 +154,7 @@ def test_training__begins_in_the_worlds_of_its_seed_near_full_braking_and_the_ra
     np.testing.assert_allclose(rates, [1.0, 0.5 + 0.5**1.5, 0.5, 0.5 - 0.5**1.5], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_actions_that_are_no_numbers__are_refused(program: ModuleType) -> None:
     worlds = eb.cuda.Worlds("paper-random", 8, 16, "cpu")
     ppo = program.Ppo(worlds, program.Settings(n=8, rollout=8, minibatches=4))
@@ -166,6 +173,7 @@ class NoReading(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
+@pytest.mark.slow
 def test_rollout_and_update__can_be_recorded(program: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """CUDA graphs demand that no number is read and that no tensor moves."""
     ppo = program.Ppo(eb.cuda.Worlds("paper-random", 8, 16, "cpu"), program.Settings(n=8, rollout=8, minibatches=4))
@@ -187,6 +195,7 @@ def test_rollout_and_update__can_be_recorded(program: ModuleType, monkeypatch: p
         ppo.rate.item()
 
 
+@pytest.mark.slow
 def test_the_learning_rate__is_the_tensor_that_the_optimiser_reads(program: ModuleType) -> None:
     ppo = program.Ppo(eb.cuda.Worlds("paper-random", 8, 16, "cpu"), program.Settings(n=8, rollout=8, minibatches=4))
     before = ppo.actor.log_std.item()
@@ -207,7 +216,7 @@ def test_the_learning_rate__is_the_tensor_that_the_optimiser_reads(program: Modu
             ["--device", "cpu", "--scenario", "paper-random-map", "--harm-count", "first"],
             "another physics run on a processor only",
         ),
-        (["--device", "cpu", "--scenario", "cooperation-0-sensors"], "has no learner"),
+        (["--device", "cpu", "--scenario", "level-0-sensors"], "has no learner"),
         (["--device", "cpu", "--harm-count", "last"], "harm_count"),
         (["--steps", "0"], "steps = 0"),
         (["--n", "2", "--rollout", "4"], "minibatches = 16: must be at most n * rollout = 8"),

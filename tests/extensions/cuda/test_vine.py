@@ -50,6 +50,7 @@ def both(recipe: Any, scenario: Any) -> tuple[Any, Any]:
     return models
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", [PAPER, PAIR])
 def test_decisions_and_gradients__are_those_of_the_processor(scenario: Any) -> None:
     """Up to the rounding of actions, which are single precision here: the kink at an impact can move a few."""
@@ -69,6 +70,7 @@ def test_decisions_and_gradients__are_those_of_the_processor(scenario: Any) -> N
     assert {*cpu.logger.name_to_value} == {*twin.logger.name_to_value}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reward", [{"harm": 1.0}, {"harm": 0.3, "harm_count": "honest", "terminal": 0.5}])
 @pytest.mark.parametrize("scenario", [PAPER, PAIR])
 def test_returns__are_those_of_the_processor_to_the_last_bit(scenario: Any, reward: dict[str, Any]) -> None:
@@ -89,6 +91,7 @@ def test_returns__are_those_of_the_processor_to_the_last_bit(scenario: Any, rewa
     assert len(np.unique(gained)) > 20 and len(np.unique(moved)) > 8
 
 
+@pytest.mark.slow
 def test_update__moves_the_weights_as_on_the_processor() -> None:
     cpu, twin = both(SMALL, PAPER)
     for model in (cpu, twin):
@@ -99,6 +102,7 @@ def test_update__moves_the_weights_as_on_the_processor() -> None:
     assert cpu.policy.optimizer.param_groups[0]["lr"] == twin.policy.optimizer.param_groups[0]["lr"]
 
 
+@pytest.mark.slow
 def test_branches__that_have_ended_gain_and_move_nothing() -> None:
     """In the last decision of an episode an action counts once, however long it was to be held."""
     _, twin = both(SMALL, PAPER)
@@ -120,6 +124,7 @@ def begin(run: Path, **settings: Any) -> Any:
     )
 
 
+@pytest.mark.slow
 def test_resume__after_a_kill_everything_is_the_same(tmp_path: Path) -> None:
     result = begin(tmp_path / "whole")
     assert result.policy.manifest.algorithm == "vine" and result.updates == 20
@@ -154,6 +159,7 @@ class NoWaiting(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
 
+@pytest.mark.slow
 def test_graphs__contain_nothing_that_waits_for_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     _, twin = both(SMALL, PAPER)
     seen, _ = twin.collect(NOTHING)
@@ -229,6 +235,7 @@ def test_too_many_worlds__are_refused_in_one_line(empty_folder: Path, monkeypatc
         start(VINE)()
 
 
+@pytest.mark.slow
 def test_too_little_memory_in_a_training__is_one_line(empty_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*given: Any, **more: Any) -> None:
         raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate")
@@ -238,6 +245,7 @@ def test_too_little_memory_in_a_training__is_one_line(empty_folder: Path, monkey
         start(SMALL.replace(total_steps=32 * 6))()
 
 
+@pytest.mark.slow
 def test_start__gives_the_weights_of_the_named_policy_as_on_the_processor(tmp_path: Path) -> None:
     begin(tmp_path / "first")
     cpu, twin = both(SMALL.replace(start=f"vine@{tmp_path / 'first'}"), PAPER)

@@ -215,8 +215,8 @@ def changed(array, row, body, value):
 def test_proofs__are_for_this_physics():
     assert physics_digest() == PROVEN_FOR, (
         f"the code of motion/ has changed: set PROVEN_FOR (extensions/proofs/avoidability.py) to {physics_digest()!r},"
-        " and keep it only if `pytest --all tests/extensions/proofs` and `make programme NAME=proofs` succeed"
-        " (docs/internals/model.md)"
+        " and keep it only if `pytest --all tests/extensions/proofs` and `pytest -m nightly"
+        " tests/motion/test_proofs.py` succeed (docs/internals/model.md)"
     )
 
 

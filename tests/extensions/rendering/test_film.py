@@ -65,7 +65,7 @@ def test_watch__makes_the_picture_of_the_readme(ethbrake: Command, empty_folder:
 def test_watch__is_refused(refuse: Refuse, monkeypatch: pytest.MonkeyPatch) -> None:
     refuse("watch --agents nobody --output x.txt", "film with the file ending '.txt': the ending must be one of")
     refuse("watch --agents nobody --output x.gif", "unknown agent 'nobody'")
-    refuse("watch --scenario cooperation-0-sensors --output x.gif", "has no learner that the agents could drive")
+    refuse("watch --scenario level-0-sensors --output x.gif", "has no learner that the agents could drive")
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     refuse("watch --agents coast --output x.mp4", "needs the package imageio_ffmpeg, which is not installed")
     Path("film.gif").write_text("precious")

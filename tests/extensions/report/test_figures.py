@@ -10,11 +10,17 @@ from matplotlib.figure import Figure
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.report.curves import curves_figure, over_seeds
-from ethbrake_marl.extensions.report.deceleration import deceleration_figure
-from ethbrake_marl.extensions.report.episode_figure import trajectories
-from ethbrake_marl.extensions.report.harm_figures import BINS, harm_above, harm_against_total_gap, harm_by_agent
-from ethbrake_marl.extensions.report.scenario_figures import worlds_figure
+from ethbrake_marl.extensions.report.figures import (
+    BINS,
+    curves_figure,
+    deceleration_figure,
+    harm_above,
+    harm_against_total_gap,
+    harm_by_agent,
+    over_seeds,
+    trajectories,
+    worlds_figure,
+)
 from ethbrake_marl.extensions.report.style import label_text, new_figure, picture_bytes, series_style
 from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.names import teams_of

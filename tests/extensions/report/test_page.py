@@ -8,10 +8,10 @@ import re
 import pytest
 
 from ethbrake_marl.errors import plain_text
-from ethbrake_marl.extensions.report.harm_figures import SLIM_IN
+from ethbrake_marl.extensions.report.figures import SLIM_IN
 from ethbrake_marl.extensions.report.page import Section, data, drawing, part, table, whole_page as page_of
 from ethbrake_marl.extensions.report.style import finish, new_figure
-from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
 
 
@@ -72,3 +72,35 @@ def test_drawing__is_as_wide_as_a_phone_shows_it_and_its_caption_is_text(width_i
     assert picture["class"] == kind and picture["alt"] == "Title. words"
     assert "A long caption, A long caption" in Page(html).text and figure.get_supxlabel() == ""
     assert base64.b64decode(picture["src"].removeprefix("data:image/svg+xml;base64,")).startswith(b"<?xml")
+
+
+def test_table__by_hand() -> None:
+    rate = Column("Collisions", digits=1, scale=100.0, unit=" %")
+    rows = [("a|b\nknows", Estimate(0.25, (0.125, 0.5)), -0.001), "paper, <test>", ("x:y", None, 2.0), ("last",)]
+    sheet = Sheet("Two agents", ["Agent", rate, Column("Change", sign="+")], rows, note="In m²/s².")
+    assert str(table(sheet)).strip().split("\n") == [
+        '<div class="wide" tabindex="0" role="region" aria-label="Two agents"><table>',
+        "<caption>Two agents</caption>",
+        "<thead><tr>",
+        '<th scope="col">Agent</th>',
+        '<th scope="col">Collisions</th>',
+        '<th scope="col">Change</th>',
+        "</tr></thead>",
+        "<tbody>",
+        '<tr><th scope="row">a|b\\nknows</th>',
+        '<td>25.0 % <span class="interval">[12.5, 50.0]</span></td>',
+        "<td>-0.00</td>",
+        "</tr>",
+        '<tr class="block"><th colspan="3" scope="rowgroup">paper, &lt;test&gt;</th></tr>',
+        '<tr><th scope="row">x:<wbr>y</th>',
+        "<td>–</td>",
+        "<td>+2.00</td>",
+        "</tr>",
+        '<tr><th scope="row">last</th>',
+        "<td></td>",
+        "<td></td>",
+        "</tr>",
+        "</tbody>",
+        "</table></div>",
+        "<p>In m²/s².</p>",
+    ]

@@ -12,11 +12,23 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episodes
-from ethbrake_marl.extensions.report.episodes import shown_worlds, worst_rows
-from ethbrake_marl.extensions.report.first_sentence import first_sentence
-from ethbrake_marl.extensions.report.learners import learners_sheets
-from ethbrake_marl.extensions.report.player import SAMPLE_S, episode_data, pieces_of, replaced_at_s
-from ethbrake_marl.extensions.report.report import Report, Test as OtherTest, avoidable_section, worst_section
+from ethbrake_marl.extensions.report.best_known import UNAVOIDABLE
+from ethbrake_marl.extensions.report.episodes import (
+    SAMPLE_S,
+    episode_data,
+    pieces_of,
+    replaced_at_s,
+    shown_worlds,
+    worst_rows,
+)
+from ethbrake_marl.extensions.report.report import (
+    Report,
+    Test as OtherTest,
+    avoidable_section,
+    first_sentence,
+    worst_section,
+)
+from ethbrake_marl.extensions.report.run import learners_sheets
 from ethbrake_marl.names import teams_of
 from ethbrake_marl.training.experiment import TEAM, without
 from tests.evaluation.lines import recorded
@@ -146,15 +158,15 @@ def test_worst_worlds__can_be_watched(searched: Compared) -> None:
     assert f'data-watch="{shown[0]}"' in text and f"{searched.result[FOCUS]['total_harm'][shown[0]]:.2f}" in text
 
 
-def test_avoidable__splits_the_worlds_only_if_somebody_has_proven_it(compared: Compared, searched: Compared) -> None:
-    avoidable = searched.result[FOCUS]["avoidable"]
+def test_unavoidable__splits_the_worlds_only_if_somebody_has_proven_it(compared: Compared, searched: Compared) -> None:
+    never = searched.result[FOCUS][UNAVOIDABLE]
     section = avoidable_section(searched)
     text = " ".join(map(str, section.body))
-    assert section.title == "What was avoidable" and f"{100 * avoidable.mean():.1f} %" in text
-    assert f"Contact avoidable: {avoidable.sum()} worlds" in text
+    assert section.title == "What was avoidable" and f"{100 * never.mean():.1f} %" in text
+    assert f"Impact unavoidable: {never.sum()} worlds" in text
     harm = searched.result[FOCUS]["first_impact_harm"] - searched.result[FOCUS]["best_known_first"]
-    easy, _, hard = text.partition("Contact unavoidable")
-    assert f"<td>{harm[avoidable].mean():.2f} " in easy and f"<td>{harm[~avoidable].mean():.2f} " in hard
+    hard, _, easy = text.partition("Other worlds")
+    assert f"<td>{harm[never].mean():.2f} " in hard and f"<td>{harm[~never].mean():.2f} " in easy
     section = avoidable_section(compared)
     assert section.title == "World by world" and len(section.body) == 1
 
@@ -163,8 +175,8 @@ def test_tables__have_no_interval_that_takes_worlds_of_a_recording_for_independe
     agents = {TEAM: "constant:4.5", without("vehicle_2"): "coast", without("vehicle_3"): "full_brake"}
     mine = with_best_known(compared_by(recorded(8).with_learners(["vehicle_2", "vehicle_3"]), agents))
     result = mine.result
-    avoidable = result.worlds["gap_1_m"] + result.worlds["gap_2_m"] > 15.0
-    columns = {agent: {**own, "avoidable": avoidable} for agent, own in result.columns.items()}
+    never = result.worlds["gap_1_m"] + result.worlds["gap_2_m"] <= 15.0
+    columns = {agent: {**own, UNAVOIDABLE: never} for agent, own in result.columns.items()}
     apart = {**result.worlds, "recording": np.arange(result.n).astype(str)}
     intervals = []
     for worlds in (result.worlds, apart):

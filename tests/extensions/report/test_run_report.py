@@ -10,9 +10,8 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.errors import _EXTRA_OF
 from ethbrake_marl.evaluation.compared import Compared
-from ethbrake_marl.extensions.report.learners import learners_sheets
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, is_papers_test, printed_sheet
-from ethbrake_marl.extensions.report.run import telling_row
+from ethbrake_marl.extensions.report.run import learners_sheets, telling_row
 from ethbrake_marl.extensions.report.three_tests import TESTS, brief, is_as_shipped, other_tests
 from ethbrake_marl.training.experiment import run_experiment
 from tests.cli.test_run import ctrl_c_when, status_of
@@ -48,11 +47,11 @@ def test_run__leaves_results_pictures_page_and_policy(finished_run: Path) -> Non
 def test_run__the_other_two_tests_stand_beside_the_main_one(finished_run: Path) -> None:
     for test in ("paper-random-brake-only", "paper-random-obstacle"):
         saved = eb.read_result(finished_run / f"results-{test}.json")
-        assert [*saved.agents] == ["full_brake", "e_v2x_bm", "trained policy", "hybrid"]
+        assert [*saved] == ["full_brake", "e_v2x_bm", "trained policy", "hybrid"]
         right = eb.evaluate(test, f"full_brake,policy@{finished_run}", episodes=60)
         for agent, spec in (("full_brake", "full_brake"), ("trained policy", f"policy@{finished_run}")):
             mean = right[spec]["total_harm"].mean()
-            assert saved.estimate(agent, "total_harm").value == pytest.approx(mean, rel=1e-12)
+            assert saved[agent]["total_harm"] == pytest.approx(mean, rel=1e-12)
 
 
 def test_run__interrupted_evaluates_the_policy_so_far_and_goes_on_as_a_training(

@@ -22,9 +22,9 @@ def test_list__has_the_items_in_the_order_of_the_paper(ethbrake: Command) -> Non
 def test_cost__counts_the_trainings_that_are_missing(ethbrake: Command, empty_folder: Path) -> None:
     quick = ethbrake("reproduce", "hybrid-table", "learning-low", "--cost").err
     assert "to do: 2 items, at most about 6 s of one core; trainings before them about 0.1 min" in quick
-    full = ethbrake("reproduce", "hybrid-table", "learning-low", "readings", "--full", "--cost").err
+    full = ethbrake("reproduce", "hybrid-table", "learning-low", "gaps", "--full", "--cost").err
     # trainings: 2 x 3 x (210 + 240) s, and 6 s
-    assert "3 items, at most about 247 s of one core; trainings before them about 45.1 min" in full
+    assert "3 items, at most about 26 s of one core; trainings before them about 45.1 min" in full
     assert "about 45.0 min" in ethbrake("reproduce", "learning-high", "--full", "--cost").err
     assert "about 37.5 min" in ethbrake("reproduce", "trajectories", "--full", "--cost").err
     assert "trainings" not in ethbrake("reproduce", "gaps", "trajectories", "--cost").err

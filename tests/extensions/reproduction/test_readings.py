@@ -1,4 +1,4 @@
-"""Readings of the paper: what they change, the random test under each, and the search over all of them."""
+"""Readings of the paper: what they change, and the random test under each."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +10,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.agents.pairwise import pairwise, predicted_harm
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.reproduction import register, search
+from ethbrake_marl.extensions.reproduction import register
 from ethbrake_marl.extensions.reproduction.made import Settings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
@@ -22,8 +22,8 @@ from ethbrake_marl.extensions.reproduction.random_test import (
     reported,
     table_of,
 )
-from ethbrake_marl.extensions.reproduction.readings import RANDOM, STATED, Reading
-from ethbrake_marl.extensions.reproduction.search import GRID, NEAREST, differences, distance, numbers_of, readings_of
+from ethbrake_marl.extensions.reproduction.readings import NEAREST, RANDOM, STATED, Reading
+from ethbrake_marl.extensions.reproduction.register import distance, numbers_of
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
 from ethbrake_marl.names import open_game, teams_of
 from tests.refused import refused
@@ -145,8 +145,6 @@ def test_names__say_what_differs() -> None:
     assert (STATED.name, EARLY.name) == ("as stated", "Vehicle 2 acts at 0.2 s")
     both = STATED._replace(step_s=0.25, others=(("horizon_s", 5.0), ("speed_limit_mps", 25.0)), star="low end")
     assert both.name == "the paper's map at 0.25 s; horizon_s = 5.0, speed_limit_mps = 25.0; a* at the low end"
-    names = {reading.name for reading in readings_of(GRID)}
-    assert len(names) == 27 * (5 + 4 * 4) * 2 * 2 * 3 * 2 * 3 * 3 == 122_472
 
 
 def test_scenario__has_what_the_reading_says() -> None:
@@ -163,54 +161,12 @@ def test_map__has_no_coupled_bound() -> None:
         table_of(STATED._replace(step_s=0.2, hybrid="realised, by the coupled H*"), 2)
 
 
-SMALL = {
-    "acts_s": (None, 0.2),
-    "step_s": (None, 0.2),
-    "plans_as_stated": (False, True),
-    "star": ("middle", "low end"),
-    "baseline": ("realised", "predicted harm, realised collisions"),
-    "hybrid": ("realised", "realised, by the coupled H*", "policy alone"),
-}
-
-
-def test_search__finds_the_reading_of_a_table() -> None:
-    readings, numbers = search.search(SMALL, 40)
-    assert len({each.tobytes() for each in numbers}) == len(readings) < len([*readings_of(SMALL)])
-    for planted in (NEAREST, STATED, STATED._replace(hybrid="realised, by the coupled H*")):
-        distances = distance(numbers, numbers_of(table_of(planted, 40)))
-        assert readings[int(distances.argmin())] == planted and distances.min() == 0.0
-        assert np.sort(distances)[1] > 0.0
-
-
 def test_difference__by_hand() -> None:
     printed = np.array([[0.5, 10.0], [0.4, 8.0], [0.2, 5.0], [0.1, 4.0]])
     ours = printed.copy()
     ours[0, 1], ours[3, 0] = 11.0, 0.05
-    assert differences(ours, printed) == pytest.approx([0.0, 0.1, 0.0, 0.0, 0.0, 0.0, 0.5, 0.0])
-    assert distance(np.stack([ours, printed]), printed) == pytest.approx([((0.1**2 + 0.5**2) / 8) ** 0.5, 0.0])
-
-
-def test_chance__is_how_near_readings_come_to_tables_of_mixed_readings() -> None:
-    one = numbers_of(table_of(STATED, 20))
-    assert not search.by_chance(one[np.newaxis]).any()
-    two = search.by_chance(np.stack([one, 2.0 * one]))
-    # k of 8 numbers are of the other reading: half of it, or twice as much
-    possible = [round(off * (k / 8) ** 0.5, 6) for k in range(9) for off in (0.5, 1.0)]
-    assert {round(float(each), 6) for each in two} <= {*possible}
-    assert two.max() > 0.0
-
-
-def test_reproduce_search__shows_the_nearest_and_says_that_it_is_a_hypothesis(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "GRID", SMALL)
-    assert search.reproduce_search(SETTINGS).notes == ["The search needs `--full`."]
-    made = search.reproduce_search(replace(SETTINGS, full=True))
-    (nearest,) = made.sheets
-    assert nearest.rows[0][:2] == ("printed", 0.0) and nearest.rows[-1][0] == "as stated"
-    distances = [row[1] for row in nearest.rows[1:-1]]
-    assert len(distances) == search.SHOWN and distances == sorted(distances)
-    assert "is a hypothesis" in made.notes[1] and f"among {len([*readings_of(SMALL)])} readings" in made.notes[1]
-    asked = {row[0]: row for row in nearest.rows}
-    assert asked["as stated"][4:] == pytest.approx(numbers_of(table_of(STATED, 20)).T.ravel())
+    assert distance(ours, printed) == pytest.approx(((0.1**2 + 0.5**2) / 8) ** 0.5)
+    assert distance(printed, printed) == 0.0
 
 
 def test_register__shows_every_alternative() -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ethbrake_marl.extensions.reproduction.documents import latex, markdown
 from ethbrake_marl.extensions.reproduction.verdicts import (
     PERCENT,
     Claim,
@@ -13,7 +14,7 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     judge_number,
     judge_statement,
 )
-from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 
 
 def around(value: float, half: float) -> Estimate:
@@ -84,7 +85,7 @@ def test_claims__in_the_one_table() -> None:
         Claim("Table II", "2,005", "", "", "cannot be", "a|b"),
         Claim("Fig. 2", "same", "", "", "not run", "needs --full"),
     ]
-    assert claims_sheet(claims).markdown().splitlines() == [
+    assert markdown(claims_sheet(claims)).splitlines() == [
         "| Where | The paper | Ours, as stated | Ours, nearest reading | Why |",
         "| --- | --- | --- | --- | --- |",
         "| Fig. 4 | a is less | holds | holds in 1 of 2 | agrees: a, -3.00 [-4.00, -2.00] |",
@@ -93,4 +94,19 @@ def test_claims__in_the_one_table() -> None:
         "| Fig. 6 | nothing | nothing to compare |  | undecided: both are 0 in all worlds |",
         "| Table II | 2,005 |  |  | cannot be because a\\|b |",
         "| Fig. 2 | same |  |  | not run: needs --full |",
+    ]
+
+
+def test_latex__by_hand() -> None:
+    sheet = Sheet(
+        "", ["Who", Column("Rate_1", digits=1, scale=100.0, unit=" %")], [("a–b", Estimate(0.25, (0.125, 0.5)))]
+    )
+    assert latex(sheet).split("\n") == [
+        r"\begin{tabular}{lr}",
+        r"\toprule",
+        r"Who & Rate\_1 \\",
+        r"\midrule",
+        r"a--b & 25.0 \% {[}12.5, 50.0{]} \\",
+        r"\bottomrule",
+        r"\end{tabular}",
     ]

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::ethbrake_marl.errors.Unfamiliar
     ("name", "agent", "episodes", "count", "first", "total"),
     [  # means of README and findings are of these agents
         ("paper-random", "best_harm", 400, "first", 5.5869, 5.6753),
-        ("paper-random-obstacle", "best_harm", 200, "total", 26.3896, 29.1247),
+        ("paper-random-obstacle", "best_harm", 200, "total", 26.0691, 28.7424),
         ("paper-random", "full_brake+search", 400, "first", 8.0593, 8.5959),
     ],
 )
@@ -111,7 +111,7 @@ def test_limits__are_regret_and_share_of_the_possible_reduction() -> None:
     share = rows["best_harm"]["share_of_possible_reduction_first"]
     assert share is not None and share.value == pytest.approx(1.0, abs=1e-9)
     assert rows["full_brake"]["share_of_possible_reduction_first"].value == 0.0
-    assert "Regret, first-impact" in eb.summarise(result).to_markdown()
+    assert "Regret, first-impact" in "".join(eb.summarise(result).sheet().headings)
 
 
 OUTDATED = "the shipped table of best known harm for paper-random is not used, because it was made for other physics"

@@ -11,7 +11,7 @@ from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.search.best_harm import driven_profiles
-from ethbrake_marl.extensions.search.pricing import Problem, Profiles, problem_of
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, beside_braking, problem_of
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, FORCE, GAP, LATENCY, MASS, SPEED
 from tests.extensions.proofs.worlds import worlds
 from tests.refused import refused
@@ -38,9 +38,18 @@ def driven(name: str, **settings: Any) -> tuple[Problem, Profiles, State]:
     return problem, driven_profiles(problem, game, alert, team), drive(game, alert, team)
 
 
+@pytest.mark.parametrize("body", [2, 3])
+def test_beside_braking__one_vehicle_drives_as_alone_although_the_other_decides_earlier(body: int) -> None:
+    (_, pair), (one, game) = eb.open_game("cooperation-3-pair"), eb.open_game("cooperation-3-pair", [f"vehicle_{body}"])
+    alert = one.sample(20, seed=3)
+    together, alone = problem_of(pair, alert), problem_of(game, alert)
+    profiles = driven_profiles(alone, game, alert, Team("wild", {body: Wild()}))
+    both = together.follow(beside_braking(together, alone, profiles))
+    assert both.borne_harm("honest") == pytest.approx(alone.follow(profiles).borne_harm("honest"), abs=1e-9)
+
+
 @pytest.mark.parametrize(
-    "name",
-    ["paper-random", "paper-random-obstacle", "paper-random-buildup", "cooperation-3-pair", "engineering-queue-ahead"],
+    "name", ["paper-random", "paper-random-obstacle", "paper-random-buildup", "cooperation-3-pair", "realistic-mixed"]
 )
 def test_follow__to_the_last_bit_what_agents_do(name: str) -> None:
     problem, profiles, last = driven(name)
@@ -132,7 +141,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "vehicles [4]: must be one or more of 1 to 3, each once": of([4]),
     "vehicles []: must be one or more of 1 to 3, each once": of([]),
     "vehicles [2, 2]: must be one or more of 1 to 3, each once": of([2, 2]),
-    "objective 'injury:CURVE': is not a weighted sum": of(None, objective="injury:lr4s"),
     "objective 'maximin': is not a weighted sum": of(None, objective="first:own,then:maximin"),
     "objective 'own': the 2 controlled vehicles have different objectives": of(None, "cooperation-3-pair", "own"),
 }

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ethbrake_marl.evaluation.compared import Compared
-from ethbrake_marl.extensions.report.harm_figures import harm_against_total_gap
+from ethbrake_marl.extensions.report.figures import harm_against_total_gap
 from ethbrake_marl.extensions.report.page import drawing
 from ethbrake_marl.extensions.report.report import Report
 

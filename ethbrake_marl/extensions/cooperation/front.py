@@ -1,0 +1,305 @@
+"""The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
+
+A point of the front is the mean harm of each vehicle over the worlds, for one choice of weights. A search finds these
+points; they approximate the convex part of the Pareto front, without a proof that no better ones exist. N vehicles, W
+choices of weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from math import comb
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.episode.counts import COUNTS, check_count
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.errors import InvalidInput
+from ethbrake_marl.extensions.search.best_harm import best_harm, driven_profiles, starting_profiles
+from ethbrake_marl.extensions.search.pricing import Problem, Profiles, beside_braking, problem_of, with_braking
+from ethbrake_marl.extensions.search.search import search_profiles
+from ethbrake_marl.extensions.search.tables import best_known
+from ethbrake_marl.motion.layout import WEIGHT, Floats, Ints
+from ethbrake_marl.names import make_teams, open_game
+from ethbrake_marl.policies.bundle import shipped_policies
+from ethbrake_marl.worlds.scenario import Scenario
+
+BUDGET = 3_000  # candidates per world and choice of weights
+CONSTANTS = 101  # constant commands that every search tries
+CHUNK = 1_000  # worlds that are searched together
+MOST = 1_000  # choices of weights in a grid
+SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides between equal choices
+FIRST_SHARE = 0.6  # of the budget; the second round starts from the best results of all choices of weights
+
+Borne = Mapping[str, Floats]  # count of harm -> harm that each vehicle bears
+Progress = Callable[[int, int], None]  # called with the number of finished searches and of all
+
+
+class Front(NamedTuple):
+    """The harm of each vehicle in n worlds, with the best commands for each of W choices of weights."""
+
+    weights: Floats  # [W, N] weights of the vehicles' harm
+    harm_count: str  # count that is weighted (``episode.counts``)
+    borne: Borne  # [W, n, N] m2/s2 by count
+    agents: Mapping[str, Borne]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
+
+    @property
+    def amounts(self) -> Floats:
+        """Weighted harm of each world, [W, n] m2/s2."""
+        return np.stack(
+            [weighted(each, row) for each, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
+        )
+
+
+def weighted(borne: Floats, weights: Floats) -> Floats:
+    """Return the weighted harm ``N sum_i w_i h_i / sum_i w_i``, [...] m2/s2, as of the objective ``weighted``.
+
+    ``borne`` [..., N] is the harm h of each vehicle, ``weights`` [N].
+    """
+    total, whole = np.zeros(borne.shape[:-1]), 0.0
+    for i, weight in enumerate(weights.tolist()):
+        total, whole = total + weight * borne[..., i], whole + weight
+    return np.asarray(len(weights) * total / whole)
+
+
+def weight_grid(vehicles: int, steps: int) -> Floats:
+    """Return W evenly spaced choices of weights, [W, N]. The weights of each choice sum to 1.
+
+    From each row to the next, one weight rises by 1 / ``steps``, and another falls by as much. Raises ``InvalidInput``
+    for more than ``MOST`` choices.
+
+    >>> from ethbrake_marl.extensions.cooperation import weight_grid
+    >>> weight_grid(3, 1).tolist()
+    [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    """
+    number = comb(steps + vehicles - 1, steps)
+    if number > MOST:
+        raise InvalidInput(
+            f"steps = {steps}: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most"
+            f" {MOST:,} are allowed; give fewer steps, or give the choices of weights yourself"
+        )
+    return np.array(_divisions(vehicles, steps)) / steps
+
+
+def _divisions(vehicles: int, steps: int) -> list[list[int]]:
+    """Return all ways to divide ``steps`` parts among the vehicles; from one way to the next, one part moves."""
+    if vehicles == 1:
+        return [[steps]]
+    divisions: list[list[int]] = []
+    for first in range(steps + 1):
+        others = _divisions(vehicles - 1, steps - first)
+        divisions += [[first, *rest] for rest in others[:: -1 if first % 2 else 1]]
+    return divisions
+
+
+def corners(vehicles: int) -> Floats:
+    """Return a choice of weights for each vehicle, [N, N]: 1 for this vehicle, ``SLIGHT`` for the others.
+
+    The others' harm decides only between commands under which this vehicle has almost the same harm.
+    """
+    return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
+
+
+def weight_table(rows: Sequence[Sequence[Any]]) -> Floats:
+    """Return choices of weights as an array, [W, N]. Raises ``InvalidInput`` for unequal rows and what is no number."""
+    numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for row in rows for each in row)
+    if not numbers or len({len(row) for row in rows}) != 1:
+        shown = "; ".join(",".join(map(str, row)) for row in rows)
+        raise InvalidInput(f"weights {shown:.80}: must be numbers, the same count in each choice, for instance 1,4,1")
+    return np.array(rows, np.float64)
+
+
+def search_front(
+    scenario: Scenario,
+    worlds: State,
+    weights: Sequence[Sequence[float]] | Floats,
+    *,
+    count: str = "honest",
+    budget: int = BUDGET,
+    threads: int = 1,
+    agents: Sequence[str] = (),
+    on_progress: Progress | None = None,
+) -> Front:
+    """Search every world for the commands with the least weighted harm, for every choice of weights.
+
+    This harm is at most that of ``CONSTANTS`` constant commands, of the shipped profiles of this world, of ``agents``,
+    of every shipped policy, and of the results for all other choices. With several learners it is also at most what the
+    same search finds for each of them alone, while the others brake fully, if all decide at the same times. A world's
+    result depends on no other world.
+
+    >>> import ethbrake_marl as eb
+    >>> from ethbrake_marl.extensions.cooperation import search_front
+    >>> scenario = eb.load_scenario("paper-random")
+    >>> front = search_front(scenario, scenario.sample(2, 7), [[1, 1, 1], [1, 0, 0]], budget=60)
+    >>> bool((front.borne["honest"][1, :, 0] <= front.borne["honest"][0, :, 0]).all())
+    True
+
+    Args:
+        scenario: its learners are controlled.
+        worlds: n worlds at the alert.
+        weights: weights of the vehicles' harm, [W, N].
+        count: what is weighted (``episode.counts``).
+        budget: number of profiles that are tried for each world and choice of weights.
+        threads: number of threads.
+        agents: names of agents that also drive all learners, with each choice of weights as the scenario's
+            ``harm_weight`` and the objective ``preference``.
+        on_progress: called with the number of finished searches and of all: two for each world and choice, and with
+            several learners two more for each of them.
+
+    Raises ``InvalidInput`` for weights that are no table of numbers with a column for each vehicle, or cannot be a
+    ``harm_weight``.
+
+    """
+    check_count("count", count)
+    weights = weight_table(weights.tolist() if isinstance(weights, np.ndarray) else weights)
+    if weights.shape[1] != scenario.vehicles:
+        raise InvalidInput(
+            f"weights has shape {weights.shape}: give one or more choices of weights, each with one number for each of"
+            f" the {scenario.vehicles} vehicles, for instance {','.join(['1', '4', *'1' * (scenario.vehicles - 2)])}"
+        )
+    if not scenario.learners:
+        raise InvalidInput(f"scenario {scenario.name!r} has no learner, whose commands could be searched")
+    names = [*agents, *(name for name in shipped_policies() if name not in agents)]
+    together = Drivers.of(scenario, weights, names, count)
+    done, searches = 0, 2 * len(weights) * worlds.n * (1 + len(together.alone))
+
+    def tell(more: int) -> None:
+        nonlocal done
+        done += more
+        if on_progress is not None:
+            on_progress(done, searches)
+
+    effort, parts = {"budget": budget, "threads": threads}, []
+    for first in range(0, worlds.n, CHUNK):
+        pool, driven = _searched(together, worlds.take(slice(first, first + CHUNK)), weights, count, effort, tell)
+        parts.append((pool.least(weights), driven))
+    borne = _joined([least for least, _ in parts])
+    return Front(weights, count, borne, {name: _joined([driven[name] for _, driven in parts]) for name in agents})
+
+
+def _joined(parts: Sequence[Borne]) -> Borne:
+    return {count: np.concatenate([part[count] for part in parts], axis=1) for count in COUNTS}
+
+
+class Drivers(NamedTuple):
+    """The learners of a game, and who may drive them under each choice of weights."""
+
+    game: Game
+    preferring: Sequence[tuple[Game, Mapping[str, Team]]]  # for each choice: the game with these weights, and agents
+    alone: Mapping[int, Drivers]  # body -> the same for each of several learners, while the others brake fully
+
+    @staticmethod
+    def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
+        chosen = [scenario.replace(harm_weight=row.tolist(), objective="preference") for row in weights]
+        teams = [make_teams(names, each, harm_count=count) for each in chosen]
+        preferring = [(open_game(each)[1], some) for each, some in zip(chosen, teams, strict=True)]
+        alone = {}
+        for body in scenario.learners if len(scenario.learners) > 1 else ():
+            single = scenario.with_learners([scenario.vehicle_names[body - 1]])
+            able = [name for name, team in make_teams(names, single).items() if [*team.drivers] == [body]]
+            alone[body] = Drivers.of(single, weights, able, count)
+        return Drivers(open_game(scenario)[1], preferring, alone)
+
+
+def _searched(
+    drivers: Drivers, worlds: State, weights: Floats, count: str, effort: Mapping[str, int], tell: Callable[[int], None]
+) -> tuple[Pool, dict[str, Borne]]:
+    """Return all profiles that were found in some worlds, and the harm of each vehicle if agents drive."""
+    pool = Pool(problem_of(drivers.game, worlds, count=count), count)
+    driven, problem = _tried(pool, worlds, weights, drivers.preferring), pool.problem
+    starts: list[list[Profiles]] = [[*starting_profiles(problem, worlds)] for _ in weights]
+    for body, single in drivers.alone.items():
+        theirs = with_braking(worlds, [other for other in drivers.alone if other != body])
+        found, _ = _searched(single, theirs, weights, count, effort, tell)
+        for given, row in zip(starts, weights, strict=True):
+            given.append(beside_braking(problem, found.problem, found.best(row)))
+            pool.add(given[-1])
+    for k, share in enumerate((FIRST_SHARE, 1.0 - FIRST_SHARE)):
+        spent = {**effort, "budget": max(int(share * effort["budget"]), 1)}
+        for given, row in zip(starts, weights, strict=True):
+            aim = problem.minimising(row / row.sum())
+            pool.add(search_profiles(aim, [pool.best(row), *(given if k == 0 else ())], **spent)[0])
+            tell(problem.n)
+    return pool, driven
+
+
+def _tried(
+    pool: Pool, worlds: State, weights: Floats, preferring: Sequence[tuple[Game, Mapping[str, Team]]]
+) -> dict[str, Borne]:
+    """Add constant commands, the shipped profiles and those of agents; return the harm if the agents drive."""
+    problem = pool.problem
+    constants = problem.constant(problem.even_grid(CONSTANTS))
+    for q in range(CONSTANTS):
+        pool.add(constants.take(slice(q, None, CONSTANTS)))
+    pool.add(best_known(problem, pool.count)[1])
+    driven: dict[str, list[Borne]] = {name: [] for name in preferring[0][1]}
+    for row, (game, teams) in zip(weights, preferring, strict=True):
+        car = worlds.car.copy()
+        car[:, WEIGHT, 1:] = row
+        for name, team in teams.items():
+            if driven[name] and not observes_weights(team):
+                driven[name].append(driven[name][0])
+            else:
+                profiles = driven_profiles(problem, game, worlds._replace(car=car), team)
+                driven[name].append(pool.add(profiles))
+    return {name: {count: np.stack([one[count] for one in each]) for count in COUNTS} for name, each in driven.items()}
+
+
+def observes_weights(team: Team) -> bool:
+    """Return whether commands may depend on the weights of harm: no if there are only policies without this feature."""
+    policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
+    seen = [() if policy is None else policy.observation.names for policy in policies]
+    return team.shield is not None or any(not names or any("harm_weight" in name for name in names) for names in seen)
+
+
+class Pool:
+    def __init__(self, problem: Problem, count: str) -> None:
+        self.problem, self.count = problem, count
+        self.profiles: list[Profiles] = []
+        self.borne: dict[str, list[Floats]] = {each: [] for each in COUNTS}
+
+    def add(self, profiles: Profiles) -> Borne:
+        self.profiles.append(profiles)
+        last = self.problem.follow(profiles)
+        for count, each in self.borne.items():
+            each.append(last.borne_harm(count))
+        return {count: each[-1] for count, each in self.borne.items()}
+
+    def choice(self, weights: Floats) -> Ints:
+        """Return the number of the profile with the least weighted harm in each world, [n]; ties: the least harm."""
+        borne = np.stack(self.borne[self.count])
+        amounts = weighted(borne, weights)
+        least = amounts.min(axis=0)
+        return np.asarray(np.where(amounts == least, borne.sum(axis=2), np.inf).argmin(axis=0))
+
+    def best(self, weights: Floats) -> Profiles:
+        chosen, rows = self.choice(weights), np.arange(self.problem.n)
+        used = np.unique(chosen)
+        ends, commands = zip(*Profiles.padded([self.profiles[k] for k in used]), strict=True)
+        place = np.searchsorted(used, chosen)
+        return Profiles(np.stack(ends)[place, rows], np.stack(commands)[place, rows])
+
+    def least(self, weights: Floats) -> Borne:
+        """Return each vehicle's harm under the best profiles for all ``weights`` [W, N]: count -> [W, n, N]."""
+        chosen, rows = [self.choice(row) for row in weights], np.arange(self.problem.n)
+        return {count: np.stack([np.stack(each)[k, rows] for k in chosen]) for count, each in self.borne.items()}
+
+
+def least_largest(scenario: Scenario, worlds: State, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
+    """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm.
+
+    It is count -> [n, N] m2/s2. The largest harm is at most that under any profile of ``front``, which was searched in
+    the same worlds.
+    """
+    game, parts = open_game(scenario)[1], []
+    for first in range(0, worlds.n, CHUNK):
+        some = worlds.take(slice(first, first + CHUNK))
+        table = best_harm(game, some, counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin")
+        last = problem_of(game, some).follow(table.profiles[front.harm_count])
+        parts.append({count: last.borne_harm(count)[np.newaxis] for count in COUNTS})
+    every = {count: np.concatenate([_joined(parts)[count], front.borne[count]]) for count in COUNTS}
+    chosen = every[front.harm_count].max(axis=2).argmin(axis=0)
+    return {count: borne[chosen, np.arange(worlds.n)] for count, borne in every.items()}

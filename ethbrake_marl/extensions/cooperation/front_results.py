@@ -1,0 +1,210 @@
+"""Results of a front: mean harms with intervals, hypervolumes, a comparison with agents, tables and the figure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from ethbrake_marl.agents.drive import Team, drive
+from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
+from ethbrake_marl.errors import count_of
+from ethbrake_marl.evaluation.captions import by_recording
+from ethbrake_marl.evaluation.identity import about_scenario, versions, worlds_sha256
+from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
+from ethbrake_marl.extensions.cooperation.front import Borne, Front, weighted
+from ethbrake_marl.extensions.report.style import (
+    TITLES,
+    finish,
+    in_our_style,
+    label_text,
+    new_panels,
+    plain,
+    series_style,
+)
+from ethbrake_marl.files.sheet import Column, Sheet
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.names import open_game
+from ethbrake_marl.worlds.describe import clusters_of, columns_of
+from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.scenario import Scenario
+
+FRONT = "Pareto front"  # name of the front beside the agents in the entry "hypervolume"; no agent can have this name
+MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of the dimensions less one
+SIZE_IN = (5.6, 4.6)  # narrow enough for a phone
+
+Json = dict[str, Any]
+
+
+def front_results(
+    front: Front, scenario: Scenario, drawn: Drawn, beside: Mapping[str, Borne], seed: int | None
+) -> Json:
+    """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
+
+    Means have 95 % intervals over worlds, or over recordings. For each choice of weights, ``ratio`` is an agent's mean
+    weighted harm divided by the front's (null if that is 0), ``above`` the difference. ``beside``: results beside the
+    front, name -> count -> harm of each vehicle, [n, N] m2/s2; it contains ``full_brake``.
+    """
+    by = clusters_of(columns_of(drawn))
+    return {
+        "kind": "front",
+        "scenario": scenario.name,
+        "seed": seed,
+        "episodes": drawn.worlds.n,
+        **({} if by is None else {"recordings": len(np.unique(by))}),
+        "harm_count": front.harm_count,
+        "vehicles": list(scenario.vehicle_names),
+        "beside": {name: _vehicles(borne, by) for name, borne in beside.items()},
+        "points": _points(front, front.borne, by),
+        "agents": {name: _points(front, borne, by) for name, borne in front.agents.items()},
+        "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count]),
+        "scenario_sha256": about_scenario(scenario)["scenario_sha256"],
+        "worlds_sha256": worlds_sha256(drawn.worlds),
+        "versions": versions(),
+    }
+
+
+def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
+    points = []
+    for k, (weights, least) in enumerate(zip(front.weights, front.amounts, strict=True)):
+        harm = borne[front.harm_count][k]
+        amounts = weighted(harm, weights)
+        points.append({
+            "weights": weights.tolist(),
+            "vehicles": _vehicles({count: borne[count][k] for count in COUNTS}, by),
+            "amount": mean(amounts, by).to_json(),
+            "sum": mean(harm.sum(axis=1), by).to_json(),
+            "above": difference(amounts, least, by).to_json(),
+            "ratio": float(amounts.mean()) / float(least.mean()) if least.any() else None,
+        })  # fmt: skip
+    return points
+
+
+def _vehicles(borne: Borne, by: Clusters) -> dict[str, list[Json]]:
+    return {count: [mean(each, by).to_json() for each in borne[count].T] for count in COUNTS}
+
+
+def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
+    """Return the hypervolumes of the front and of each agent, for two reference points.
+
+    A point is the mean harm of all vehicles for one choice of weights. The first reference point is full braking
+    (``full_brake`` [n, N] m2/s2), so only points count that are better for every vehicle. The second has, for each
+    vehicle, the larger of this and of its largest mean harm on the front. ``share``: an agent's hypervolume divided by
+    the front's, None if that is 0. Empty for more than ``MOST_DIMENSIONS`` vehicles.
+    """
+    if len(full_brake.T) > MOST_DIMENSIONS:
+        return []
+    points = {name: each[front.harm_count].mean(axis=1) for name, each in {FRONT: front.borne, **front.agents}.items()}
+    braking = full_brake.mean(axis=0)
+    references = {
+        "full braking": braking, "largest harm of each vehicle": np.maximum(braking, points[FRONT].max(axis=0)),
+    }  # fmt: skip
+    entries = []
+    for words, reference in references.items():
+        volumes = {name: hypervolume(rows, reference) for name, rows in points.items()}
+        whole = volumes[FRONT]
+        of = {name: {"volume": each, "share": each / whole if whole else None} for name, each in volumes.items()}
+        entries.append({"reference": words, "at": reference.tolist(), "of": of})
+    return entries
+
+
+def hypervolume(points: Floats, reference: Floats) -> float:
+    """Return the exact volume of the region between ``points`` [Q, N], which dominate it, and ``reference`` [N].
+
+    Smaller coordinates are better. A point is ignored unless all its coordinates are below the reference point's. The
+    region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
+
+    >>> import numpy as np
+    >>> from ethbrake_marl.extensions.cooperation.front_results import hypervolume
+    >>> hypervolume(np.array([[1.0, 2.0], [2.0, 1.0]]), np.array([3.0, 3.0]))
+    3.0
+    """
+    points = points[(points < reference).all(axis=1)]
+    if not len(points):
+        return 0.0
+    if len(reference) == 1:
+        return float(reference[0] - points.min())
+    points = points[np.argsort(points[:, -1], kind="stable")]
+    ends = np.append(points[1:, -1], reference[-1])
+    slices = ((end - points[k, -1], points[: k + 1, :-1]) for k, end in enumerate(ends))
+    return sum(float(height) * hypervolume(below, reference[:-1]) for height, below in slices if height > 0.0)
+
+
+def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
+    game = open_game(scenario)[1]
+    last = drive(game, drawn.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
+    return {count: last.borne_harm(count) for count in COUNTS}
+
+
+def front_sheet(results: Json) -> Sheet:
+    """Return a table with one row for each choice of weights, and for each result beside the front.
+
+    Its columns are each vehicle's mean of what is weighted, the line's mean of every count, and each agent's ``ratio``.
+    """
+    count, agents = results["harm_count"], results["agents"]
+
+    def row(name: str, vehicles: Mapping[str, list[Json]], *ratios: float | None) -> tuple[str | float | None, ...]:
+        means = {each: [harm["value"] for harm in vehicles[each]] for each in COUNTS}
+        return (name, *means[count], *map(sum, means.values()), *ratios)
+
+    rows = [
+        row(",".join(f"{weight:g}" for weight in point["weights"]), point["vehicles"], *ratios)
+        for point, *ratios in zip(
+            results["points"], *([each["ratio"] for each in points] for points in agents.values()), strict=True
+        )
+    ]
+    rows += [row(name, vehicles) for name, vehicles in results["beside"].items()]
+    columns = [
+        Column("Weights"), *(Column(f"Vehicle {k + 1}", short=f"V{k + 1}") for k in range(len(results["vehicles"]))),
+        Column("Sum, first impacts", short="First"), Column("Sum, all impacts", short="All"),
+        Column("Sum, honest cost", short="Honest"),
+        *(Column(name, digits=3, short=re.sub("(?<=[/+])", "\n", name)) for name in agents),
+    ]  # fmt: skip
+    note = (
+        f"Mean {IN_WORDS[count]} of each vehicle, and mean first-impact harm, total harm and honest cost of the line,"
+        f" m2/s2. Agents: weighted {IN_WORDS[count]} of the agent divided by that of the front"
+        f"{by_recording(results.get('recordings', 0))}."
+    )
+    return Sheet(f"Front of {results['scenario']}, {results['episodes']:,} worlds", columns, rows, note, gap=2)
+
+
+def hypervolume_sheet(results: Json) -> Sheet:
+    share = Column("Share of the front", digits=1, scale=100.0, unit=" %")
+    rows = [
+        (each["reference"], name, *volume.values())
+        for each in results["hypervolume"]
+        for name, volume in each["of"].items()
+    ]
+    columns: list[Column | str] = ["Reference", "Of", Column("Hypervolume"), share]
+    return Sheet(f"Hypervolume of the mean {IN_WORDS[results['harm_count']]}, (m2/s2)^N", columns, rows, gap=2)
+
+
+@in_our_style
+def front_figure(results: Json) -> Figure:
+    """Draw one point for each choice of weights: the line's mean harm against that of the vehicle that bears most.
+
+    ``results``: the content of ``front.json``.
+    """
+    beside = {name: [{"vehicles": vehicles}] for name, vehicles in results["beside"].items()}
+    count, all_positive = results["harm_count"], True
+    figure, (axes,) = new_panels(SIZE_IN)
+    for number, (name, points) in enumerate({"Pareto front": results["points"], **beside, **results["agents"]}.items()):
+        harm = np.array([[each["value"] for each in point["vehicles"][count]] for point in points])
+        style = series_style(number) | {"linestyle": "none", "markersize": 5.0, "fillstyle": "none"}
+        axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style)
+        all_positive &= bool((harm.max(axis=1) > 0.0).all())
+    if all_positive:
+        axes.set(xscale="log", yscale="log")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(FuncFormatter(plain))
+            axis.set_minor_formatter(FuncFormatter(plain))
+    axes.tick_params(which="minor", labelsize=7)
+    axes.set(xlabel=f"Line: {TITLES[count].lower()}", ylabel=f"Vehicle that bears most: {TITLES[count].lower()}")
+    worlds = count_of(results["episodes"], "world")
+    caption = f"{results['scenario']}, {worlds}; one point for each of {len(results['points'])} choices of the weights."
+    return finish(figure, caption, axes, columns=2, fontsize=8)

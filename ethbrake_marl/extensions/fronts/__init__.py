@@ -1,1 +1,0 @@
-"""The command ``study front``: the harm of each vehicle if commands minimise a weighted sum of these harms."""

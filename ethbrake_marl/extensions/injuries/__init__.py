@@ -1,0 +1,1 @@
+"""Expected injuries of the impacts, as measures and as an objective."""

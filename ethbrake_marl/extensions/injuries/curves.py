@@ -1,0 +1,97 @@
+"""Expected number of injuries if the same impacts happened in 1,000 lines of vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ethbrake_marl.episode.objectives import Harm
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.episode.step import driven_again
+from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
+from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats
+from ethbrake_marl.registry import Part
+
+
+class Curve(NamedTuple):
+    """Probability of an injury in a rear-end impact, as a function of the vehicle's change of speed dv (m/s)."""
+
+    severity: str  # on the abbreviated injury scale
+    formula: str
+    source: str
+    front: Callable[[Floats], Floats]  # in the striking vehicle, which is hit at its front
+    rear: Callable[[Floats], Floats]  # in the struck vehicle
+
+
+def _power(share: Floats) -> Floats:
+    """``min(share^1.531, 1)``, with the same bits on every processor."""
+    positive = share > 0.0
+    return np.where(positive, np.minimum(exp_each(1.531 * log_each(np.where(positive, share, 1.0))), 1.0), 0.0)
+
+
+_GEISSLINGER = "Geisslinger, Poszler and Lienkamp 2023, doi:10.1038/s42256-022-00607-z, parameters of its code"
+CURVES = {
+    "lr4s": Curve(
+        "MAIS3+", "1 / (1 + exp(4.457 - 0.177 dv - c)), with c = 0 if the front is hit, c = -0.431 if the rear is hit",
+        _GEISSLINGER, lambda dv: logistic(-4.457 + 0.177 * dv), lambda dv: logistic(-4.888 + 0.177 * dv),
+    ),
+    "reference": Curve(
+        "MAIS3+", "min((dv / s)^1.531, 1), with s = 51.287 m/s if the front is hit, s = 66.956 m/s if the rear is hit",
+        _GEISSLINGER, lambda dv: _power(dv / 51.287), lambda dv: _power(dv / 66.956),
+    ),
+    "gidas": Curve(
+        "MAIS2+", "1 / (1 + exp(5.820 - 0.292 dv))", "GIDAS, from the code of Geisslinger et al. 2023",
+        lambda dv: logistic(-5.820 + 0.292 * dv), lambda dv: logistic(-5.820 + 0.292 * dv),
+    ),
+}  # fmt: skip
+
+
+def risks(changes: Floats, curve: str) -> Floats:
+    """Probability of an injury in each vehicle by an impact at its front, and at its rear, [n, 2, N].
+
+    ``changes`` [n, 2, N] are the vehicle's changes of speed there (m/s). Where it was not hit the probability is 0.
+    ``curve`` is a name in ``CURVES``.
+    """
+    each = [CURVES[curve].front(changes[:, 0].copy()), CURVES[curve].rear(changes[:, 1].copy())]
+    return np.where(changes > 0.0, np.stack(each, axis=1), 0.0)
+
+
+def injured_by_harm(harm: Harm, vehicle: int, curve: str) -> Floats:
+    """Expected injuries in 1,000 lines, as if a single impact had done each pair's harm.
+
+    A vehicle that is hit on both sides counts with the larger of its two risks. Exact for first impacts of two
+    vehicles; too large if several impacts of a pair add up.
+    """
+    rebound = (1.0 + harm.car[:, RESTITUTION, :-1]) * np.sqrt(harm.pairs[:, :-1])
+    mass = harm.car[:, MASS, 1:]
+    both = mass[:, :-1] + mass[:, 1:]
+    changes = np.stack([rebound, np.zeros(mass.shape)], axis=1)  # front, rear
+    changes[:, 1, :-1] = mass[:, 1:] / both * rebound[:, 1:]
+    changes[:, 0, 1:] *= mass[:, :-1] / both
+    return np.asarray(np.cumsum(1_000.0 * risks(changes, curve).max(axis=1), axis=1)[:, -1])
+
+
+def speed_changes(before: State, after: State) -> Floats:
+    """Each vehicle's largest change of speed by one impact between two states, at its front and rear, [n, 2, N] m/s.
+
+    There must be no decision between the states. Pushing in contact is not an impact.
+    """
+    out = np.zeros((after.n, 2, after.vehicles))
+    struck = np.asarray((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
+    for k, scratch in driven_again(before, after, struck):
+        out[k] = scratch[[FRONT_CHANGE, REAR_CHANGE], 1:]
+    return out
+
+
+def injured(changes: Floats, curve: str) -> Floats:
+    """Expected injuries of each vehicle in 1,000 lines, [n, N], from ``speed_changes`` [n, 2, N] (m/s).
+
+    Only the side (front or rear) with the larger change counts.
+    """
+    front, rear = np.moveaxis(risks(changes, curve), 1, 0)
+    return np.asarray(1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front))
+
+
+OBJECTIVE = Part(injured_by_harm, arguments=tuple(CURVES))

@@ -1,0 +1,11 @@
+"""The parts that this extension adds: group -> name -> module of this folder and object."""
+
+PARTS = {
+    "measures": {
+        "injury": "measures:INJURY",
+        "injury_lr4s": "measures:LR4S",
+        "injury_reference": "measures:REFERENCE",
+        "injury_gidas": "measures:GIDAS",
+    },
+    "objectives": {"injury": "curves:OBJECTIVE"},
+}

@@ -1,0 +1,34 @@
+"""Tables as Markdown and LaTeX, for the page and its files: pandas is not in the extra ``report``.
+
+Only what tables of the reproduction need: they have no sections, and no cell has two lines.
+"""
+
+from __future__ import annotations
+
+from ethbrake_marl.files.sheet import Sheet
+
+LATEX = str.maketrans({
+    **{each: rf"\{each}" for each in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}", "²": "$^2$", "–": "--", "[": "{[}", "]": "{]}",
+})  # fmt: skip
+
+
+def lines_of(sheet: Sheet) -> list[list[str]]:
+    """Return the texts of headings and rows."""
+    return [sheet.headings, *([cell.in_words for cell in row if not isinstance(cell, str)] for row in sheet.shown())]
+
+
+def markdown(sheet: Sheet) -> str:
+    """Return the table as Markdown, without title and note."""
+    heads, *rows = lines_of(sheet)
+    rule = ["---" if column.text else "---:" for column in sheet.formats]
+    escaped = [[text.replace("|", "\\|") for text in row] for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (heads, rule, *escaped))
+
+
+def latex(sheet: Sheet) -> str:
+    """Return a LaTeX ``tabular`` for the package ``booktabs``, without title and note."""
+    heads, *rows = (" & ".join(text.translate(LATEX) for text in line) + r" \\" for line in lines_of(sheet))
+    kinds = "".join("l" if column.text else "r" for column in sheet.formats)
+    begin, end = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule"], [r"\bottomrule", r"\end{tabular}"]
+    return "\n".join([*begin, heads, r"\midrule", *rows, *end])

@@ -1,0 +1,67 @@
+"""``study front`` as a user types it."""
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from tests.fixtures.commands import Command, Refuse, told_json
+
+SMALL = "--episodes 20 --steps 1 --budget 100"
+
+
+def test_front__writes_json_and_a_figure_and_prints_every_count(ethbrake: Command, empty_folder: Path) -> None:
+    answer = ethbrake(*f"study front {SMALL} --agents e_v2x_bm --output out".split())
+    assert answer.status == 0, answer.err
+    found = json.loads(Path("out/front.json").read_text())
+    assert [point["weights"] for point in found["points"][:3]] == [[0, 0, 1], [0, 1, 0], [1, 0, 0]]
+    assert (
+        len(found["points"]) == len(found["agents"]["e_v2x_bm"]) == 7
+    )  # corners, equal weights, corners that break ties
+    assert found["agents"]["e_v2x_bm"][1]["ratio"] >= 1.0
+    assert found["harm_count"] == "honest" and [*found["points"][0]["vehicles"]] == ["first", "total", "honest"]
+    assert {each["reference"] for each in found["hypervolume"]} == {"full braking", "largest harm of each vehicle"}
+    with Image.open("out/front.png") as picture:
+        assert picture.width > 700
+    for words in ("0,1,0", "full_brake", "maximin", "First", "All", "Honest", "e_v2x_bm", "Hypervolume"):
+        assert words in answer.out
+
+
+def test_front__of_given_weights_two_learners_and_total_harm(ethbrake: Command, empty_folder: Path) -> None:
+    line = "study front --scenario cooperation-4-all --weights 1,1,1 --weights 0,0,3 --episodes 2 --budget 20 --json"
+    answer = ethbrake(*line.split(), "--set", "harm_count=total", "--output", "out")
+    found = told_json(answer)
+    assert (found["harm_count"], found["agents"]) == ("total", {}) and len(found["points"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("--weights 1,1", ("shape (1, 2)", "each of the 3 vehicles", "1,4,1")),
+        ("--weights 1,-1,1", ("harm_weight[1]", "-1")),
+        ("--weights 1,x,1", ("weights 1,x,1: must be numbers",)),
+        ("--weights 1,,1", ("--weights", "not valid")),
+        ("--agents nobody", ("unknown agent 'nobody'",)),
+        ("--steps 50", ("1,326 choices of weights", "at most 1,000")),
+        ("--set roles.vehicle_2=full_brake", ("has no learner",)),
+        ("--set harm_count=last", ("harm_count = 'last': must be 'first', 'total' or 'honest'",)),
+    ],
+)
+def test_front__refuses_before_any_work(refuse: Refuse, given: str, words: tuple[str, ...]) -> None:
+    refuse(f"study front {given} --output out", *words)
+
+
+@pytest.mark.filterwarnings("error")
+def test_front__without_any_harm_has_a_figure_and_no_warning(ethbrake: Command, empty_folder: Path) -> None:
+    line = "study front --weights 1,1,1 --episodes 3 --budget 50 --agents coast --set rules=paper --output out"
+    answer = ethbrake(*line.split(), "--set", "gaps_m=1000")
+    assert answer.status == 0 and Path("out/front.png").is_file(), answer.err
+    assert json.loads(Path("out/front.json").read_text())["harm_count"] == "first"
+
+
+def test_front__does_not_replace_results(ethbrake: Command, empty_folder: Path) -> None:
+    Path("out").mkdir()
+    Path("out/front.json").write_text("mine")
+    answer = ethbrake(*f"study front {SMALL} --output out".split())
+    assert answer.status == 2 and "front.json" in answer.err and Path("out/front.json").read_text() == "mine"
