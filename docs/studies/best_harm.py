@@ -2,6 +2,7 @@
 
 ``python docs/studies/best_harm.py --scenario paper-random --episodes 1000 --output paper-random.npz`` searches a list.
 With ``--output``, finished chunks are saved beside the file, and the same command continues after an interruption.
+``--merge`` takes the better of several tables in each world, so that searches with other seeds add up.
 ``--shipped`` prints proven and best known harm of every shipped table, and the gap between them.
 ``--restamp`` renews the digest of the physics in every shipped table whose harms are still the same, bit for bit.
 """
@@ -12,7 +13,7 @@ import argparse
 import shlex
 import shutil
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +27,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
 from ethbrake_marl.extensions.search.best_harm import BUDGET, search_list
-from ethbrake_marl.extensions.search.pricing import problem_of
+from ethbrake_marl.extensions.search.pricing import best_of, problem_of
 from ethbrake_marl.extensions.search.tables import SHIPPED, BestHarmTable, outdated_tables, shipped_tables
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
@@ -60,6 +61,13 @@ def main(words: list[str]) -> None:
     add("--start", type=Path, metavar="FILE.npz", help="a table to start from; no world gets more harm")
     add("--agents", default="", metavar="A,B,...", help="agents that the search also starts from")
     add("--output", type=Path, metavar="FILE.npz", help="the table to write")
+    add(
+        "--merge",
+        nargs="+",
+        type=Path,
+        metavar="FILE.npz",
+        help="search nothing: the best of these tables in each world",
+    )
     given = parser.parse_args(words)
     if given.restamp:
         sys.exit(0 if restamp(SHIPPED) else 1)
@@ -70,14 +78,15 @@ def main(words: list[str]) -> None:
         print("\n".join(f"| {' | '.join(cell.in_words for cell in row)} |" for row in sheet.shown()))
         return
     names = [Path(word).name if word.endswith(".npz") else word for word in words]  # without folders
-    table = search(given, shlex.join(["docs/studies/best_harm.py", *names]))
+    command = shlex.join(["docs/studies/best_harm.py", *names])
+    table = merged(given.merge, command) if given.merge else search(given, command)
     for key, value in table.header.items():
         print(f"{key:28} {value}")
     for count, harm in table.harm.items():
         print(f"{f'best known harm, {count}':28} {harm.mean():.4f} m2/s2, {(harm == 0.0).mean():.1%} of worlds without")
     if given.output is not None:
         table.save(given.output)
-        shutil.rmtree(parts_beside(given.output))
+        shutil.rmtree(parts_beside(given.output), ignore_errors=True)
         print(f"every world: {given.output}", file=sys.stderr)
 
 
@@ -109,6 +118,18 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
         if count not in harm:  # stays as it was
             harm[count], profiles[count] = known.stored(problem_of(game, alert), count)
     return BestHarmTable(table.identity, harm, profiles, header)
+
+
+def merged(paths: Sequence[Path], command: str) -> BestHarmTable:
+    """Return the best of several tables of the same worlds, world by world, in the counts of the first."""
+    first, *others = tables = [BestHarmTable.load(path) for path in paths]
+    if any(not np.array_equal(each.identity, first.identity) for each in others):
+        raise InvalidInput("--merge: the tables are of different worlds")
+    harm, profiles = {}, {}
+    for count in first.harm:
+        harm[count], profiles[count] = best_of([(t.harm[count], t.profiles[count]) for t in tables if count in t.harm])
+    after = " | ".join(str(table.header.get("command", "a table without a command")) for table in tables)
+    return BestHarmTable(first.identity, harm, profiles, {**first.header, "command": command, "after": after})
 
 
 def worlds_of(table: BestHarmTable) -> tuple[Scenario, Game, State]:
