@@ -271,7 +271,7 @@ def ablation_figure(results: Json, caption: str) -> Figure:
             own = [(x + 0.06 * unit * number, each) for x, name, each in points if name in (None, algorithm)]
             _draw_algorithm(axes, own, unit, algorithm, series_style(1 if number == 0 else number + 3))
         if swept is None:
-            words = [name.removeprefix("cooperation-").replace("-", "\n", 1) for name in names]
+            words = [name.removeprefix("cooperation-").removeprefix("level-").replace("-", "\n", 1) for name in names]
             axes.set_xticks([at[name] for name in names], words, fontsize=8)
         if axes.dataLim.ymin < 1.0:
             axes.set_yscale("symlog", linthresh=LINEAR)
