@@ -75,7 +75,8 @@ def search(
         effort: Any = {"rounds": rounds, "restarts": restarts, "drawn": drawn, "changes": changes, "seed": seed}
         alone = best_alone(problem, partial(search, seconds=part, device=device, **effort))
         both = joined([part.shortened() for part in (given, alone) if part is not None], n)
-        given = Profiles(*(array.reshape(-1, *array.shape[2:]) for array in both))
+        ends, commands = both
+        given = Profiles(ends.reshape(-1, *ends.shape[2:]), commands.reshape(-1, *commands.shape[2:]))
     with enough_memory(f"n = {n} worlds, restarts = {restarts} threads in each, on device {str(on)!r}"):
         searched, kernel = searched_worlds(problem, on)
         plans = started(problem, given, restarts, seed, on)

@@ -91,7 +91,7 @@ def injured(changes: Floats, curve: str) -> Floats:
     Only the side (front or rear) with the larger change counts.
     """
     front, rear = np.moveaxis(risks(changes, curve), 1, 0)
-    return 1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front)
+    return np.asarray(1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front))
 
 
 OBJECTIVE = Part(injured_by_harm, arguments=tuple(CURVES))

@@ -132,8 +132,6 @@ def test_too_little_memory__is_one_line(monkeypatch: pytest.MonkeyPatch) -> None
         ({"rounds": 0}, "rounds = 0"),
         ({"restarts": 3}, "restarts = 3: must be a power of two, from 1 to 1024"),
         ({"restarts": 2048}, "restarts = 2048: must be"),
-        ({"restarts": True}, "restarts = True: must be"),
-        ({"restarts": 2.0}, "restarts = 2.0: must be"),
         ({"drawn": 0}, "drawn = 0"),
         ({"changes": 0}, "changes = 0"),
         ({"seed": -1}, "seed = -1"),

@@ -122,16 +122,13 @@ REFUSED: dict[str, Callable[[], object]] = {
     "command 99 m/s2 of vehicle_2 in row 0; must be in [-7, 7] m/s2": lambda: of([2])().follow(
         of([2])().constant(np.full((2, 1, 1), 99.0))
     ),
-    "command 9 m/s2 of vehicle_3 in row 1; must be in [-6, 6] m/s2": lambda: of([2, 3])().follow(
-        of([2, 3])().constant(np.array([[[0.0, 0.0]], [[0.0, 9.0]]]))
-    ),
     "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": of([2], reacting("vehicle_3")),
     "vehicle_1 is driven by 'ppo', whose commands are not known at the alert": of([2], reacting("vehicle_1")),
     "profiles: ends must not decrease": lambda: of([2])().follow(Profiles(np.array([[9, 3]] * 2), np.zeros((2, 2, 1)))),
     "vehicles [4]: must be one or more of 1 to 3, each once": of([4]),
     "vehicles []: must be one or more of 1 to 3, each once": of([]),
     "vehicles [2, 2]: must be one or more of 1 to 3, each once": of([2, 2]),
-    "objective 'injury:CURVE': is not a weighted sum": of(None, objective="injury:lr4s"),
+    "objective 'injury:lr4s|reference|gidas': is not a weighted sum": of(None, objective="injury:lr4s"),
     "objective 'maximin': is not a weighted sum": of(None, objective="first:own,then:maximin"),
     "objective 'own': the 2 controlled vehicles have different objectives": of(None, "cooperation-3-pair", "own"),
 }
