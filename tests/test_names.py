@@ -80,7 +80,6 @@ def test_a_script__has_the_name_that_it_was_asked_for_by(spec: str):
         ("constnt:3", "unknown agent 'constnt'; did you mean 'constant'"),
         ("constant", "constant needs a finite deceleration"),
         ("constant:x", "constant needs a finite deceleration"),
-        ("constant:inf", "constant needs a finite deceleration"),
         ("full_brake:3", "full_brake takes no argument"),
         ("full_brake@x", "full_brake uses no policy"),
         ("full_brake+stepp", "unknown shield or search 'stepp'"),
@@ -181,8 +180,15 @@ def test_a_function_of_a_file__takes_an_argument_and_wrappers(tmp_path: Path, mo
     assert team.name == "mine.py:make:3+around" and team.drivers[2].name == "constant:3"
 
 
-@pytest.mark.parametrize("name", ["a+b", "a,b", "lr=1,seed=2,x", "a+around"])
-@pytest.mark.parametrize("kind", ["{}", "policy@{}", "policy@{}+around", "coast,policy@{}/policy,full_brake"])
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("a+b", "{}"),
+        ("a,b", "policy@{}"),
+        ("lr=1,seed=2,x", "policy@{}+around"),
+        ("a+around", "coast,policy@{}/policy,full_brake"),
+    ],
+)
 def test_a_path_with_a_comma_or_plus__is_refused(name: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     register_shield("around", around)
@@ -237,10 +243,7 @@ def test_agents__are_given_as_names_or_as_mappings_of_names_agents_and_vehicles(
     ("agents", "message"),
     [
         ({}, "must be names, such as"),
-        (None, "must be names, such as"),
-        (3, "must be names, such as"),
         ({"a": 3}, "agent 'a' = 3: has no name"),
-        ({"a": print}, "agent 'a' = <built-in function print>: has no name"),
         ({"a": {"vehicle": "coast"}}, "team 'a': 'vehicle': must be the name of a vehicle"),
         ({"a": {2: "coast"}}, "team 'a': 2: must be the name of a vehicle"),
         ({"a": {"vehicle_2": Team("x", {})}}, "team 'a': vehicle_2 = Team.*has no knows"),

@@ -11,21 +11,11 @@ import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.search.tables import SHIPPED, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.names import make_teams
 from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
 
-price, equal_time, team_curves = (load(f"../studies/{name}") for name in ("price", "equal_time", "team_curves"))
+team_curves = load("../studies/team_curves")
 PNG = b"\x89PNG"
-BASE = eb.load_scenario("cooperation-2-paper")
-
-
-def test_price__is_nothing_where_everything_is_known():
-    found = price.drive(BASE, 3, {"paper": {"preset": "paper"}})["paper"]
-    for count in price.COUNTS:
-        assert price.price(found, "e_v2x_bm:estimated", count).value == pytest.approx(0.0, abs=1e-4)
-    assert price.above(found, "e_v2x_bm:estimated") is None
-    assert price.above(found, f"{price.POLICY}+step:estimated").value == 0.0
 
 
 drawings = load("../drawings")
@@ -62,14 +52,6 @@ def test_restamp__renews_a_table_only_if_all_its_harms_keep_their_bits(tmp_path,
     assert same == f"cooperation-2-five: same bits, physics {physics_digest()}"
     assert other_harm.endswith("NOT renewed: other harms in worlds: 1 of 400 (total); search the list again")
     assert other_worlds.endswith("NOT renewed: its worlds are not those of its list")
-
-
-def test_equal_time__compares_with_the_first_team() -> None:
-    scenario, game = eb.open_game("paper-random")
-    teams = make_teams("e_v2x_bm,full_brake", scenario)
-    rows = equal_time.rows_of(equal_time.drive(scenario.sample(30, 7), teams, game, 1), teams)
-    assert {row[0]: row[6] == "" for row in rows} == {"`e_v2x_bm`": True, "`full_brake`": False}
-    assert all(float(row[2]) > 0.0 for row in rows)
 
 
 def test_team_curves__show_the_middle_three_of_five_seeds_and_what_they_compare_with() -> None:

@@ -198,7 +198,6 @@ def test_full_state__has_every_vehicle_pair_time_and_obstacle(name: str, size: i
     ("listed", "text"),
     [
         ([], "must be a list of groups and features"),
-        ("own", "must be a list of groups and features"),
         ([1], "1: must be the name of a group or of a feature"),
         (["own", "own.speed"], "own.speed is listed twice"),
         (["harm_weight"], "describes a neighbour; write front_1.harm_weight"),

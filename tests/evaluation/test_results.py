@@ -71,8 +71,9 @@ def content(folder: Path) -> dict[str, Any]:
     return {path.name: path.is_file() and path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("case", THERE)
-@pytest.mark.parametrize("kind", ["file", "link", "folder"])
+@pytest.mark.parametrize(
+    ("kind", "case"), [*(("file", case) for case in THERE), *((kind, next(iter(THERE))) for kind in ("link", "folder"))]
+)
 def test_refused_results__leave_every_file_as_it_was(case: str, kind: str, tmp_path: Path) -> None:
     name, rows = THERE[case]
     result = evaluated(PAIR, 2)
@@ -100,12 +101,7 @@ def test_refused_rows__leave_no_results_beside_them(rows: str, tmp_path: Path) -
 
 EDITS: dict[str, Callable[[dict[str, Any]], Any]] = {
     "episodes": lambda row: row.update(episodes=2),
-    "interval": lambda row: row.update(total_harm_interval=[0.0, 1e30]),
-    "error": lambda row: row.update(total_harm_error=1e-9),
-    "name": lambda row: row.update(agent="mine"),
     "one key less": lambda row: row.pop("collisions"),
-    "one key more": lambda row: row.update(extra=1),
-    "another digest": lambda row: row.update(results_sha256="0" * 64),
     "no digest": lambda row: row.pop("results_sha256"),
 }
 

@@ -147,9 +147,12 @@ def test_seeds__one_for_each_row_give_the_episodes_of_single_environments(scenar
     worlds = many.describe_worlds()
     assert [worlds["gap_1_m"][row] for row in range(3)] == [env.describe_world()["gap_1_m"] for env in singles]
     assert min(infos["world"]) > 0
-    again = EthBrakeVectorEnv(3, scenario)
+
+
+def test_seeds__one_for_each_row_begin_with_the_first_world() -> None:
+    again = EthBrakeVectorEnv(3, "mixture-delays")
     again.reset(seed=1)
-    assert again.reset(seed=seeds)[1]["world"].tolist() == [0, 0, 0]
+    assert again.reset(seed=[3, 11, 3])[1]["world"].tolist() == [0, 0, 0]
     assert again.reset()[1]["world"].tolist() == [1, 1, 1]
     assert again.reset(seed=4)[1]["world"].tolist() == [0, 1, 2]
 

@@ -25,7 +25,6 @@ YAML: dict[str, str | bytes] = {
     ", line 1, column 4: tag tag:yaml.org,2002:python": "a: !!python/object/apply:os.system [ls]\n",
     ", line 3, column 1: key 'a' occurs twice; the first is on line 1": "a: 1\nb: 2\na: 3\n",
     ", line 1, column 1: a key must be text; if": "1: a\n",
-    ", line 1, column 3: a key must be text; if": "? [a, b]\n: 1\n",
     ", line 2, column 1: not valid YAML: but found another document": "a: 1\n---\nb: 2\n",
     ", line 2, column 2: not valid YAML:": "a: [1, 2\nb: 3\n",
     ", line 2, column 1: not valid YAML:": "a:\n\t- 1\n",

@@ -59,10 +59,7 @@ def test_save_team__drives_as_the_actors_do(between: nn.Module, shared: bool, tm
 
 BAD: dict[str, Any] = {
     "no mean": nn.Linear(FEATURES, 1),
-    "no activation": Actor(nn.Linear(FEATURES, 4), nn.Linear(4, 1)),
     "another activation": Actor(nn.Linear(FEATURES, 4), nn.GELU(), nn.Linear(4, 1)),
-    "two activations": Actor(nn.Linear(FEATURES, 4), nn.ReLU(), nn.Linear(4, 4), nn.Tanh(), nn.Linear(4, 1)),
-    "an activation at the end": Actor(nn.Linear(FEATURES, 4), nn.ReLU(), nn.Linear(4, 1), nn.Tanh()),
     "two actions": Actor(nn.Linear(FEATURES, 4), nn.ReLU(), nn.Linear(4, 2)),
 }
 

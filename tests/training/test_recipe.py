@@ -61,7 +61,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "mine.yaml, line 2: algorithm = trpo: must be one of ppo, sac": lambda: with_line(
         "algorithm: ppo", "algorithm: trpo"
     ),
-    "mine.yaml, line 2: algorithm = counterfactual: ": lambda: with_line("m: ppo", "m: counterfactual"),
     "mine.yaml, line 15: network.policy = []: must not be empty": lambda: with_line("policy: [8]", "policy: []"),
     "mine.yaml, line 15: network.values: unknown key; did you mean value?": lambda: with_line("value:", "values:"),
     "mine.yaml, line 16: reward.harms: unknown key; did you mean harm?": lambda: with_line("harm: 1", "harms: 1"),

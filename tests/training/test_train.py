@@ -52,33 +52,48 @@ def status_of(run: Path) -> dict[str, Any]:
     return content
 
 
-def test_train__leaves_a_folder_whose_policy_is_the_best_on_the_list(tmp_path: Path) -> None:
-    run, reports = tmp_path / "run", list[Progress]()
-    result = train(TINY, "paper-random", run, on_progress=reports.append, settings=["x=1"])
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any, list[Progress]]:
+    """A tiny training: its folder, its result and what it reported."""
+    run, reports = tmp_path_factory.mktemp("trained") / "run", list[Progress]()
+    return run, train(TINY, "paper-random", run, on_progress=reports.append, settings=["x=1"]), reports
+
+
+def test_train__reports_and_returns_what_its_folder_says(trained: tuple[Path, Any, list[Progress]]) -> None:
+    run, result, reports = trained
     names = ["config.json", "policy", "policy-last", "progress.csv", "run.json", "run.lock", "tensorboard"]
     assert sorted(path.name for path in run.iterdir()) == names
-    assert (result.status, result.steps, result.updates) == ("finished", 6 * UPDATE, 6)
-    assert [each["updates"] for each in result.evaluations] == [0, 3, 6]
+    status, config = status_of(run), json.loads((run / "config.json").read_text())
+    for told in ((result.status, result.steps, result.updates), tuple(map(status.get, ("status", "steps", "updates")))):
+        assert told == ("finished", 6 * UPDATE, 6)
+    assert status["evaluations"] == list(result.evaluations)
     assert [(report.done, report.total) for report in reports] == [(UPDATE * k, 6 * UPDATE) for k in range(7)]
+    assert TrainingRecipe.model_fields.keys() - config["recipe"].keys() == {"observation", "device"}
+    assert config["settings"] == ["x=1"]
 
-    harm = [each["first_impact_harm"] for each in result.evaluations]
-    assert result.metrics == result.evaluations[int(np.argmin(harm))]
+
+def test_train__leaves_the_policy_that_is_the_best_on_the_list(trained: tuple[Path, Any, list[Progress]]) -> None:
+    run, result, _ = trained
     policy, last = load_policy(run), load_policy(run / "policy-last")
     assert policy.manifest == result.policy.manifest and last.manifest == result.last_policy.manifest
     assert (policy.manifest.steps, last.manifest.steps) == (result.metrics["steps"], 6 * UPDATE)
     assert policy.manifest.versions["physics"] == physics_digest()
     assert policy.manifest.learners == ("vehicle_2",) and policy.manifest.seeds == {"training": 0, "evaluation": 7}
-
     scenario, game = open_game("paper-random")
     assert result.agent == f"policy@{run}"
     ended = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent), scenario))
-    assert ended.harm("first").mean() == pytest.approx(min(harm), rel=1e-12)
+    least = min(each["first_impact_harm"] for each in result.evaluations)
+    assert (
+        ended.harm("first").mean() == pytest.approx(least, rel=1e-12) and least == result.metrics["first_impact_harm"]
+    )
 
-    status, config = status_of(run), json.loads((run / "config.json").read_text())
-    assert (status["status"], status["steps"], status["updates"]) == ("finished", 6 * UPDATE, 6)
-    assert status["evaluations"] == list(result.evaluations)
-    assert TrainingRecipe.model_fields.keys() - config["recipe"].keys() == {"observation", "device"}
-    assert config["settings"] == ["x=1"]
+
+def test_train__measures_before_the_first_update_and_as_often_as_asked(
+    trained: tuple[Path, Any, list[Progress]],
+) -> None:
+    run, result, _ = trained
+    harm = [each["first_impact_harm"] for each in result.evaluations]
+    assert [each["updates"] for each in result.evaluations] == [0, 3, 6]
     rows = kept(run)["rows"]
     assert [int(row["steps"]) for row in rows] == [UPDATE * k for k in range(7)]
     assert [float(row["eval/first_impact_harm"]) for row in rows[::3]] == harm

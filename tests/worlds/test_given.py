@@ -107,7 +107,6 @@ def test_table__may_be_of_polars() -> None:
             lambda pandas: pandas.Series([7.0, True], dtype=object),
             ": gap_1_m = Series of object: must be a number or a",
         ),
-        (lambda pandas: pandas.array([True, None], dtype="boolean"), ": gap_1_m = BooleanArray of boolean: must be a"),
         (lambda pandas: pandas.to_datetime(["2020-01-01"] * 2), ": gap_1_m = DatetimeIndex of datetime64["),
         (lambda pandas: np.array([7, 10**400], object), ": gap_1_m = ndarray of object: must be a number or a list"),
         (lambda pandas: {0: 7, 1: 8}, ": gap_1_m = {0: 7, 1: 8}: must be a number or a list of numbers"),

@@ -75,7 +75,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     ),
     "line 5: gaps_m.uniform = [5, 6, 7]: must have 2 entries": lambda: given(gaps_m="{uniform: [5, 6, 7]}"),
     "line 5: gaps_m.uniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{uniform: [9, 6]}"),
-    "line 5: gaps_m.loguniform = [9, 6]: low must not be above high": lambda: given(gaps_m="{loguniform: [9, 6]}"),
     "line 5: gaps_m.uniform[1] = .nan: must be a finite number": lambda: given(gaps_m="{uniform: [5, .nan]}"),
     "line 5: gaps_m.choice: cannot be combined with the other keys here; a quantity has only one": lambda: given(
         gaps_m="{uniform: [5, 9], choice: [7]}"
@@ -177,8 +176,8 @@ REFUSED: dict[str, Callable[[], object]] = {
     "vehicle_types.car.mass_t = null: must have a value; leave the key out if": lambda: given(
         vehicle_types="{car: {mass_t: null}}"
     ),
-    "line 15: vehicle_types.car.load = 2: a load must be in [0, 1]": lambda: given(vehicle_types="{car: {load: 2}}"),
     "line 15: vehicle_types.car.weight = 0: must be greater than 0": lambda: given(vehicle_types="{car: {weight: 0}}"),
+    "line 15: vehicle_types.car.load = 2: a load must be in [0, 1]": lambda: given(vehicle_types="{car: {load: 2}}"),
     "line 10: latency_s = [0, 0.5, 0.8]: must be left out, because every vehicle type": lambda: given(
         vehicle_types="{car: {latency_s: 3}}"
     ),
@@ -221,7 +220,6 @@ REFUSED: dict[str, Callable[[], object]] = {
         v2x="{preset: clear, hears: none, radio_s: 0.1}"
     ),
     "senses: none means that no vehicle is in sight; leave it out": lambda: given(v2x="{sensing_s: [0.8, 1]}"),
-    "must be a preset (paper, clear, nominal, congested, blocked, sensors-only)": lambda: given(v2x="5"),
     "v2x = {preset: blocked}: vehicle_3 may not be able to act until 2.2 s; this time must be below": lambda: given(
         v2x="blocked", horizon_s="2"
     ),
@@ -283,9 +281,6 @@ REFUSED: dict[str, Callable[[], object]] = {
         objective="first:weighted:1,2,then:own"
     ),
     "objective 'vehicle_K': must name a vehicle, as in vehicle_3": lambda: PAPER.replace(objective="vehicle_K"),
-    "objective = vehicle_0: unknown objective 'vehicle_0'; did you mean 'vehicle_K'?": lambda: PAPER.replace(
-        objective="vehicle_0"
-    ),
     "objective = \"first:ownn,then:total\": unknown objective 'ownn'; did you mean 'own'?": lambda: PAPER.replace(
         objective="first:ownn,then:total"
     ),
@@ -341,7 +336,7 @@ def test_roles__are_frozen(copied: Scenario) -> None:
             change(copied.roles)
 
 
-@pytest.mark.parametrize("spec", ["Full_brake", "2fast", "full brake", "constant:", ":3", "constant: 3", "a\n"])
+@pytest.mark.parametrize("spec", ["Full_brake", "2fast", "constant:", "constant: 3", "a\n"])
 def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: str) -> None:
     with refused(f"agent {spec!r}: must be name or name:argument"):
         check_role(spec)
@@ -350,7 +345,7 @@ def test_agent_of_a_role__is_a_name_in_lower_case_and_an_argument(spec: str) -> 
 @pytest.mark.parametrize(
     "text",
     [
-        "first", "first:", "first:own", "first:own,total", "first:own,then:", "first:,then:own",
+        "first", "first:", "first:own,then:",
         "first:own,then:own,then:own", "first:first:own,then:own,then:own", "first:own,then:first", "then:own",
     ],
 )  # fmt: skip
@@ -360,7 +355,7 @@ def test_first__needs_two_objectives(text: str) -> None:
         PAPER.replace(objective=text)
 
 
-@pytest.mark.parametrize("name", ["My Scenario", "-x", "x" * 65, "../x", "x\n"])
+@pytest.mark.parametrize("name", ["My Scenario", "x" * 65, "../x", "x\n"])
 def test_name_of_a_new_scenario__is_a_plain_word(name: str) -> None:
     with refused(f"scenario name {name!r}: must be 1 to 64 lower case letters, digits, - and _"):
         new_scenario_text(name)

@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,6 +109,15 @@ def test_levels__of_other_roles_or_latencies_cannot_be_imitated() -> None:
     assert not can_imitate(answer("cooperation-3-pair", 1, latency_s=[0, 0.55, 0.5]), late).any()
 
 
+def check_level(level: dict[str, Any]) -> None:
+    """The search has found what the policies of two seeds have not, and no cost without the harm in it."""
+    one, other = level["policy_sha256"]
+    assert level["seeds"] == 2 and one != other
+    searched = {count: level[count]["searched"] for count in ("first", "total", "honest")}
+    assert all(each["best_known"]["value"] <= each["harm"]["value"] for each in searched.values())
+    assert searched["honest"]["best_known"]["value"] >= searched["total"]["best_known"]["value"]
+
+
 def test_ablation__trains_compares_and_goes_on(
     ethbrake: Command, empty_folder: Path, tiny_recipe: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,15 +134,10 @@ def test_ablation__trains_compares_and_goes_on(
     pair = json.loads((out / "trainings" / folders[2] / "config.json").read_text())["recipe"]
     assert (config["recipe"]["total_steps"], pair["total_steps"]) == (128, 256)
     for level in found["levels"][1:]:
-        assert level["seeds"] == 2
-        for count in ("first", "total", "honest"):
-            searched = level[count]["searched"]
-            assert searched["best_known"]["value"] <= searched["harm"]["value"]
-        assert level["honest"]["searched"]["best_known"]["value"] >= level["total"]["searched"]["best_known"]["value"]
-        assert len(level["policy_sha256"]) == 2 and level["policy_sha256"][0] != level["policy_sha256"][1]
+        check_level(level)
     assert found["levels"][1]["first"]["full_brake"] == found["levels"][2]["first"]["full_brake"]
-    assert "(rewarded for honest cost)" in found["conditions"]
-    assert "first 2 worlds" in found["conditions"] and "2 seeds, 128 decisions" in found["conditions"]
+    for condition in ("(rewarded for honest cost)", "first 2 worlds", "2 seeds, 128 decisions"):
+        assert condition in found["conditions"]
     again = ethbrake(*line.split(), *small.split(), "--output", "out", "--json")
     assert again.status == 0 and json.loads(again.out)["levels"] == found["levels"]
     other = ethbrake(*line.split(), *small.replace("12", "13").split(), "--output", "out")

@@ -64,7 +64,6 @@ REFUSED = {
     "--levels cooperation-3-pair,cooperation-3-pair": "given twice",
     "--levels cooperation-3-pair": "give at least two levels",
     "--levels level-0-sensors,paper-distance": "level 'paper-distance': speed_1_mps is",
-    "--levels cooperation-3-pair,cooperation-3-five": "vehicles is 5, but 3",
     "--levels level-0-sensors,cooperation-3-pair --set roles.vehicle_2=coast --set roles.vehicle_3=coast": (
         "no level has a learner"
     ),
@@ -92,8 +91,6 @@ def level(scenario: eb.Scenario) -> Level:
     ("changes", "message"),
     [
         ({"mass_t": [4.5, 5.5, 6]}, "level 'mine': mass_3_t is 6.0, but 5.9 at level 'cooperation-2-paper'"),
-        ({"restitution": 0.2}, "level 'mine': restitution is 0.2, but 0.1 at level 'cooperation-2-paper'"),
-        ({"latency_s": [0, 0.5, 0.9]}, "level 'mine': latency_3_s is 0.9, but 0.8 at level"),
         ({"brake_rate_mps3": 30}, "level 'mine': brake_rate_1_mps3 is 30.0, but not set at level"),
     ],
 )

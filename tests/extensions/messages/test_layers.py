@@ -46,9 +46,6 @@ def of_preset() -> eb.Scenario:
 ACTS = "belong to different extensions, whose games would replace each other; leave one out"
 REFUSED: dict[str, Callable[[], Any]] = {
     f"v2x: tells and mine {ACTS}": lambda: changed({"tells": ["speed"], "mine": 1}),
-    f"v2x: mine and tells {ACTS}": lambda: changed({"mine": 1, "tells": ["speed"]}),
-    f"v2x: persistence and news {ACTS}": lambda: changed({"persistence": "periodic", "news": 1}),
-    f"v2x: also_mine and other {ACTS}": lambda: changed({"mine": 1, "also_mine": 1, "other": 1}),
     f"v2x: tells and mine {ACTS} ": of_preset,
     f"mixture[0].scenario: scenario 'paper-random': v2x: tells and mine {ACTS}": lambda: eb.load_scenario(
         {"name": "two", "mixture": [{"scenario": "paper-random"}], "v2x": {"preset": "nominal", "tells": [], "mine": 1}}

@@ -349,7 +349,6 @@ REFUSED = {
     "lower_bound: count = 'worst': must be 'first', 'total' or 'honest'": dict(count="worst"),
     "lower_bound: horizon_s = 0.2: must be a finite number of at least 0.5": dict(horizon_s=0.2),
     "lower_bound: horizon_s = inf: must be a finite number of at least 0.5": dict(horizon_s=math.inf),
-    "lower_bound: horizon_s = '8': must be a finite number": dict(horizon_s="8"),
     "lower_bound: time_step_s = 0.0: must be a finite number of at least 0.001": dict(time_step_s=0.0),
     "lower_bound: time_step_s = nan: must be a finite number of at least 0.001": dict(time_step_s=math.nan),
 }

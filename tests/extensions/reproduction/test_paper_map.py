@@ -161,7 +161,6 @@ def test_observation__is_the_state_of_the_paper() -> None:
     [
         ({"physics": "paper-mop"}, "physics: unknown physics 'paper-mop'; did you mean 'paper-map'?"),
         ({"obstacle_margin_m": 1.7}, "obstacle_margin_m: is not known to physics: paper-map"),
-        ({"brake_rate_mps3": 10.0}, "brake_rate_mps3: is not known to physics: paper-map"),
         ({"v2x": {"preset": "nominal", "persistence": "periodic"}}, "v2x: is not known to physics: paper-map"),
     ],
 )

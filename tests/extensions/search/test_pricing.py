@@ -132,9 +132,6 @@ REFUSED: dict[str, Callable[[], object]] = {
     "command 99 m/s2 of vehicle_2 in row 0; must be in [-7, 7] m/s2": lambda: of([2])().follow(
         of([2])().constant(np.full((2, 1, 1), 99.0))
     ),
-    "command 9 m/s2 of vehicle_3 in row 1; must be in [-6, 6] m/s2": lambda: of([2, 3])().follow(
-        of([2, 3])().constant(np.array([[[0.0, 0.0]], [[0.0, 9.0]]]))
-    ),
     "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": of([2], reacting("vehicle_3")),
     "vehicle_1 is driven by 'ppo', whose commands are not known at the alert": of([2], reacting("vehicle_1")),
     "profiles: ends must not decrease": lambda: of([2])().follow(Profiles(np.array([[9, 3]] * 2), np.zeros((2, 2, 1)))),

@@ -104,7 +104,6 @@ def header(**entries: Any) -> Callable[[BestHarmTable], bytes]:
 
 DAMAGED: dict[str, Callable[[BestHarmTable], bytes]] = {
     "header: must be an object with the entry format: 2": header(format=1),
-    "header: must be an object with the entry format": header(format=True),
     "first_harm: must be finite and at least 0 m2/s2": changed(first_harm=lambda harm: harm * np.nan),
     "total_harm: must be finite and at least 0 m2/s2": changed(total_harm=lambda harm: harm - 99.0),
     "first_commands: must be finite": changed(first_commands=lambda commands: commands + np.inf),
