@@ -1,19 +1,13 @@
-"""The commands ``agent list`` and ``agent export``."""
+"""The command ``agent list``."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
-
 import typer
 
-from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, example
+from ethbrake_marl.cli.command import JsonOption, Out, example
 from ethbrake_marl.files.sheet import Sheet
 
-agent_group = typer.Typer(
-    help="List the agents, or export a policy.",
-    epilog=example("agent list", "agent export runs/early --onnx early.onnx"),
-)
+agent_group = typer.Typer(help="List the agents.", epilog=example("agent list"))
 
 
 @agent_group.command("list", epilog=example("agent list"))
@@ -33,23 +27,3 @@ def agent_list(as_json: JsonOption = False) -> None:
         )
         for reason in why_not_listed():
             out.note(f"left out: {reason}")
-
-
-@agent_group.command("export", epilog=example("agent export runs/early --onnx early.onnx"))
-def agent_export(
-    policy: Annotated[
-        str, typer.Argument(metavar="NAME|PATH", help="Name of a shipped policy, or folder of a run or policy bundle.")
-    ],
-    onnx: Annotated[Path, typer.Option(metavar="FILE", help="File for the ONNX model.")],
-    force: ForceOption = False,
-) -> None:
-    """Write a policy as an ONNX model.
-
-    The input of the model is an observation, the output an acceleration. The command needs the package onnx, which the
-    extra `export` installs.
-    """
-    with Out(force=force) as out:
-        from ethbrake_marl.policies.bundle import load_named_policy
-
-        out.check(onnx)
-        out.write(onnx, load_named_policy(policy).to_onnx(), what="written")

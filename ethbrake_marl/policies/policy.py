@@ -24,7 +24,6 @@ from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.manifest import Manifest, content_sha256, installed_versions
 from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.policies.observed import ObservationSchema
-from ethbrake_marl.policies.onnx_model import onnx_model
 
 MANIFEST, WEIGHTS = "manifest.json", "weights.safetensors"  # the files of a bundle
 
@@ -92,14 +91,6 @@ class Policy:
         with new_folder(Path(folder).expanduser(), replace=replace) as partial:
             write_file(partial / WEIGHTS, serialised(self.tensors))
             write_file(partial / MANIFEST, manifest.model_dump_json(indent=2).encode() + b"\n")
-
-    def to_onnx(self) -> bytes:
-        """Return an ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
-
-        The acceleration is the action times the observed braking or driving capacity. Results may differ from this
-        package's by rounding. Raises ``MissingExtra`` without the package onnx.
-        """
-        return onnx_model(self.manifest, self.observation, self.tensors)
 
 
 def _own_sha256(manifest: Manifest) -> str:

@@ -12,8 +12,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import onnx
-import onnxruntime
 import pytest
 import stable_baselines3 as stable
 import supersuit
@@ -150,17 +148,6 @@ def test_model__drives_as_in_its_own_librarys_rollout() -> None:
     assert harms(policy_agent(model), worlds=worlds)[0] == pytest.approx(-total, rel=1e-5, abs=1e-5)
 
 
-def test_onnx__bytes_of_a_file_and_a_session_drive_as_the_policy_does(tmp_path: Path) -> None:
-    path = tmp_path / "shipped.onnx"
-    path.write_bytes(PPO.to_onnx())
-    session = onnxruntime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])
-    agents = [policy_agent(given) for given in (path, str(path), session)]
-    path.write_bytes(b"written over, after the agent was made")
-    for agent in agents:
-        assert harms(agent) == pytest.approx(harms(LearnedAgent(PPO)), rel=1e-5, abs=1e-5)
-    assert agents[0].name == "shipped"
-
-
 def ramp(seen: Any, memory: Any) -> Any:
     """Brakes harder with every step; spoils what it was given."""
     steps, kept = memory
@@ -203,10 +190,8 @@ def test_clip__means_the_nearest_action_and_one_float32_step_beyond_is_always_1(
     assert actions(policy_agent(lambda seen: np.full(len(seen), -7), clip=True, actions=5)) == [-1.0] * 12
 
 
-def test_agent__can_be_pickled_where_its_policy_can(tmp_path: Path) -> None:
-    path = tmp_path / "a.onnx"
-    path.write_bytes(PPO.to_onnx())
-    agents: list[Agent] = [policy_agent(given) for given in (brake, partial(brake), small_net(), path)]
+def test_agent__can_be_pickled_where_its_policy_can() -> None:
+    agents: list[Agent] = [policy_agent(given) for given in (brake, partial(brake), small_net())]
     for agent in [*agents, policy_agent(ramp, initial_state=no_steps), LearnedAgent(PPO)]:
         assert actions(pickle.loads(pickle.dumps(agent))) == actions(agent)
 
@@ -238,19 +223,6 @@ def test_model__observes_what_it_was_trained_on_even_from_a_file(around: str, tm
         assert around == "VecNormalize" or harms(agent) == by_hand
     with refused("agent 'PPO': observation lists other features than the policy was trained on"):
         policy_agent(trained, observation=["own"])
-
-
-def test_onnx__observes_what_its_metadata_name() -> None:
-    model = onnx.load_model_from_string(PPO.to_onnx())
-    onnx.helper.set_model_props(model, {"features": ",".join(View(OTHERS).names)})
-    agent = policy_agent(model.SerializeToString(), name="file")
-    assert agent.observation == View(OTHERS) and harms(agent) != harms(LearnedAgent(PPO))
-    with refused("agent 'file': observation lists other features than the policy was trained on"):
-        policy_agent(model.SerializeToString(), name="file", observation=["own", "front_1", "rear_1"])
-    del model.metadata_props[:]
-    agent = policy_agent(model.SerializeToString(), name="file", observation=[*OTHERS, "place"])
-    with refused("agent 'file', vehicle_2: act fails", AgentFailed):
-        harms(agent)
 
 
 @pytest.mark.parametrize("given", [brake, small_net()], ids=["function", "torch module"])

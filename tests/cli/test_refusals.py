@@ -185,8 +185,3 @@ def test_output__is_a_folder_of_its_own(line: str, message: str, refuse: Refuse)
 def test_file_of_the_user__is_refused_with_its_line(code: str, line: str, message: str, refuse: Refuse) -> None:
     Path("bad.py").write_text(code)
     refuse(f"evaluate {line}", message)
-
-
-def test_export__replaces_a_file_only_by_force(refuse: Refuse) -> None:
-    Path("mine.onnx").write_bytes(b"mine")
-    refuse("agent export ppo --onnx mine.onnx", "mine.onnx: already exists")

@@ -3,14 +3,11 @@
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 
-from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.actor import Actor
 from ethbrake_marl.policies.layers import squash
 from ethbrake_marl.policies.network import NetworkSpec
@@ -111,33 +108,6 @@ def test_policy__says_which_format_its_network_needs() -> None:
     for kind, version in versions.items():
         policy = Policy.make(tensors_for(SPECS[kind]), network=SPECS[kind], observation=View(), **FIELDS)
         assert policy.manifest.format_version == version
-
-
-@pytest.mark.parametrize("kind", [kind for kind in SPECS if kind != "wide"])
-def test_onnx__asks_for_the_same_acceleration(kind: str) -> None:
-    spec = SPECS[kind]
-    tensors = tensors_for(spec)
-    if kind in ("clip", "tanh"):
-        tensors["policy.output.weight"] *= np.float32(3.0)  # so that some actions reach the bounds
-    policy = Policy.make(tensors, network=spec, observation=View(), **FIELDS)
-    scenario, game = open_game("paper-random")
-    state = game.reset(scenario.replace(driving_capacity_mps2={"uniform": [1, 3]}).sample(10_000, 5))
-    seen = View().observe(state, np.array([2]), 0.1)[:, 0]
-    expected, _ = LearnedAgent(policy).act(state, None, 2)
-    session = onnxruntime.InferenceSession(policy.to_onnx(), providers=["CPUExecutionProvider"])
-    action, acceleration = session.run(["action", "acceleration_mps2"], {"observation": seen})
-    near = np.isclose(action, policy(seen), rtol=0.0, atol=1e-5)
-    assert np.ptp(expected) > 0.5 and near.mean() > 0.999  # choices between two nearly equal scores may differ
-    np.testing.assert_allclose(acceleration[near[:, 0], 0], expected[near[:, 0]], rtol=0.0, atol=1e-4)
-    assert session.get_modelmeta().custom_metadata_map["features"].split(",") == list(View().names)
-
-
-def test_onnx__needs_the_capacities() -> None:
-    view = View(["own.speed", "own.driving_capacity"])
-    spec = network("clip", observation_size=2)
-    policy = Policy.make(tensors_for(spec), network=spec, observation=view, **FIELDS)
-    with refused("to_onnx: the policy lacks own.braking_capacity; must observe"):
-        policy.to_onnx()
 
 
 WRONG: dict[str, dict[str, Any]] = {

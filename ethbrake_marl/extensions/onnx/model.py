@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import InvalidInput, naming_extras
-from ethbrake_marl.policies.layers import Float32s
-from ethbrake_marl.policies.manifest import Manifest
+from ethbrake_marl.policies.policy import Policy
 
 CAPACITIES = ("own.braking_capacity", "own.driving_capacity")
 
 
-def onnx_model(manifest: Manifest, observation: View, tensors: Mapping[str, Float32s]) -> bytes:
-    """Return the ONNX model of a policy (``Policy.to_onnx``). Its metadata list the names of the observed ``features``.
+def to_onnx(policy: Policy) -> bytes:
+    """Return an ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
-    Raises ``InvalidInput`` if the policy does not observe both its capacities, ``MissingExtra`` without onnx.
+    The acceleration is the action times the observed braking or driving capacity. Results may differ from this
+    package's by rounding. Its metadata list the names of the observed ``features``. Raises ``InvalidInput`` if the
+    policy does not observe both its capacities, ``MissingExtra`` without the package onnx.
     """
+    manifest, observation, tensors = policy.manifest, policy.observation, policy.tensors
     spec, columns = manifest.network, {f.name: (c, f.scale) for c, f in enumerate(observation.features)}
     missing = [name for name in CAPACITIES if name not in columns]
     if missing:
