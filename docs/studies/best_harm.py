@@ -75,7 +75,8 @@ def main(words: list[str]) -> None:
         if outdated := outdated_tables():
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
         sheet = shipped_bounds(shipped_tables())
-        print("\n".join(f"| {' | '.join(cell.in_words for cell in row)} |" for row in sheet.shown()))
+        heads = [column if isinstance(column, str) else column.heading for column in sheet.columns]
+        print("\n".join(f"| {' | '.join(row)} |" for row in (heads, *([c.in_words for c in r] for r in sheet.shown()))))
         return
     names = [Path(word).name if word.endswith(".npz") else word for word in words]  # without folders
     command = shlex.join(["docs/studies/best_harm.py", *names])
