@@ -7,7 +7,7 @@ import typer
 from ethbrake_marl.cli.command import JsonOption, Out, example
 from ethbrake_marl.files.sheet import Sheet
 
-agent_group = typer.Typer(help="List the agents.", epilog=example("agent list"))
+agent_group = typer.Typer(help="List the agents.", epilog=example("agent list", "agent list --json"))
 
 
 @agent_group.command("list", epilog=example("agent list"))
