@@ -133,12 +133,13 @@ def _built(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenari
     if isinstance(content, dict) and "based_on" in content:
         base = _base(document, content["based_on"], folder, above)
         own = {key: value for key, value in content.items() if key != "based_on"}
+        unknown = {key: value for key, value in own.items() if key not in Scenario.model_fields}
         inherited = {key: value for key, value in base.declared().items() if key not in ("name", *WORDS)}
-        content = changed_content(inherited, own)
+        content = {**changed_content(inherited, own), **unknown}
     content = _with_rows(document, (), content, folder)
     listed = content.get("mixture") if isinstance(content, dict) else None
     if isinstance(listed, list | tuple):
-        content = {**content, "mixture": [_member(document, i, entry, folder) for i, entry in enumerate(listed)]}
+        content = {**content, "mixture": [_member(document, i, entry, folder, above) for i, entry in enumerate(listed)]}
     scenario = Scenario.from_document(Document(document.file, content, document.lines))
     if base is not None:
         for key in document.content.keys() - {"name", *WORDS, "based_on"}:
@@ -154,15 +155,19 @@ def _base(document: Document, name: Any, folder: Path, above: tuple[Path, ...]) 
         if not isinstance(name, str):
             right = "must be the name of a scenario or the path of its file"
             raise InvalidInput(f"based_on = {flow_text(name, 60)}: {right}")
-        path = scenario_path(name, folder)
-        places = [each.resolve() for each in above]
-        if path.resolve() in places:
-            circle = " -> ".join(each.stem for each in (*above[places.index(path.resolve()) :], path))
-            raise InvalidInput(f"based_on = {name}: {circle} is a circle; base one of them on another scenario")
-        return _load(path, above)
+        return _load_below(f"based_on = {name}", scenario_path(name, folder), above)
 
 
-def _member(document: Document, i: int, entry: Any, folder: Path) -> Any:
+def _load_below(what: str, path: Path, above: tuple[Path, ...]) -> Scenario:
+    """Load a scenario that the last file of ``above`` needs. Raises ``InvalidInput`` if it is one of these files."""
+    places = [each.resolve() for each in above]
+    if path.resolve() in places:
+        circle = " -> ".join(each.stem for each in (*above[places.index(path.resolve()) :], path))
+        raise InvalidInput(f"{what}: {circle} is a circle; base one of them on another scenario")
+    return _load(path, above)
+
+
+def _member(document: Document, i: int, entry: Any, folder: Path, above: tuple[Path, ...]) -> Any:
     if not isinstance(entry, dict) or "scenario" not in entry:
         return entry
     at: YamlPath = ("mixture", i, "scenario")
@@ -170,7 +175,8 @@ def _member(document: Document, i: int, entry: Any, folder: Path) -> Any:
     if not isinstance(member, str):
         return {**entry, "scenario": _with_rows(document, at, member, folder)}
     with document.refusing_at(at):
-        return {**entry, "scenario": load_scenario(scenario_path(member, folder)).declared()}
+        loaded = _load_below(f"mixture[{i}].scenario = {member}", scenario_path(member, folder), above)
+        return {**entry, "scenario": loaded.declared()}
 
 
 def _with_rows(document: Document, at: YamlPath, content: Any, folder: Path) -> Any:

@@ -351,6 +351,8 @@ BASED = {
     "a.yaml, line 2: based_on = [b]: must be the name of a scenario or the path of its file": "[b]",
     "a.yaml, line 2: based_on = a.yaml: a -> a is a circle; base one of them on another scenario": "a.yaml",
     "based_on = a.yaml: a -> b -> a is a circle; base one of them on another scenario": "b.yaml",
+    "a.yaml, line 3: frictoin: unknown key; did you mean friction": "paper-random\nfrictoin: null",
+    "a -> c -> a is a circle; base one of them on another scenario": "c.yaml",
     "a.yaml, line 3: mass_kg: unknown key; did you mean mass_t (tonnes)?": "paper-random\nmass_kg: 3",
     "missing.yaml: the file does not exist": "missing.yaml",
 }
@@ -359,6 +361,7 @@ BASED = {
 @pytest.mark.parametrize("message", BASED)
 def test_based_on__refuses(message: str, empty_folder: Path) -> None:
     write("b", "based_on: a.yaml\n")
+    write("c", "mixture: [{scenario: paper-random}, {scenario: a.yaml}]\n")
     with refused(message):
         load_scenario(write("a", f"based_on: {BASED[message]}\n"))
 
