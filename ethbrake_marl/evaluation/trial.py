@@ -40,7 +40,8 @@ def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
     worlds, first = drawn.worlds, game.reset(drawn.worlds)
     harm, refused, last = {}, {}, first
     for what, spec in COMPARED.items():
-        if loaded.learners and spec in AGENTS:
+        alone = spec == "best_harm"  # each of several learners would assume that the others brake fully
+        if loaded.learners and spec in AGENTS and not (alone and len(loaded.learners) > 1):
             try:
                 team = team_of(make_agent(spec, scenario=loaded, harm_count=count), loaded)
                 then = drive(game, worlds, team)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
+
 from ethbrake_marl.evaluation.trial import COMPARED, WORLDS, try_scenario
+from ethbrake_marl.names import AGENTS
 from ethbrake_marl.worlds.catalogue import load_scenario
 
 PAPER = load_scenario("paper-random")
@@ -32,3 +35,9 @@ def test_trial__counts_what_moves_what_is_late_and_what_collides_early(monkeypat
 def test_trial__of_a_line_that_nobody_learns_in_has_no_harm_to_compare():
     trial = try_scenario(PAPER.with_learners([]))
     assert trial.harm == {} and trial.known == {} and trial.moving == 0
+
+
+@pytest.mark.skipif("best_harm" not in AGENTS, reason="the search is an extension")
+def test_best_known__is_told_of_one_learner_alone() -> None:
+    assert "best known" in try_scenario(PAPER).harm
+    assert [*try_scenario(load_scenario("cooperation-3-pair")).harm] == ["full braking", "best constant deceleration"]
