@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.doors import names_behind
 from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.errors import naming_extras
+from ethbrake_marl.renamed import new_name
 
 if TYPE_CHECKING:
     # Environments
@@ -109,8 +110,8 @@ def _import_public(name: str) -> Any:
         if find_spec(folder) is not None and find_spec(f"{folder}.{name}") is not None:
             return import_module(f"{folder}.{name}")
         close = get_close_matches(name, _HOMES, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
+        hint = new_name(name) or (f"did you mean {close[0]!r}?" if close else "")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint and '; '}{hint}")
     register_environments()
     with naming_extras():
         value = getattr(import_module(_HOMES[name]), name)

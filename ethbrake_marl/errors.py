@@ -11,6 +11,8 @@ from difflib import get_close_matches
 from importlib.util import find_spec
 from numbers import Integral
 
+from ethbrake_marl.renamed import new_name
+
 _NAMED = 5  # largest number of failed worlds that a message lists one by one
 
 LINE_LIMIT = 1_500  # characters of a message; a longer message is shortened in the middle
@@ -200,7 +202,7 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name. Its message shows a similar name, or all ``known`` names.
+    """Return the error for an unknown name. Its message shows the new name, a similar one, or all ``known`` names.
 
     ``kind`` is a noun such as ``scenario``. ``may_be_own``: the message adds that own names must be registered first.
     """
@@ -208,6 +210,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
     own = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
     hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"
+    hint = new_name(name) or hint
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
 
 

@@ -26,6 +26,7 @@ from ethbrake_marl.cli.command import INTERRUPTED, Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.kernel_store import obstacle, on_first_compilation
 from ethbrake_marl.registry import OURS, Registry, giver, points
+from ethbrake_marl.renamed import new_name
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -89,6 +90,9 @@ def run_command(arguments: Sequence[str]) -> int:
         where = context.command_path if context else "ethbrake"
         message = re.sub(r"Value error, |, unable to parse string as an? \w+", "", error.format_message())
         message = message.replace("Input should be", "must be").replace("a valid integer", "a whole number")
+        unknown = re.match(r"No such (?:command|option:?) '?([\w-]+)'?", message)
+        if unknown and (renamed := new_name(unknown[1])):
+            message = f"{unknown[0]}; {renamed}"
         return _refuse(f"{message} (see: {where} --help)")
     except EthBrakeError as error:
         return _refuse(str(error))
