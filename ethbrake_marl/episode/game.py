@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ethbrake_marl.episode import step as one_step
+from ethbrake_marl.episode.commands import proposal_array
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State, check_exact
@@ -98,7 +99,7 @@ class Game(NamedTuple):
         """
         if self.shield is not None:
             if actions is not None:
-                actions = one_step.proposals(self.rules, actions, state.n)
+                actions = proposal_array(self.rules.learners, actions, state.n)
             actions, memory = self.shield.decide(self, state, actions, donate=donate)
             state = state._replace(memories={**state.memories, "shield": memory})
         if self.rewarding.is_compiled:

@@ -24,12 +24,13 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import action_of
 from ethbrake_marl.episode.counts import COUNTS, amount_so_far
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import LISTED, NUMBER, TIME, State, split_world
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.layout import BRAKING, COUNT, DRIVING, FIRST, FORCE, MASS, TOTAL, Floats, Ints
+from ethbrake_marl.motion.layout import COUNT, FIRST, FORCE, MASS, TOTAL, Floats, Ints
 
 NUMBERS = (
     "time_s",
@@ -63,8 +64,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
             command, world = wanted[k, i], out[k, o]
             world[0], world[1], world[2], world[3] = clock[k, TIME], line[k, FORCE, i], borne[0, i - 1], borne[1, i - 1]
             world[4], world[5], world[6], world[7] = first, total, 1.0 if impacts > 0.0 else 0.0, command
-            capacity = car[k, BRAKING if command < 0.0 else DRIVING, i]
-            world[8] = min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0
+            world[8] = action_of(car[k], i, command, clock[k, TIME])
 
 
 def numbers(state: State, bodies: Ints) -> Floats:

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import write_commands
 from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, weights_of
-from ethbrake_marl.episode.state import ENDED, PHYSICS, STEPS, State, check_exact
-from ethbrake_marl.episode.step import advance, command, note_motion
+from ethbrake_marl.episode.state import ENDED, PHYSICS, STEPS, TIME, State, check_exact
+from ethbrake_marl.episode.step import advance, note_motion
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
 from ethbrake_marl.motion.layout import BRAKING, LINE_ROWS, Floats, scratch_for
@@ -37,7 +38,8 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, co
     for k in range(len(out)):
         harm = amount_so_far(line[k], count)
         while clock[k, ENDED] == 0.0 and harm <= most[k]:
-            command(car[k], wanted[k], learners, plans[k, min(int(clock[k, STEPS]), plans.shape[1] - 1)])
+            actions = plans[k, min(int(clock[k, STEPS]), plans.shape[1] - 1)]
+            write_commands(car[k], wanted[k], learners, actions, clock[k, TIME])
             met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
             harm = math.inf if met == FAILED else amount_so_far(line[k], count)
         out[k] = harm

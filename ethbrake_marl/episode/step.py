@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import LARGEST_ACTION, action_array, check_actions, write_commands
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.state import (
     CLOCK_COLUMNS,
@@ -22,7 +23,7 @@ from ethbrake_marl.episode.state import (
     check_exact,
     mapped,
 )
-from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, PhysicsError, describe_error
+from ethbrake_marl.errors import AgentFailed, EthBrakeError, PhysicsError, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, MET, drive, drive_worlds
 from ethbrake_marl.motion.layout import (
@@ -53,7 +54,6 @@ SAFE_END = 4  # 1 if the episode has ended without any impact
 COUNTED = 5  # harm of the step in the reward's count (m2/s2)
 OUT_ROWS = 6
 
-LARGEST_ACTION = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # counts as 1: the next float32 number
 ROUNDING = 1e-9  # fraction of a step: a horizon that exceeds whole steps by less needs no further step
 
 
@@ -117,17 +117,6 @@ class Step(NamedTuple):
     def safe_end(self) -> Bools:
         """Whether the episode ended in this step without any impact, [n]."""
         return self.out[SAFE_END] == 1.0
-
-
-@kernel
-def command(car, wanted, learners, actions):
-    """Write one world's commands (m/s2) to ``wanted`` [N + 1], from the ``actions`` [L] of the bodies ``learners`` [L].
-
-    Action -1: full braking; 0: coasting; 1: full driving.
-    """
-    for j in range(learners.shape[0]):
-        i, action = learners[j], min(max(actions[j], -1.0), 1.0)
-        wanted[i] = action * car[BRAKING, i] if action < 0.0 else action * car[DRIVING, i]
 
 
 @kernel
@@ -199,7 +188,7 @@ def step_worlds(line, car, clock, wanted, actions, scratch, out, reward, learner
             reward[k, i] = 0.0
         if clock[k, ENDED] == 1.0:
             continue
-        command(car[k], wanted[k], learners, actions[k])
+        write_commands(car[k], wanted[k], learners, actions[k], clock[k, TIME])
         before = beside_harm(line[k], count)
         met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
         if met == FAILED:
@@ -296,7 +285,7 @@ def step(
     ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` look at the state at every decision. Raises
     ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
-    actions = numbers_of(rules, actions, state.n)
+    actions = action_array(rules.learners, actions, state.n)
     line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
     if not donate:
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
@@ -307,7 +296,7 @@ def step(
         rules.terminal, rules.counting,
     )  # fmt: skip
     if refused >= 0:
-        _check_actions(rules, actions[refused])
+        check_actions(rules.learners, actions[refused])
     if failed >= 0:
         raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
@@ -322,37 +311,6 @@ def scripted(scripts: Mapping[int, Any], state: State) -> State:
     for i, command_mps2 in commands.items():
         np.copyto(wanted[:, i], command_mps2, where=running)
     return state._replace(wanted=wanted, memories=memories)
-
-
-def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None) -> State:
-    """State with the commands of scripts and learners, as at the beginning of a step; arguments of ``step``."""
-    given = proposals(rules, numbers_of(rules, actions, state.n), state.n)
-    if np.isnan(given).any():
-        _check_actions(rules, given[np.isnan(given).any(axis=1).argmax()])
-    state, learners = scripted(scripts, state), rules.learners
-    capacity = np.where(given < 0.0, state.car[:, BRAKING, learners], state.car[:, DRIVING, learners])
-    running = ~state.ended[:, np.newaxis]
-    state.wanted[:, learners] = np.where(running, given * capacity, state.wanted[:, learners])
-    return state
-
-
-def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
-    """Actions of the L learners as float64 [n, L]. Raises ``InvalidInput`` for another type or shape."""
-    shape = n, len(rules.learners)
-    if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
-        raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
-    return np.ascontiguousarray(actions, np.float64)
-
-
-def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
-    """Copy of proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput``."""
-    actions = numbers_of(rules, actions, n)
-    size = np.abs(actions)
-    if not (size > 1.0).any():
-        return actions.copy()
-    for row in actions[(size > LARGEST_ACTION).any(axis=1)]:
-        _check_actions(rules, np.where(np.isnan(row), 0.0, row))
-    return np.clip(actions, -1.0, 1.0)
 
 
 def begin(script: Any, alert: State, body: int) -> Any:
@@ -420,14 +378,6 @@ def _called(script: Any, method: str, state: State, *given: Any) -> Any:
     except Exception as error:
         name, body = getattr(script, "name", type(script).__name__), given[-1]
         raise AgentFailed(name, None, f"vehicle_{body}: {method} fails: {describe_error(error)}") from error
-
-
-def _check_actions(rules: Rules, actions: Floats) -> None:
-    for body, action in zip(rules.learners, actions, strict=True):
-        if not -LARGEST_ACTION <= action <= LARGEST_ACTION:
-            raise InvalidInput(
-                f"action of vehicle_{body} = {float(action)!r}: must be from -1 (full braking) to 1 (full driving)"
-            )
 
 
 def failure(state: State, row: int, start_s: float, until_s: float) -> PhysicsError:

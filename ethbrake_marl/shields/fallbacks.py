@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent, propose, to_action
+from ethbrake_marl.agents.drive import Agent, propose
 from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import descend, hold
 from ethbrake_marl.episode.state import END, State
@@ -36,12 +37,11 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
     actions = []
     for column, body in enumerate(learners.tolist()):
         action = np.full((n, len(learners)), -1.0)
-        action[:, column] = to_action(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
+        action[:, column] = actions_of(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
         actions.append(action)
     if len(learners) > 1:
         wanted, _ = descend(state, learners.tolist(), SHARES, ROUNDS, until_s, count)
-        descended = [to_action(alert, body, wanted[:, body]) for body in learners.tolist()]
-        actions += [np.stack(descended, axis=1), np.full((n, len(learners)), -1.0)]
+        actions += [actions_of(alert, learners, wanted[:, learners]), np.full((n, len(learners)), -1.0)]
     return [held(game, action) for action in actions]
 
 

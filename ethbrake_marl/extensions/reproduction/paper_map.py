@@ -33,6 +33,7 @@ from functools import partial
 import numpy as np
 
 from ethbrake_marl.episode import step as one_step
+from ethbrake_marl.episode.commands import check_actions, commands_of, proposal_array
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, PHYSICS, STEPS, TIME, State
@@ -138,7 +139,7 @@ class MappedGame(Game):
         return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        before, rules = one_step.decided(self.rules, self.scripts, state, actions), self.rules
+        before, rules = decided(self, state, actions), self.rules
         after, over = sample(before, rules.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
         np.copyto(after.clock, before.clock, where=over[:, np.newaxis])
@@ -154,6 +155,18 @@ class MappedGame(Game):
         shared = rules.terminal * out[SAFE_END] - rules.harm * out[COUNTED]
         reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)
         return after, Step(reward, out, rules.time_step_s)
+
+
+def decided(game: Game, state: State, actions: Floats | None) -> State:
+    """State with the commands of scripts and learners, as at the beginning of a step of a game."""
+    learners = game.rules.learners
+    given = proposal_array(learners, actions, state.n)
+    if np.isnan(given).any():
+        check_actions(learners, given[np.isnan(given).any(axis=1).argmax()])
+    state = one_step.scripted(game.scripts, state)
+    commands = commands_of(state, learners, given)
+    state.wanted[:, learners] = np.where(state.ended[:, np.newaxis], state.wanted[:, learners], commands)
+    return state
 
 
 class PaperMap:
