@@ -20,7 +20,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, failure, first_decision, step
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.roles import HELD, LEARNER
 
@@ -41,7 +41,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
     """
     until_s = np.full(alert.n, horizon_s, np.float64)
     braking = np.maximum(-alert.wanted, 0.0)
-    braking[:, body] = alert.car[:, BRAKING, body]
+    braking[:, body] = alert.braking_capacity_mps2[:, body - 1]
     best = closed_form(alert, braking, body).deceleration_mps2
     harm = harms(alert, body, best[:, np.newaxis], count, until_s)[:, :, 0]
     rows = np.flatnonzero(harm.any(axis=0))
@@ -69,7 +69,7 @@ def search(alert: State, body: int, count: str, until_s: Floats) -> Floats:
     ends.
     """
     best = np.full((alert.n, 3), np.inf)
-    rows, step = np.arange(alert.n), alert.car[:, BRAKING, body] / FIRST_PARTS
+    rows, step = np.arange(alert.n), alert.braking_capacity_mps2[:, body - 1] / FIRST_PARTS
     at = step[:, np.newaxis] * np.arange(FIRST_PARTS + 1)
     harm = harms(alert, body, at, count, until_s)
     while len(rows):
@@ -169,7 +169,7 @@ class EV2XBM:
                     " alert; use e_v2x_bm:pairwise, which assumes that its neighbours brake fully"
                 )
         wanted, learners = alert.wanted.copy(), self.rules.learners
-        wanted[:, learners] = -alert.car[:, BRAKING][:, learners]
+        wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
         alert = alert._replace(wanted=wanted)
         command = -coupled(alert, body, self.count, self.rules.horizon_s).deceleration_mps2
         wanted[:, body] = command

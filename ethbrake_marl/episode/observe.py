@@ -27,6 +27,7 @@ from ethbrake_marl.episode.features import (
 from ethbrake_marl.episode.functions import called, check_finite
 from ethbrake_marl.episode.state import TIME, State
 from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.forces import capacity
 from ethbrake_marl.motion.layout import (
     BRAKING,
     DRIVING,
@@ -198,7 +199,7 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
         for o in range(len(observers)):
             i = observers[o]
             left = max(c[OWN_LATENCY, i] - time, 0.0)
-            own = full_stop_m(w[SPEED, i], left, c[BRAKING, i])
+            own = full_stop_m(w[SPEED, i], left, capacity(c, BRAKING, i, time))
             value[0], value[1], value[2], value[3] = w[SPEED, i], w[FORCE, i], c[BRAKING, i], c[DRIVING, i]
             value[4], value[5], value[6] = c[MASS, i], left, c[RESTITUTION, i]
             f = N_OWN
@@ -210,7 +211,7 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
                     for p in range(min(i, j), max(i, j)):
                         gap += w[GAP, p]
                     wait = max(c[OWN_LATENCY, j] - time, 0.0)
-                    stop = full_stop_m(w[SPEED, j], wait, c[BRAKING, j])
+                    stop = full_stop_m(w[SPEED, j], wait, capacity(c, BRAKING, j, time))
                     value[f], value[f + 1], value[f + 3] = 1.0, gap, w[FORCE, j]
                     value[f + 2] = w[SPEED, i] - w[SPEED, j] if front else w[SPEED, j] - w[SPEED, i]
                     value[f + 4], value[f + 5], value[f + 6] = c[BRAKING, j], c[MASS, j], wait

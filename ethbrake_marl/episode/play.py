@@ -18,6 +18,7 @@ from ethbrake_marl.episode.state import ENDED, PHYSICS, STEPS, TIME, State, chec
 from ethbrake_marl.episode.step import advance, note_motion
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING, LINE_ROWS, Floats, scratch_for
 
 if TYPE_CHECKING:
@@ -127,9 +128,10 @@ def descend(
     ``shares`` are the candidates, in [0, 1]. The bodies take turns in ``rounds`` rounds, each with the others' latest
     choice. Returns the commands of all bodies, [n, N + 1] m/s2, and the harm of the episode, [n] m2/s2.
     """
-    wanted, least = -state.car[:, BRAKING], np.zeros(state.n)
+    braking = capacities(state.car, BRAKING, state.time_s)
+    wanted, least = -braking, np.zeros(state.n)
     for body in list(bodies) * rounds:
-        tried = -state.car[:, BRAKING, [body]] * shares
+        tried = -braking[:, [body]] * shares
         harm = hold(state, wanted, [body], tried[:, :, np.newaxis], until_s, count)[0]
         wanted[:, body] = np.take_along_axis(tried, harm.argmin(axis=1)[:, np.newaxis], 1)[:, 0]
         least = harm.min(axis=1)

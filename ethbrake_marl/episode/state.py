@@ -10,6 +10,7 @@ import numpy as np
 from ethbrake_marl.episode.counts import Count, amount_so_far, own_amounts, pair_amounts, weights_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import (
     BRAKING,
     COUNT,
@@ -156,13 +157,13 @@ class State(NamedTuple):
 
     @property
     def braking_capacity_mps2(self) -> Floats:
-        """Largest deceleration on this road, [n, N] m/s2."""
-        return self.car[:, BRAKING, 1:]
+        """Largest deceleration now, [n, N] m/s2."""
+        return capacities(self.car, BRAKING, self.time_s)[:, 1:]
 
     @property
     def driving_capacity_mps2(self) -> Floats:
-        """Largest forward acceleration on this road, [n, N] m/s2."""
-        return self.car[:, DRIVING, 1:]
+        """Largest forward acceleration now, [n, N] m/s2."""
+        return capacities(self.car, DRIVING, self.time_s)[:, 1:]
 
     @property
     def mass_t(self) -> Floats:

@@ -17,7 +17,7 @@ from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import descend, hold
 from ethbrake_marl.episode.state import END, State
-from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.motion.layout import Floats
 
 SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
 ROUNDS = 2  # in which they try them
@@ -33,7 +33,7 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
     """
     learners, n, until_s = game.rules.learners, state.n, state.clock[:, END]
     full = alert._replace(wanted=state.wanted.copy())
-    full.wanted[:, learners] = -alert.car[:, BRAKING, learners]
+    full.wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
     actions = []
     for column, body in enumerate(learners.tolist()):
         action = np.full((n, len(learners)), -1.0)
@@ -66,7 +66,7 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
         for column in range(len(learners)):
             alone[:, column * len(ALONE) : (column + 1) * len(ALONE), column] = ALONE
         actions = np.concatenate([actions, alone], axis=1)
-    commands = actions.repeat(each, axis=0) * states.car[:, np.newaxis, BRAKING, learners]
+    commands = actions.repeat(each, axis=0) * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
     harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], count)[0]
     harm = harm.reshape(len(plans), each, -1).max(axis=1)
     best = harm.argmin(axis=1)

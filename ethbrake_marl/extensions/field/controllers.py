@@ -18,7 +18,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.motion.layout import BRAKING, DRIVING, FAR_M, FORCE, GAP, SPEED, Bools, Floats
+from ethbrake_marl.motion.layout import FAR_M, FORCE, GAP, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 
 TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap
@@ -252,7 +252,8 @@ class Controller:
             elapsed, perceiving = state.time_s - memory + SAME_S, getattr(p, "perception", 0.0)
             waiting = np.where(elapsed < perceiving, 0.0, np.minimum(seen.own_mps2, -getattr(p, "release", 0.0)))
             command = np.where(elapsed < perceiving + p.reaction, waiting, command)
-        return np.clip(command, -state.car[:, BRAKING, body], state.car[:, DRIVING, body]), memory
+        braking, driving = state.braking_capacity_mps2, state.driving_capacity_mps2
+        return np.clip(command, -braking[:, body - 1], driving[:, body - 1]), memory
 
 
 def make_controller(argument: str | None, settings: Any) -> Controller:

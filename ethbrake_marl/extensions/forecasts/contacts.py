@@ -13,16 +13,17 @@ import math
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import command_of
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.state import TIME, State, check_exact
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, MET, drive
+from ethbrake_marl.motion.forces import capacity
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
     CAR_ROWS,
-    DRIVING,
     FAR_M,
     FORCE,
     GAP,
@@ -102,9 +103,9 @@ def known_line(line, car, know, time, i, known, parameters, commands):
         parameters[LATENCY, j], commands[j] = 0.0, force if inside else 0.0
         if j == i or force == 0.0:
             parameters[LATENCY, j] = max(car[OWN_LATENCY, j] - time, 0.0)
-            commands[j] = -car[BRAKING, j] if inside else 0.0
+            commands[j] = -capacity(car, BRAKING, j, time) if inside else 0.0
         elif inside and force < 0.0 and car[BRAKE_RATE, j] < math.inf:
-            commands[j] = -car[BRAKING, j]
+            commands[j] = -capacity(car, BRAKING, j, time)
     if first == 1 and line[GAP, 0] < FAR_M:
         known[GAP, 0], first = line[GAP, 0], 0
     return first, last
@@ -127,7 +128,7 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 for row in range(LINE_ROWS):
                     for j in range(here.shape[1]):
                         here[row, j] = known[row, j]
-                commands[i] = -car[k, BRAKING, i] if c == 0 else car[k, DRIVING, i] if c == 2 else 0.0
+                commands[i] = command_of(car[k], i, c - 1.0, clock[k, TIME])
                 met = drive(here, parameters, commands, scratch, 0.0, FORECAST_S)
                 if met == FAILED:
                     failed = k

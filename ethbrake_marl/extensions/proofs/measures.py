@@ -10,6 +10,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import LowerBound, lower_bound
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.registry import Part
 
@@ -45,7 +46,7 @@ def _controlled(game: Game, alert: State, *, together: bool = False) -> int:
     """Return the controlled vehicle, or 2 for Vehicles 2 and 3 together. Raises ``InvalidInput`` for other learners."""
     learners = game.rules.learners.tolist()
     others = [body for body in range(1, alert.vehicles + 1) if body not in learners]
-    if game.scripts or (alert.wanted[:, others] != -alert.car[:, BRAKING, others]).any():
+    if game.scripts or (alert.wanted[:, others] != -capacities(alert.car, BRAKING, alert.time_s)[:, others]).any():
         raise InvalidInput(
             "avoidable, proven_harm: a vehicle that does not learn does not brake fully; all others must"
         )

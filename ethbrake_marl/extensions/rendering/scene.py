@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import action_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import advance_worlds
 from ethbrake_marl.motion.layout import (
-    BRAKING,
     COUNT,
-    DRIVING,
     FAR_M,
     FIRST,
     GAP,
@@ -88,8 +87,7 @@ class Scene(NamedTuple):
 
     def share(self, body: int) -> float:
         """Return the command as a share of the capacity, -1 (brakes fully) to 1 (drives fully)."""
-        command = self.command(body)
-        return command / float(self.car[BRAKING if command < 0.0 else DRIVING, body]) if command else 0.0
+        return float(action_of(self.car, body, self.command(body), self.time_s))
 
     def said_of(self, body: int) -> str:
         """Return what a vehicle does, in words such as "brakes 3.0 m/s2"."""

@@ -41,6 +41,7 @@ from ethbrake_marl.extensions.report.style import (
     write_picture,
 )
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING, LATENCY, Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.describe import quantities_of
@@ -200,7 +201,7 @@ def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float)
 
     Rows: first-impact harm predicted by the paper's closed form, and simulated first-impact and total harm.
     """
-    braking, wait = np.ascontiguousarray(world.car[0, BRAKING]), world.car[0, LATENCY].copy()
+    braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING, world.time_s)[0]), world.car[0, LATENCY].copy()
     priced: Any = predicted_harm
     predicted = [priced(world.line[0], braking, wait, body, float(a)) for a in at]
     return np.stack([predicted, *hold(world, world.wanted, [body], -at[None, :, None], horizon_s, "first")[:, 0]])
@@ -225,7 +226,7 @@ def deceleration_figure(
         )
     (body,), horizon_s = loaded.learners, loaded.horizon_s
     chosen = float(pairwise(world, body).deceleration_mps2[0])
-    at = np.union1d(np.linspace(0.0, world.car[0, BRAKING, body], DECELERATION_POINTS), [chosen])
+    at = np.union1d(np.linspace(0.0, world.braking_capacity_mps2[0, body - 1], DECELERATION_POINTS), [chosen])
     predicted, first, total = harm_of_decelerations(world, body, at, horizon_s)
     place = int(np.searchsorted(at, chosen))
     figure, (axes,) = new_panels((8.0, 4.9))

@@ -22,6 +22,7 @@ from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
@@ -144,8 +145,8 @@ class Problem(NamedTuple):
     @property
     def bounds(self) -> Floats:
         """Smallest and largest command of each controlled vehicle, [n, B, 2] m/s2."""
-        car = self.state.car[:, :, self.bodies]
-        return np.ascontiguousarray(np.stack([-car[:, BRAKING], car[:, DRIVING]], axis=2))
+        braking, driving = self.state.braking_capacity_mps2, self.state.driving_capacity_mps2
+        return np.ascontiguousarray(np.stack([-braking, driving], axis=2)[:, self.bodies - 1])
 
     def take(self, rows: Any) -> Problem:
         return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
@@ -282,7 +283,7 @@ def problem_of(
 def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
     """Return worlds at the alert in which some vehicles brake fully, whatever their roles say."""
     wanted = alert.wanted.copy()
-    wanted[:, bodies] = -alert.car[:, BRAKING][:, bodies]
+    wanted[:, bodies] = -capacities(alert.car, BRAKING, alert.time_s)[:, bodies]
     return alert._replace(wanted=wanted)
 
 
