@@ -44,7 +44,7 @@ NUMBERS = (
     "chosen_action",
 )
 COLLIDED = NUMBERS.index("collided")
-OF_FIRST, OF_ALL = COUNTS["first"], COUNTS["total"]
+FIRST_WEIGHTS, TOTAL_WEIGHTS = COUNTS["first"], COUNTS["total"]
 
 
 @large
@@ -56,7 +56,8 @@ def report(line, car, clock, wanted, bodies, borne, out):
     for k in range(len(out)):
         split_world(line[k, FIRST], car[k, MASS], borne[0])
         split_world(line[k, TOTAL], car[k, MASS], borne[1])
-        first, total, impacts = amount_so_far(line[k], OF_FIRST), amount_so_far(line[k], OF_ALL), 0.0
+        first, total = amount_so_far(line[k], FIRST_WEIGHTS), amount_so_far(line[k], TOTAL_WEIGHTS)
+        impacts = 0.0
         for p in range(line.shape[2] - 1):
             impacts += line[k, COUNT, p]
         for o in range(len(bodies)):
@@ -89,7 +90,7 @@ def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str,
         nothing = np.zeros(state.n)
         return {"cost": nothing, **worlds, **{f"reward_{name}": nothing for name in reported}}
     terms = step.terms or game.rewarding.shared(step)
-    return {"cost": step.counted, **worlds, **{f"reward_{name}": terms[name] for name in reported}}
+    return {"cost": step.cost, **worlds, **{f"reward_{name}": terms[name] for name in reported}}
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:

@@ -30,27 +30,27 @@ def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
 
 
 @large
-def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, count, scratch, out):
+def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, weights, scratch, out):
     """Follow plans [n, T, L] of the L learners, in place; write the harm to ``out`` [n].
 
     An episode stops above the harm ``most`` [n]. After T decisions the last one repeats. The other arguments are those
     of ``step.step_worlds``.
     """
     for k in range(len(out)):
-        harm = amount_so_far(line[k], count)
+        harm = amount_so_far(line[k], weights)
         while clock[k, ENDED] == 0.0 and harm <= most[k]:
             actions = plans[k, min(int(clock[k, STEPS]), plans.shape[1] - 1)]
             write_commands(car[k], wanted[k], learners, actions, clock[k, TIME])
             met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
-            harm = math.inf if met == FAILED else amount_so_far(line[k], count)
+            harm = math.inf if met == FAILED else amount_so_far(line[k], weights)
         out[k] = harm
 
 
 @large
-def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, memory, out):
+def hold_worlds(line, car, wanted, bodies, tried, time, until, weights, tie_weights, memory, out):
     """Write the harm to ``out`` [2, n, C] if ``bodies`` [B] hold the commands ``tried`` [n, C, B] (m/s2).
 
-    The other bodies hold ``wanted``. Row 0 of ``out`` counts by the weights ``count`` [6], row 1 by ``other``. ``time``
+    The other bodies hold ``wanted``. Row 0 of ``out`` counts by ``weights`` [6], row 1 by ``tie_weights``. ``time``
     and ``until`` [n] (s): from when to when they hold. ``line``, ``car`` and ``wanted`` are arrays of a ``State``;
     ``memory``: ``working_memory``, overwritten.
     """
@@ -66,8 +66,8 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, count, other, mem
                 commands[bodies[b]] = tried[k, j, b]
             failed = drive(here, car[k], commands, scratch, time[k], until[k]) == FAILED
             note_motion(here)
-            out[0, k, j] = math.inf if failed else amount_so_far(here, count)
-            out[1, k, j] = math.inf if failed else amount_so_far(here, other)
+            out[0, k, j] = math.inf if failed else amount_so_far(here, weights)
+            out[1, k, j] = math.inf if failed else amount_so_far(here, tie_weights)
 
 
 def played(
@@ -112,10 +112,10 @@ def hold(
     """
     others = "e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping"
     check_exact(state, f"a plan of constant commands ({others})")
-    out, counts = np.empty((2, *tried.shape[:2])), (weights_of(count), weights_of(other_count(count)))
+    out, weights = np.empty((2, *tried.shape[:2])), (weights_of(count), weights_of(other_count(count)))
     hold_worlds(
         state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(tried),
-        state.time_s.copy(), np.full(state.n, until_s, np.float64), *counts, working_memory(wanted.shape[1]), out,
+        state.time_s.copy(), np.full(state.n, until_s, np.float64), *weights, working_memory(wanted.shape[1]), out,
     )  # fmt: skip
     return out
 

@@ -280,7 +280,7 @@ class Rewarding(NamedTuple):
 
     def shared(self, step: Step) -> dict[str, Floats]:
         """Values of the terms that the compiled step computes, name -> [n]."""
-        known = {"harm": -step.counted, "terminal": step.out[SAFE_END]}
+        known = {"harm": -step.cost, "terminal": step.out[SAFE_END]}
         return {name: value for name, value in known.items() if name in self.reported}
 
 

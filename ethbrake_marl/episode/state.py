@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import Count, amount_so_far, own_amounts, pair_amounts, weights_of
+from ethbrake_marl.episode.counts import Count, amount_so_far, pair_amounts, weights_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacities
@@ -198,14 +198,14 @@ class State(NamedTuple):
         Without impacts with the obstacle and, in the honest cost, Vehicle 1's own driving and motion.
         """
         self._check_count(count)
-        return pair_amounts(self.line, count)[:, 1:-1]
+        return pair_amounts(self.line, count)[0, :, 1:-1]
 
     def borne_harm(self, count: Count = "first") -> Floats:
         """Harm that each vehicle has borne so far, [n, N] m2/s2. The two shares of a pair sum to its harm."""
         self._check_count(count)
-        own, out = own_amounts(self.line, count), np.empty((self.n, self.vehicles))
-        split_harm(pair_amounts(self.line, count) - own, self.car[:, MASS], out)
-        return out + own[:, :-1]
+        (pairs, unshared), out = pair_amounts(self.line, count), np.empty((self.n, self.vehicles))
+        split_harm(pairs - unshared, self.car[:, MASS], out)
+        return out + unshared[:, :-1]
 
     def _check_count(self, count: Count) -> None:
         if PHYSICS not in self.memories:

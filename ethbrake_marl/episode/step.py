@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.commands import LARGEST_ACTION, action_array, check_actions, write_commands
-from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.counts import COUNTS, OF_FIRST, OF_TOTAL, beside_harm
 from ethbrake_marl.episode.state import (
     CLOCK_COLUMNS,
     END,
@@ -30,14 +30,11 @@ from ethbrake_marl.motion.layout import (
     BRAKING,
     COUNT,
     DRIVING,
-    DROVE,
     FORCE,
     LATENCY,
     MOVING,
     NEW_FIRST,
     NEW_TOTAL,
-    PASSED,
-    PUSHED,
     SPEED,
     Bools,
     Floats,
@@ -51,7 +48,7 @@ TOTAL_HARM = 1  # harm of all impacts of the step (m2/s2)
 TERMINATED = 2  # 1 if all vehicles have come to rest
 TRUNCATED = 3  # 1 if the end of the last step has come first
 SAFE_END = 4  # 1 if the episode has ended without any impact
-COUNTED = 5  # harm of the step in the reward's count (m2/s2)
+COST = 5  # harm of the step in the reward's count (m2/s2)
 OUT_ROWS = 6
 
 ROUNDING = 1e-9  # fraction of a step: a horizon that exceeds whole steps by less needs no further step
@@ -65,7 +62,7 @@ class Rules(NamedTuple):
     horizon_s: float
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
-    counting: Floats = COUNTS["first"]  # weights of what counts in the reward (``episode.counts``)
+    weights: Floats = COUNTS["first"]  # of what counts as harm in the reward (``episode.counts``)
     most_steps: float = np.inf  # number of steps after which an episode is truncated, as at the horizon
 
 
@@ -99,9 +96,9 @@ class Step(NamedTuple):
         return self.out[TOTAL_HARM]
 
     @property
-    def counted(self) -> Floats:
+    def cost(self) -> Floats:
         """Harm of the line in this step in the reward's count, [n] m2/s2."""
-        return self.out[COUNTED]
+        return self.out[COST]
 
     @property
     def terminated(self) -> Bools:
@@ -154,26 +151,15 @@ def advance(line, car, clock, wanted, scratch, time_step_s):
     return met, at_rest
 
 
-@kernel
-def beside_harm(line: Floats, count: Floats) -> float:
-    """Part of the honest cost beside the harm of impacts, in one world so far (m2/s2); ``count`` [6] from ``COUNTS``.
-
-    ``amount_so_far`` sums in another order; the last bits of rewards depend on this one.
-    """
-    amount = 0.0
-    for p in range(line.shape[1] - 1):
-        amount += count[2] * line[PASSED, p] + count[3] * line[PUSHED, p]
-        amount += count[4] * line[DROVE, p] + count[5] * line[MOVING, p]
-    return amount
-
-
 @large
-def step_worlds(line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, harm, terminal, count):
+def step_worlds(
+    line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, harm, terminal, weights
+):
     """Advance every running episode by one step, in place; return the row of an invalid action and of a failed world.
 
     -1 stands for none. An action is invalid if it is not a number in [-1, 1]; then nothing has moved. ``line`` to
     ``wanted`` are arrays of a ``State``, ``out`` and ``reward`` of a ``Step``; ``scratch`` is the physics' working
-    memory. ``harm`` and ``terminal`` are weights of the reward, ``count`` [6] those of the harm in it (``COUNTS``).
+    memory. ``harm`` and ``terminal`` are weights of the reward, ``weights`` [6] those of the harm in it (``COUNTS``).
     """
     n, bodies = wanted.shape
     for k in range(n):
@@ -189,7 +175,7 @@ def step_worlds(line, car, clock, wanted, actions, scratch, out, reward, learner
         if clock[k, ENDED] == 1.0:
             continue
         write_commands(car[k], wanted[k], learners, actions[k], clock[k, TIME])
-        before = beside_harm(line[k], count)
+        before = beside_harm(line[k], weights)
         met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
         if met == FAILED:
             failed = k
@@ -203,9 +189,10 @@ def step_worlds(line, car, clock, wanted, actions, scratch, out, reward, learner
         out[TERMINATED, k] = 1.0 if at_rest else 0.0
         out[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
         out[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
-        counted = count[0] * out[HARM, k] + count[1] * out[TOTAL_HARM, k] + (beside_harm(line[k], count) - before)
-        shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * counted
-        out[COUNTED, k] = counted
+        impact_harm = weights[OF_FIRST] * out[HARM, k] + weights[OF_TOTAL] * out[TOTAL_HARM, k]
+        cost = impact_harm + (beside_harm(line[k], weights) - before)
+        shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * cost
+        out[COST, k] = cost
         for i in range(bodies - 1):
             reward[k, i] = shared
     return -1, failed
@@ -293,7 +280,7 @@ def step(
     scratch = scratch_for(wanted.shape[1])
     refused, failed = step_worlds(
         line, car, clock, wanted, actions, scratch, out, reward, rules.learners, rules.time_step_s, rules.harm,
-        rules.terminal, rules.counting,
+        rules.terminal, rules.weights,
     )  # fmt: skip
     if refused >= 0:
         check_actions(rules.learners, actions[refused])

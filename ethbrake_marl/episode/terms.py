@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import ROWS, own_amounts, pair_amounts
+from ethbrake_marl.episode.counts import ROWS, pair_amounts
 from ethbrake_marl.episode.functions import called, check_finite, described
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.play import descend
@@ -144,7 +144,7 @@ def potential(rules: Rules, state: State) -> Floats:
     further = state.line.copy()
     further[:, ROWS] = 0.0
     state = state._replace(line=further)
-    _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], rules.counting)
+    _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], rules.weights)
     least[state.ended] = 0.0
     return -least
 
@@ -182,17 +182,15 @@ def component(name: str, count: str) -> TermFunction:
 
 
 def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
-    pairs = _grown(pair_amounts, count, before, after)
-    own = _grown(own_amounts, count, before, after)
-    return 0.0 - Harm.of(pairs, own, after.car).borne[:, vehicle]
+    return 0.0 - Harm.of(_increase(count, before, after), after.car).borne[:, vehicle]
 
 
 def _of_pair(pair: int, count: str, before: State, step: Step, after: State) -> Floats:
-    return 0.0 - _grown(pair_amounts, count, before, after)[:, pair]
+    return 0.0 - _increase(count, before, after)[0, :, pair]
 
 
-def _grown(amounts_of: Callable[..., Floats], count: str, before: State, after: State) -> Floats:
-    return amounts_of(after.line, count) - amounts_of(before.line, count)
+def _increase(count: str, before: State, after: State) -> Floats:
+    return pair_amounts(after.line, count) - pair_amounts(before.line, count)
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:

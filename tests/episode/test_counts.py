@@ -37,10 +37,10 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     while not state.ended[0]:
         assert not state.line[:, MOVING].any()
         state, step = game.step(state, np.zeros((1, 1)))
-        counted += step.counted[0]
+        counted += step.cost[0]
         assert step.vector is not None
         borne -= step.vector[0, 0]
-        assert step.reward[0].tolist() == [-step.counted[0]] * 2
+        assert step.reward[0].tolist() == [-step.cost[0]] * 2
     assert state.line[0, PUSHED].tolist() == near([0.0, 1.8, 0.0])
     assert state.line[0, MOVING].tolist() == near([18.05**2, 18.05**2, 0.0])
     assert (state.harm("first"), state.harm("total")) == (near([36.0]), near([36.0]))
@@ -72,7 +72,7 @@ def test_amounts__of_pairs_and_worlds_have_the_weights_of_the_count() -> None:
     state = state_of([5.0, 5.0], [1.0, 1.0, 1.0])
     state.line[0, ROWS] = np.arange(1.0, 7.0)[:, np.newaxis] * [1.0, 10.0, 100.0, 0.0]
     for count, weight in (("first", 1.0), ("total", 2.0), ("honest", 2.0 + 3.0 + 40.0 + 50.0 + 6.0)):
-        assert pair_amounts(state.line, count)[0].tolist() == [weight, 10.0 * weight, 100.0 * weight, 0.0]
+        assert pair_amounts(state.line, count)[0, 0].tolist() == [weight, 10.0 * weight, 100.0 * weight, 0.0]
         assert state.harm(count).tolist() == [111.0 * weight]
         assert state.pair_harm(count).tolist() == [[10.0 * weight, 100.0 * weight]]
     own = np.array([0.5, 0.0, 0.0, 0.0, 2.0, 0.0])
@@ -105,7 +105,7 @@ def test_counts__are_ordered_never_fall_and_are_the_sum_of_what_steps_count(name
             before = {each: state.harm(each) for each in COUNTS}
             now = np.minimum(state.steps, plans.shape[1] - 1)
             state, step = game.step(state, plans[np.arange(N), now])
-            counted = counted + step.counted
+            counted = counted + step.cost
             for each in COUNTS:
                 assert (state.harm(each) >= before[each]).all()
             assert (state.harm("honest") >= state.harm("total")).all()

@@ -13,7 +13,7 @@ from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import COUNTED, Step
+from ethbrake_marl.episode.step import COST, Step
 from ethbrake_marl.episode.terms import potential, register_term
 from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
@@ -35,7 +35,7 @@ def moved(gaps: list[float], speeds: list[float], seconds: float, commands: Any 
 def paid(reward: dict[str, Any], before: State, after: State, **settings: Any) -> Step:
     rewarding, rules = Rewarding.of(reward, "total", after.vehicles, LEARNERS, (0.5, 8.0), settings.pop("vector", None))
     step = step_between(before, after, **settings)
-    step.out[COUNTED] = harm = after.harm(rules.counting) - before.harm(rules.counting)
+    step.out[COST] = harm = after.harm(rules.weights) - before.harm(rules.weights)
     compiled = (rules.terminal * step.safe_end - rules.harm * harm)[:, np.newaxis]
     return rewarding.complete(before, step._replace(reward=np.repeat(compiled, after.vehicles, axis=1)), after)[1]
 

@@ -51,7 +51,7 @@ class Ruling(NamedTuple):
     time_step_s: Any
     harm: Any
     terminal: Any
-    counting: Any  # [6]
+    weights: Any  # [6]
 
 
 class Looking(NamedTuple):
@@ -140,7 +140,7 @@ def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
             mine.actions[0, j] = 1.0 if action > 1.0 else (-1.0 if action < -1.0 else action)
         refused, failed = step_worlds(
             mine.line, mine.car, mine.clock, mine.wanted, mine.actions, mine.scratch, mine.out, mine.reward,
-            rules.learners, rules.time_step_s, rules.harm, rules.terminal, rules.counting,
+            rules.learners, rules.time_step_s, rules.harm, rules.terminal, rules.weights,
         )  # fmt: skip
         for row in range(mine.out.shape[0]):
             results.out[row, t] = mine.out[row, 0] if refused < 0 else 0.0

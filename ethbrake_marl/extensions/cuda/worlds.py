@@ -239,7 +239,7 @@ def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Lo
     on = partial(torch.tensor, device=device)
     rules, plan = game.rules, game.views[int(game.rules.learners[0])].plan
     ruling = Ruling(
-        on(rules.learners), float(rules.time_step_s), float(rules.harm), float(rules.terminal), on(rules.counting)
+        on(rules.learners), float(rules.time_step_s), float(rules.harm), float(rules.terminal), on(rules.weights)
     )
     looking = Looking(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
     size = bodies, len(rules.learners), plan.scaling.shape[1], len(plan.offsets)

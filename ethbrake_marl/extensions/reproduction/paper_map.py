@@ -34,10 +34,11 @@ import numpy as np
 
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import check_actions, commands_of, proposal_array
+from ethbrake_marl.episode.counts import OF_FIRST, OF_PASSED, OF_TOTAL
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, PHYSICS, STEPS, TIME, State
-from ethbrake_marl.episode.step import COUNTED, HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
+from ethbrake_marl.episode.step import COST, HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
 from ethbrake_marl.episode.terms import pair_energies
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import UNSHOWN, require
@@ -151,8 +152,8 @@ class MappedGame(Game):
         ends = after.ended & ~over
         out[TERMINATED], out[TRUNCATED] = ends & after.at_rest, ends & ~after.at_rest
         out[SAFE_END] = ends & ~after.collided
-        out[COUNTED] = rules.counting[0] * out[HARM] + rules.counting[1] * out[TOTAL_HARM]
-        shared = rules.terminal * out[SAFE_END] - rules.harm * out[COUNTED]
+        out[COST] = rules.weights[OF_FIRST] * out[HARM] + rules.weights[OF_TOTAL] * out[TOTAL_HARM]
+        shared = rules.terminal * out[SAFE_END] - rules.harm * out[COST]
         reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)
         return after, Step(reward, out, rules.time_step_s)
 
@@ -179,7 +180,7 @@ class PaperMap:
     def game(self, game: Game) -> Game:
         """Return the game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
-        if game.rules.counting[2:].any() or counted:
+        if game.rules.weights[OF_PASSED:].any() or counted:
             what = f"the term {counted[0]}" if counted else "harm_count honest"
             raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
         terms = tuple(

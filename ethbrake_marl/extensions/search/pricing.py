@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, own_amount, pair_amount, weights_of
+from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, unshared_amount, weights_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
 from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, LAST, STEPS, State, check_exact
@@ -361,10 +361,10 @@ def worth(line, shares, weights, aim):
     for i in range(line.shape[1]):
         borne = from_ahead
         if i < line.shape[1] - 1:
-            own = own_amount(line, i, weights)
-            shared = pair_amount(line, i, weights) - own
+            unshared = unshared_amount(line, i, weights)
+            shared = pair_amount(line, i, weights) - unshared
             borne += shares[0, i] * shared
-            from_ahead = shares[1, i] * shared + shares[2, i] * own
+            from_ahead = shares[1, i] * shared + shares[2, i] * unshared
         value = max(value, borne) if aim == LARGEST else value + borne
     return value
 
