@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import MODEL, NOBODY, STATE
 from ethbrake_marl.agents.pairwise import Choice, closed_form, pairwise
-from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Rules, failure, first_decision, step
 from ethbrake_marl.errors import InvalidInput

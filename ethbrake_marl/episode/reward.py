@@ -11,7 +11,6 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from ethbrake_marl.episode.conduct import drove, push, still_moving
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State
@@ -24,9 +23,12 @@ from ethbrake_marl.episode.terms import (
     collision,
     component,
     components_of,
+    drove,
     growth,
     jerk,
+    push,
     risk,
+    still_moving,
 )
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.model import UNSHOWN, FileModel, first_mistake, require

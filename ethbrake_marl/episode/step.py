@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -20,7 +20,6 @@ from ethbrake_marl.episode.state import (
     STEPS,
     TIME,
     State,
-    check_exact,
     mapped,
 )
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, PhysicsError, describe_error
@@ -196,30 +195,6 @@ def step_worlds(
         for i in range(bodies - 1):
             reward[k, i] = shared
     return -1, failed
-
-
-def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wanted: Floats, scratch: Floats) -> int:
-    """Advance every world from ``time`` to ``until`` [n] (s), ``line`` in place; return a failed row, or -1.
-
-    The other arrays are described in ``motion.layout``; all vehicles hold the commands ``wanted`` [n, N + 1] (m/s2).
-    """
-    moved = line.copy()  # arrays of any layout become alike, because a kernel is compiled for each layout
-    failed: int = drive_worlds(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
-    line[:] = moved
-    return failed
-
-
-def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[int, Floats]]:
-    """Simulate ``these`` worlds [n] again from ``before`` to ``after``; yield each row and the physics' scratch memory.
-
-    There must be no decision between the states.
-    """
-    check_exact(before, "a quantity of single impacts")
-    scratch = scratch_for(after.vehicles + 1)
-    for k in np.flatnonzero(these).tolist():
-        line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
-        drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
-        yield k, scratch
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:

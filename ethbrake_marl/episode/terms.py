@@ -33,13 +33,13 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import ROWS, pair_amounts
 from ethbrake_marl.episode.functions import called, check_finite, described
+from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
-from ethbrake_marl.episode.play import descend
 from ethbrake_marl.episode.state import END, State, check_exact
-from ethbrake_marl.episode.step import Rules, Step
+from ethbrake_marl.episode.step import TRUNCATED, Rules, Step
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
-from ethbrake_marl.motion.layout import TOTAL, Floats
+from ethbrake_marl.motion.layout import DROVE, PUSHED, TOTAL, Floats
 from ethbrake_marl.registry import Registry
 
 TermFunction = Callable[[State, Step, State], Floats]
@@ -131,6 +131,30 @@ def risk(params: Any, before: State, step: Step, after: State) -> Floats:
     total[:, :-1] += pair_risk
     total[:, 1:] += pair_risk
     return total
+
+
+def push(before: State, step: Step, after: State) -> Floats:
+    """Term push, [n]: minus the push (m/s) of all contacts in the step.
+
+    It includes the contact with the obstacle. Formula: ``motion.push``.
+    """
+    check_exact(before, "the term push")
+    return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
+
+
+def drove(before: State, step: Step, after: State) -> Floats:
+    """Term drove, [n, N]: minus the speed that the engine alone gives (m/s).
+
+    That is the integral of the force where it is positive (``motion.forces``).
+    """
+    check_exact(before, "the term drove")
+    return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
+
+
+def still_moving(before: State, step: Step, after: State) -> Floats:
+    """Term still_moving, [n]: -1 if a vehicle moves at the horizon, otherwise 0."""
+    check_exact(before, "the term still_moving")
+    return 0.0 - step.out[TRUNCATED] * after.moving
 
 
 def potential(rules: Rules, state: State) -> Floats:

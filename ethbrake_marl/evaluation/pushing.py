@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.conduct import driving_s, first_impact_s
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.episode.step import Step, advance_worlds
+from ethbrake_marl.episode.step import Step
 from ethbrake_marl.evaluation.measures import Given, Statistic
+from ethbrake_marl.evaluation.resimulation import advance_worlds, simulate_again
 from ethbrake_marl.evaluation.summary_row import PUSHED_FAR_M
-from ethbrake_marl.motion.layout import FAR_M, GAP, PUSHED, Floats, scratch_for
+from ethbrake_marl.motion.layout import COUNT, FAR_M, GAP, LATENCY, NEXT_TIME, PUSHED, Floats, scratch_for
 from ethbrake_marl.registry import Part
 
 POST_M = 1e5  # distance of a post that nobody reaches, from which ways are measured to 1e-10 m
@@ -82,6 +82,24 @@ def pushed_mps(game: Game, alert: State, last: State) -> Given:
     of_pair = last.line[:, PUSHED]
     behind = {f"{i}": of_pair[:, i] for i in range(1, last.vehicles)}
     return {"": of_pair.sum(axis=1), **behind, "obstacle": of_pair[:, 0]}
+
+
+def first_impact_s(before: State, after: State) -> Floats:
+    """Time of the line's first impact, [n] s; ``before.time_s`` if it was earlier, ``after.time_s`` if later or never.
+
+    There must be no decision between the two states.
+    """
+    until: Floats = np.where(before.collided, before.time_s, after.time_s)
+    for k, scratch in simulate_again(before, after, ~before.collided & after.collided):
+        struck = after.line[k, COUNT] > 0.0
+        until[k] = before.time_s[k] + scratch[NEXT_TIME, struck].min()
+    return until
+
+
+def driving_s(before: State, after: State, until_s: Floats) -> Floats:
+    """Time from ``before`` to ``until_s`` [n] with a positive command in force, [n, N] s."""
+    begun_s = np.maximum(before.car[:, LATENCY, 1:], before.time_s[:, np.newaxis])
+    return np.where(after.commands_mps2 > 0.0, np.maximum(until_s[:, np.newaxis] - begun_s, 0.0), 0.0)
 
 
 class DroveTowards:

@@ -14,9 +14,9 @@ import numpy as np
 from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.episode.step import advance_worlds
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.pushing import with_post
+from ethbrake_marl.evaluation.resimulation import advance_worlds
 from ethbrake_marl.motion.layout import (
     COUNT,
     FIRST,

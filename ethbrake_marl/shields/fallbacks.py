@@ -15,7 +15,7 @@ from ethbrake_marl.agents.drive import Agent, propose
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import descend, hold
+from ethbrake_marl.episode.hold import descend, hold
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.motion.layout import Floats
 

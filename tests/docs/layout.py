@@ -29,7 +29,7 @@ this. `python -m tests.docs.layout` makes this page from the code.
 | What does one impact cost? | `motion/impact.py`; who bears it: `state.py`, `split_harm`; in infos: `infos.py` |
 | How does a scenario become a game? | `worlds/`: `catalogue.py`, `game.py`; worlds are drawn in `sampling.py` |
 | How do environments play it? | `faces/face.py`, on `faces/stream.py`: its episodes, drawn again when they end |
-| What would happen? | `episode/play.py`: `played`, `price` (a plan), `hold` (constant commands) |
+| What would happen? | `episode/play.py`: `price` (a plan); `episode/hold.py`: `hold` (constant commands) |
 | Where does a number in a table come from? | `evaluation/`: `measures.py`, `statistics.py`, `summary.py` |
 | Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/decision.py` |
 | What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |

@@ -9,8 +9,9 @@ import pytest
 
 from ethbrake_marl.episode.counts import COUNTS, ROWS, pair_amounts
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.objectives import amounts, objectives_of
-from ethbrake_marl.episode.play import hold, played, price
+from ethbrake_marl.episode.play import played, price
 from ethbrake_marl.episode.reward import RewardParams, reward_params
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.door import evaluate

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import descend, hold, price
+from ethbrake_marl.episode.hold import descend, hold
+from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.objectives import amounts, objectives_of
-from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import COST, Step

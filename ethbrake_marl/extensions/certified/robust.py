@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import MODEL, Agent
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import END, State, mapped, take
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty

@@ -14,7 +14,7 @@ from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, PercentF
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise, predicted_harm
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
-from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.captions import caption, ranges_of
