@@ -43,7 +43,7 @@ NUMBERS = (
     "chosen_command_mps2",
     "chosen_action",
 )
-COLLIDED = NUMBERS.index("collided")
+TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, COLLIDED, COMMAND, ACTION = range(len(NUMBERS))
 FIRST_WEIGHTS, TOTAL_WEIGHTS = COUNTS["first"], COUNTS["total"]
 
 
@@ -62,10 +62,11 @@ def report(line, car, clock, wanted, bodies, borne, out):
             impacts += line[k, COUNT, p]
         for o in range(len(bodies)):
             i = bodies[o]
-            command, world = wanted[k, i], out[k, o]
-            world[0], world[1], world[2], world[3] = clock[k, TIME], line[k, FORCE, i], borne[0, i - 1], borne[1, i - 1]
-            world[4], world[5], world[6], world[7] = first, total, 1.0 if impacts > 0.0 else 0.0, command
-            world[8] = action_of(car[k], i, command, clock[k, TIME])
+            info, time, command = out[k, o], clock[k, TIME], wanted[k, i]
+            info[TIME_NOW], info[FORCE_NOW], info[COLLIDED] = time, line[k, FORCE, i], 1.0 if impacts > 0.0 else 0.0
+            info[BORNE_FIRST], info[BORNE_TOTAL] = borne[0, i - 1], borne[1, i - 1]
+            info[LINE_FIRST], info[LINE_TOTAL] = first, total
+            info[COMMAND], info[ACTION] = command, action_of(car[k], i, command, time)
 
 
 def numbers(state: State, bodies: Ints) -> Floats:

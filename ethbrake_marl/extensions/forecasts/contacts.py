@@ -45,7 +45,9 @@ from ethbrake_marl.registry import Part
 FORECAST_S = 10.0
 COMMANDS = {"brake": "full braking", "coast": "coasting", "drive": "full driving"}
 SIDES = {"front": "the vehicle ahead", "rear": "the vehicle behind"}
-PER_COMMAND = 10  # features of `contact` for each command
+# places of the features of `contact` for one command: those of an impact, for each side, then the harm
+IMPACT_TIME, IMPACT_CLOSING, IMPACT_FRACTION, IMPACT_STEPS, PER_SIDE = range(5)
+FIRST_HARM, TOTAL_HARM, PER_COMMAND = 2 * PER_SIDE, 2 * PER_SIDE + 1, 2 * PER_SIDE + 2
 FAR_PER_COMMAND = 4  # features of `contact_far`
 
 
@@ -135,8 +137,9 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 value = out[k, o, c * PER_COMMAND : (c + 1) * PER_COMMAND]
                 write_features(scratch, met == MET, i, first, last, time_step_s, value)
                 far = near + c * FAR_PER_COMMAND
-                out[k, o, far], out[k, o, far + 1] = value[0], value[4]
-                out[k, o, far + 2], out[k, o, far + 3] = math.sqrt(value[8]), math.sqrt(value[9])
+                out[k, o, far], out[k, o, far + 1] = value[IMPACT_TIME], value[PER_SIDE + IMPACT_TIME]
+                out[k, o, far + 2] = math.sqrt(value[FIRST_HARM])
+                out[k, o, far + 3] = math.sqrt(value[TOTAL_HARM])
     return failed
 
 
@@ -148,22 +151,21 @@ def write_features(scratch, met, i, first, last, time_step_s, value):
     impact exactly at the end of a time step belongs to this step, as in the episode.
     """
     for side in range(2):
-        p, at = i - 1 + side, 4 * side
-        for f in range(4):
-            value[at + f] = 0.0
+        p, impact = i - 1 + side, value[side * PER_SIDE : (side + 1) * PER_SIDE]
+        impact[:] = 0.0
         if first <= p < last:
             time = scratch[NEXT_TIME, p] if met else math.inf
             hit = time < math.inf
             steps = (time if hit else FORECAST_S) / time_step_s
             whole = max(math.ceil(steps) - 1.0, 0.0)
-            value[at] = time if hit else FORECAST_S
-            value[at + 1] = scratch[NEXT_CLOSING, p] if hit else 0.0
-            value[at + 2] = steps - whole if hit else 0.0
-            value[at + 3] = whole
-    value[8] = value[9] = 0.0
+            impact[IMPACT_TIME] = time if hit else FORECAST_S
+            impact[IMPACT_CLOSING] = scratch[NEXT_CLOSING, p] if hit else 0.0
+            impact[IMPACT_FRACTION] = steps - whole if hit else 0.0
+            impact[IMPACT_STEPS] = whole
+    value[FIRST_HARM] = value[TOTAL_HARM] = 0.0
     for p in range(first, last if met else first):
-        value[8] += scratch[NEW_FIRST, p]
-        value[9] += scratch[NEW_TOTAL, p]
+        value[FIRST_HARM] += scratch[NEW_FIRST, p]
+        value[TOTAL_HARM] += scratch[NEW_TOTAL, p]
 
 
 def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
