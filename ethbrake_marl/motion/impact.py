@@ -101,6 +101,12 @@ def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk
 
 
 @kernel
+def restitution(car, closing):
+    """Coefficient of restitution of an impact of one world, 0 to 1; ``closing`` is its largest closing speed (m/s)."""
+    return car[RESTITUTION, 0] if closing >= PLASTIC_MPS else 0.0
+
+
+@kernel
 def resolve_cluster(line, car, scratch, first, last):
     """Replace the speeds of the touching bodies ``first..last`` by their speeds after the impact.
 
@@ -112,7 +118,7 @@ def resolve_cluster(line, car, scratch, first, last):
     largest = 0.0
     for p in range(first, last):
         largest = max(largest, scratch[CLOSING, p])
-    bounce, end = car[RESTITUTION, 0] if largest >= PLASTIC_MPS else 0.0, last + 1
+    bounce, end = restitution(car, largest), last + 1
     blocks = pool(
         car[MASS], line[SPEED], line[SPEED], scratch[ZERO], scratch[ZERO], scratch, first, last, scratch[POOLED],
         scratch[JERK],
@@ -159,7 +165,7 @@ def after_impact_of(car, scratch, first, last, body):
         car[MASS], scratch[BEFORE], scratch[BEFORE], scratch[ZERO], scratch[ZERO], scratch, first, last,
         scratch[POOLED], scratch[JERK],
     )  # fmt: skip
-    bounce = car[RESTITUTION, 0] if largest >= PLASTIC_MPS else 0.0
+    bounce = restitution(car, largest)
     return scratch[POOLED, body] + bounce * (scratch[POOLED, body] - before)
 
 
@@ -191,7 +197,7 @@ def next_of_series(car, scratch, now, first, last):
     after the other, the hardest impact first. It is known by a pair that had an impact at this moment: after a plastic
     impact at once no pair closes.
     """
-    if car[RESTITUTION, 0] > 0.0 or last - first < 2:
+    if restitution(car, math.inf) > 0.0 or last - first < 2:
         return -1
     hardest, again = first, False
     for p in range(first, last):

@@ -6,7 +6,17 @@ from typing import Any, NamedTuple
 
 from ethbrake_marl.files.model import UNITS, UNSHOWN, require
 from ethbrake_marl.files.yaml import YamlPath
-from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, LATENCY, LIMIT, MASS, RELEASE_RATE, WEIGHT
+from ethbrake_marl.motion.layout import (
+    BRAKE_RATE,
+    BRAKING,
+    DRIVING,
+    LATENCY,
+    LIMIT,
+    MASS,
+    RELEASE_RATE,
+    RESTITUTION,
+    WEIGHT,
+)
 from ethbrake_marl.worlds.quantity import DISTRIBUTIONS, support
 
 # A stream is an independent sequence of uniform random numbers, named by a tuple.
@@ -192,6 +202,7 @@ CAR_ROWS = {
     "brake_rate_mps3": BRAKE_RATE,
     "release_rate_mps3": RELEASE_RATE,
     "harm_weight": WEIGHT,
+    "restitution": RESTITUTION,
 }  # rows of `State.car`
 
 

@@ -141,7 +141,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
         line[rows, layout.SPEED, 1:], line[rows, GAP, 0] = whole["speeds_mps"][rows], obstacle[rows, 0]
         line[rows, GAP, 1:N], line[rows, GAP, N] = whole["gaps_m"][rows], np.inf
         car[rows, layout.MASS, 0] = car[rows, BRAKE_RATE] = car[rows, layout.RELEASE_RATE] = np.inf
-        car[rows, layout.RESTITUTION], car[rows, layout.WEIGHT, 1:] = whole["restitution"][rows], 1.0
+        car[rows, layout.RESTITUTION, 0], car[rows, layout.WEIGHT, 1:] = whole["restitution"][rows, 0], 1.0
         for row, each in of_car:
             car[rows, row, 1:] = each[rows]
         know[rows, 1:, 1:] = known[rows]
