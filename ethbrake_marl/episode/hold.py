@@ -14,8 +14,8 @@ from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, weig
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.drive import FAILED, drive
 from ethbrake_marl.motion.forces import capacities
+from ethbrake_marl.motion.interval import FAILED, move_line
 from ethbrake_marl.motion.layout import BRAKING, LINE_ROWS, Floats, scratch_for
 
 
@@ -41,7 +41,7 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, weights, tie_weig
                     here[row, i] = line[k, row, i]
             for b in range(len(bodies)):
                 commands[bodies[b]] = tried[k, j, b]
-            failed = drive(here, car[k], commands, scratch, time[k], until[k]) == FAILED
+            failed = move_line(here, car[k], commands, scratch, time[k], until[k]) == FAILED
             note_motion(here)
             out[0, k, j] = math.inf if failed else amount_so_far(here, weights)
             out[1, k, j] = math.inf if failed else amount_so_far(here, tie_weights)

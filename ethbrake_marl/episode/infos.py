@@ -30,7 +30,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import LISTED, NUMBER, TIME, State, split_world
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.layout import COUNT, FIRST, FORCE, MASS, TOTAL, Floats, Ints
+from ethbrake_marl.motion.layout import FIRST, FORCE, IMPACTS, MASS, TOTAL, Floats, Ints
 
 NUMBERS = (
     "time_s",
@@ -59,7 +59,7 @@ def report(line, car, clock, wanted, bodies, borne, out):
         first, total = amount_so_far(line[k], FIRST_WEIGHTS), amount_so_far(line[k], TOTAL_WEIGHTS)
         impacts = 0.0
         for p in range(line.shape[2] - 1):
-            impacts += line[k, COUNT, p]
+            impacts += line[k, IMPACTS, p]
         for o in range(len(bodies)):
             i = bodies[o]
             info, time, command = out[k, o], clock[k, TIME], wanted[k, i]

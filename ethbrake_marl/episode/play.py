@@ -13,7 +13,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import ENDED, PHYSICS, STEPS, TIME, State
 from ethbrake_marl.episode.step import advance
 from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.drive import FAILED
+from ethbrake_marl.motion.interval import FAILED
 from ethbrake_marl.motion.layout import Floats, scratch_for
 
 

@@ -13,12 +13,12 @@ from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import (
     BRAKING,
-    COUNT,
     DRIVING,
     FAR_M,
     FORCE,
     GAP,
     HIT,
+    IMPACTS,
     LATENCY,
     MASS,
     RESTITUTION,
@@ -183,7 +183,7 @@ class State(NamedTuple):
     @property
     def collided(self) -> Bools:
         """Whether the world has had an impact, [n]."""
-        return np.asarray(self.line[:, COUNT].any(axis=1))
+        return np.asarray(self.line[:, IMPACTS].any(axis=1))
 
     def harm(self, count: Count = "first") -> Floats:
         """Harm of each world so far, [n] m2/s2; ``count`` says which harm (``episode.counts``)."""

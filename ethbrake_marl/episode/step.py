@@ -24,12 +24,12 @@ from ethbrake_marl.episode.state import (
 )
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, PhysicsError, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import FAILED, MET, drive, drive_worlds
+from ethbrake_marl.motion.interval import FAILED, MET, move_line, move_lines
 from ethbrake_marl.motion.layout import (
     BRAKING,
-    COUNT,
     DRIVING,
     FORCE,
+    IMPACTS,
     LATENCY,
     MOVING,
     NEW_FIRST,
@@ -133,7 +133,7 @@ def note_motion(line):
 
 @kernel
 def advance(line, car, clock, wanted, scratch, time_step_s):
-    """Advance one running world to its next decision, in place; return ``drive``'s result, and whether all is at rest.
+    """Advance one running world to its next decision, in place; return ``move_line``'s result, and whether all rests.
 
     Arguments as in ``step_worlds``, without the axis of worlds. Decision times are multiples of the time step after the
     first decision, so that they never differ by rounding.
@@ -141,7 +141,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s):
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
     until = clock[END] if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
-    met = drive(line, car, wanted, scratch, clock[TIME], until)
+    met = move_line(line, car, wanted, scratch, clock[TIME], until)
     clock[TIME] = until
     at_rest = met != FAILED and stands(line, wanted)
     clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
@@ -180,7 +180,7 @@ def step_worlds(
             failed = k
         impacts = 0.0
         for p in range(bodies - 1):
-            impacts += line[k, COUNT, p]
+            impacts += line[k, IMPACTS, p]
             if met == MET:
                 out[HARM, k] += scratch[NEW_FIRST, p]
                 out[TOTAL_HARM, k] += scratch[NEW_TOTAL, p]
@@ -211,7 +211,7 @@ def advanced(state: State, until_s: Floats) -> State:
     """State at ``until_s`` [n] if all vehicles hold their commands."""
     line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
     car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others
-    failed = drive_worlds(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
+    failed = move_lines(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
     if failed >= 0:
         raise failure(state, failed, state.time_s[failed], until_s[failed])
     clock[:, TIME] = until_s

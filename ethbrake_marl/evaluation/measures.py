@@ -43,7 +43,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import PHYSICS, State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
-from ethbrake_marl.motion.layout import COUNT, FIRST
+from ethbrake_marl.motion.layout import FIRST, IMPACTS
 
 Values = NDArray[Any]
 Given = Values | Mapping[str, Values] | None
@@ -130,7 +130,7 @@ def harm(count: str, game: Game, alert: State, last: State) -> Given:
 
 def impacts(game: Game, alert: State, last: State) -> Given:
     """Number of impacts in each world, those with an obstacle included."""
-    return np.asarray(last.line[:, COUNT].sum(axis=1), np.int64)
+    return np.asarray(last.line[:, IMPACTS].sum(axis=1), np.int64)
 
 
 def hardest_impact_mps(game: Game, alert: State, last: State) -> Given:

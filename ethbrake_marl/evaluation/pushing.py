@@ -10,7 +10,7 @@ from ethbrake_marl.episode.step import Step
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.evaluation.resimulation import advance_worlds, simulate_again
 from ethbrake_marl.evaluation.summary_row import PUSHED_FAR_M
-from ethbrake_marl.motion.layout import COUNT, FAR_M, GAP, LATENCY, NEXT_TIME, PUSHED, Floats, scratch_for
+from ethbrake_marl.motion.layout import FAR_M, GAP, IMPACTS, LATENCY, NEXT_TIME, PUSHED, Floats, scratch_for
 from ethbrake_marl.registry import Part
 
 POST_M = 1e5  # distance of a post that nobody reaches, from which ways are measured to 1e-10 m
@@ -91,7 +91,7 @@ def first_impact_s(before: State, after: State) -> Floats:
     """
     until: Floats = np.where(before.collided, before.time_s, after.time_s)
     for k, scratch in simulate_again(before, after, ~before.collided & after.collided):
-        struck = after.line[k, COUNT] > 0.0
+        struck = after.line[k, IMPACTS] > 0.0
         until[k] = before.time_s[k] + scratch[NEXT_TIME, struck].min()
     return until
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.motion.drive import drive, drive_worlds
+from ethbrake_marl.motion.interval import move_line, move_lines
 from ethbrake_marl.motion.layout import Bools, Floats, scratch_for
 
 
@@ -17,7 +17,7 @@ def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wante
     The other arrays are described in ``motion.layout``; all vehicles hold the commands ``wanted`` [n, N + 1] (m/s2).
     """
     moved = line.copy()  # arrays of any layout become alike, because a kernel is compiled for each layout
-    failed: int = drive_worlds(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
+    failed: int = move_lines(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
     line[:] = moved
     return failed
 
@@ -31,5 +31,5 @@ def simulate_again(before: State, after: State, these: Bools) -> Iterator[tuple[
     scratch = scratch_for(after.vehicles + 1)
     for k in np.flatnonzero(these).tolist():
         line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
-        drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
+        move_line(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
         yield k, scratch

@@ -34,8 +34,8 @@ from ethbrake_marl.motion.layout import (
     JERK,
     LAST_TIME,
     MASS,
-    NEW_COUNT,
     NEW_FIRST,
+    NEW_IMPACTS,
     NEW_TOTAL,
     NEXT_CLOSING,
     NEXT_TIME,
@@ -252,7 +252,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
         if scratch[CLOSING, p] > TOUCH_MPS:
             harm = scratch[CLOSING, p] * scratch[CLOSING, p]
             scratch[NEW_TOTAL, p] += harm
-            scratch[NEW_COUNT, p] += 1.0
+            scratch[NEW_IMPACTS, p] += 1.0
             scratch[LAST_TIME, p] = now
             if scratch[NEXT_TIME, p] == math.inf:
                 scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p] = now, scratch[CLOSING, p]

@@ -13,7 +13,7 @@ from ethbrake_marl.episode.state import PHYSICS, State
 from ethbrake_marl.episode.step import at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
-from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, FAR_M, GAP, LATENCY, Bools, Floats, Ints
+from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, GAP, IMPACTS, LATENCY, Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.counters import Channel, Numbers, numbers_of, world_numbers
 from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
@@ -181,7 +181,7 @@ def has_early_impact(scenario: Scenario, alert: State) -> Bools:
     """Whether an impact happens before or when the first learner can act, [n]. Nobody can prevent it."""
     deciders = np.array(scenario.learners, np.int64)
     state = first_decision(alert, deciders, scenario.time_step_s, scenario.horizon_s)
-    return np.asarray(state.line[:, COUNT].any(axis=1))
+    return np.asarray(state.line[:, IMPACTS].any(axis=1))
 
 
 def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:

@@ -51,7 +51,7 @@ evaluation/evaluate.py  evaluate, _driven
 agents/drive.py         play, and in each step:
 episode/game.py           Game.step
 episode/step.py           step; asked: agents/policy_agent.py, policies/actor.py
-motion/drive.py           drive; motion/impact.py, resolve_impacts: the harm
+motion/interval.py        move_line; motion/impact.py, resolve_impacts: the harm
 evaluation/measures.py  harm: episode/state.py, State.harm
 evaluation/summary.py   summarise; statistics.py, mean
 files/sheet.py          Sheet: columns become text

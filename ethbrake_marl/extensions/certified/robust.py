@@ -19,7 +19,7 @@ from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import END, State, mapped, take
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.motion.layout import BRAKING, COUNT, GAP, SPEED, Bools, Floats
+from ethbrake_marl.motion.layout import BRAKING, GAP, IMPACTS, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import held
 from ethbrake_marl.shields.named import NamedShield
@@ -136,7 +136,7 @@ def may_be_in(state: State, members: State) -> Bools:
     True after any impact. Before it, gaps and speeds are monotone in each quantity, so every world within the intervals
     lies in this range.
     """
-    struck = state.line[:, COUNT].any(axis=1) | members.line[:, :, COUNT].any(axis=(1, 2))
+    struck = state.line[:, IMPACTS].any(axis=1) | members.line[:, :, IMPACTS].any(axis=(1, 2))
     inside = np.ones(state.n, np.bool_)
     for row, columns in ((SPEED, slice(1, None)), (GAP, slice(1, -1))):
         now, ends = state.line[:, row, columns], members.line[:, :, row, columns]

@@ -18,8 +18,8 @@ from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.state import TIME, State, check_exact
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import FAILED, MET, drive
 from ethbrake_marl.motion.forces import capacity
+from ethbrake_marl.motion.interval import FAILED, MET, move_line
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
@@ -131,7 +131,7 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                     for j in range(here.shape[1]):
                         here[row, j] = known[row, j]
                 commands[i] = command_of(car[k], i, c - 1.0, clock[k, TIME])
-                met = drive(here, parameters, commands, scratch, 0.0, FORECAST_S)
+                met = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
                 if met == FAILED:
                     failed = k
                 value = out[k, o, c * PER_COMMAND : (c + 1) * PER_COMMAND]

@@ -13,9 +13,9 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.compiling import kernel
-from ethbrake_marl.motion.drive import solo
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.impact import TOUCH_MPS
+from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, FAR_M, GAP, LATENCY, LIMIT, MASS, SPEED, Floats
 
 GAP_L, V_L, A_L, ONSET_L = range(4)  # gap to the front vehicle (m); ONSET: time from which a vehicle may act (s)

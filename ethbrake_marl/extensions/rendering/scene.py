@@ -12,10 +12,10 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.evaluation.resimulation import advance_worlds
 from ethbrake_marl.motion.layout import (
-    COUNT,
     FAR_M,
     FIRST,
     GAP,
+    IMPACTS,
     LATENCY,
     NEXT_CLOSING,
     NEXT_TIME,
@@ -147,13 +147,13 @@ class Motion:
         """Return line, place of Vehicle 1 and recent impacts at a time of this motion (s after the alert)."""
         line = self.line.copy()
         line[GAP, 0] = ahead_m = min(line[GAP, 0], POST_M)
-        counts, scratch = line[COUNT].copy(), scratch_for(len(self.wanted))
+        counts, scratch = line[IMPACTS].copy(), scratch_for(len(self.wanted))
         times = np.array([self.start_s]), np.array([time_s])
         if time_s > self.start_s:
             advance_worlds(line[np.newaxis], self.car[np.newaxis], *times, self.wanted[np.newaxis], scratch)
         new = [
             Impact(int(p), float(scratch[NEXT_CLOSING, p]), self.start_s + float(scratch[NEXT_TIME, p]))
-            for p in np.flatnonzero(line[COUNT] > counts)
+            for p in np.flatnonzero(line[IMPACTS] > counts)
         ]
         recent = tuple(impact for impact in (*self.impacts, *new) if impact.time_s > time_s - FLASH_S)
         front_m = self.front_m + float(ahead_m - line[GAP, 0])

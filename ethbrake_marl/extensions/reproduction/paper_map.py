@@ -44,11 +44,11 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import UNSHOWN, require
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.layout import (
-    COUNT,
     FIRST,
     FORCE,
     GAP,
     HIT,
+    IMPACTS,
     LATENCY,
     LIMIT,
     MASS,
@@ -81,7 +81,7 @@ def exchange(line: Floats, car: Floats) -> None:
         harm = np.where(impact, closing * closing, 0.0)
         line[:, FIRST, p] += np.where(line[:, HIT, p] == 0.0, harm, 0.0)
         line[:, TOTAL, p] += harm
-        line[:, COUNT, p] += impact
+        line[:, IMPACTS, p] += impact
         line[:, HIT, p] = np.maximum(line[:, HIT, p], impact)
 
 

@@ -21,8 +21,8 @@ from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, LAST, STEPS,
 from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import FAILED
 from ethbrake_marl.motion.forces import capacities
+from ethbrake_marl.motion.interval import FAILED
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
