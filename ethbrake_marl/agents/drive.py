@@ -84,7 +84,7 @@ class Team(NamedTuple):
         Raises ``InvalidInput`` unless the team drives exactly the learners, for a shield without learners, and if the
         game already has another shield.
         """
-        driven, wanted = sorted(self.drivers), sorted(game.rules.learners.tolist())
+        driven, wanted = sorted(self.drivers), sorted(game.settings.learners.tolist())
         if driven != wanted:
             theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
             raise InvalidInput(f"team {self.name!r}: drives {theirs}; must drive exactly {right}")
@@ -131,7 +131,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
         memories = {body: begin(agent, alert, body) for body, agent in agents.items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.
-        game = game._replace(scripts={**game.scripts, **agents}, rules=game.rules._replace(learners=NOBODY))
+        game = game._replace(scripts={**game.scripts, **agents}, settings=game.settings._replace(learners=NOBODY))
     else:
         state, actions = game.reset(alert), None
     yield None, state

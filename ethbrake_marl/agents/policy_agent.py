@@ -61,7 +61,7 @@ class LearnedAgent:
 
     def check(self, game: Game, body: int) -> None:
         """Warn (``Unfamiliar``) if the policy was trained with another physics or another time step."""
-        manifest, step_s = self.policy.manifest, game.rules.time_step_s
+        manifest, step_s = self.policy.manifest, game.settings.time_step_s
         then, now = manifest.versions.get(PHYSICS), physics_digest()
         if then not in (None, now):
             warnings.warn(

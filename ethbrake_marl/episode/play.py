@@ -53,9 +53,9 @@ def played(
     line, car, clock, know, wanted, memories = state
     if not donate:
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
-    out, rules = np.empty(len(plans)), game.rules
+    out, settings = np.empty(len(plans)), game.settings
     play_worlds(
-        line, car, clock, wanted, plans, most, rules.learners, rules.time_step_s, weights_of(count),
+        line, car, clock, wanted, plans, most, settings.learners, settings.time_step_s, weights_of(count),
         scratch_for(wanted.shape[1]), out,
     )  # fmt: skip
     return State(line, car, clock, know, wanted, memories), out

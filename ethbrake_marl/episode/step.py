@@ -53,7 +53,7 @@ OUT_ROWS = 6
 ROUNDING = 1e-9  # fraction of a step: a horizon that exceeds whole steps by less needs no further step
 
 
-class Rules(NamedTuple):
+class StepSettings(NamedTuple):
     """The numbers that a step needs."""
 
     learners: Ints  # [L] bodies (1: Vehicle 1) whose actions are given
@@ -106,7 +106,7 @@ class Step(NamedTuple):
 
     @property
     def truncated(self) -> Bools:
-        """Whether the episode ended in this step at the horizon, or after the most steps (``Rules``), [n]."""
+        """Whether the episode ended in this step at the horizon, or after the most steps (``StepSettings``), [n]."""
         return self.out[TRUNCATED] == 1.0
 
     @property
@@ -218,50 +218,48 @@ def advanced(state: State, until_s: Floats) -> State:
     return state._replace(line=line, car=car, clock=clock, wanted=wanted)
 
 
-def first_decision(
-    alert: State, deciders: Ints, time_step_s: float, horizon_s: float, most_steps: float = np.inf
-) -> State:
+def first_decision(alert: State, deciders: Ints, settings: StepSettings) -> State:
     """Episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
 
-    Until then all vehicles hold ``alert.wanted``. The other arguments are those of ``Rules``.
+    Until then all vehicles hold ``alert.wanted``.
     """
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
-    state = advanced(alert, first)
+    state, most = advanced(alert, first), settings.most_steps
     state.clock[:, FIRST_DECISION] = first
-    steps = last_step(first, time_step_s, horizon_s)
-    state.clock[:, LAST] = np.minimum(steps, most_steps)
-    state.clock[:, END] = np.where(steps <= most_steps, horizon_s, first + most_steps * time_step_s)
+    steps = steps_to_horizon(first, settings)
+    state.clock[:, LAST] = np.minimum(steps, most)
+    state.clock[:, END] = np.where(steps <= most, settings.horizon_s, first + most * settings.time_step_s)
     return state
 
 
-def last_step(first_s: Any, time_step_s: float, horizon_s: float) -> Any:
+def steps_to_horizon(first_s: Any, settings: StepSettings) -> Any:
     """Number of the step that ends at the horizon, if the first decision is at ``first_s``."""
-    return np.ceil((horizon_s - first_s) / time_step_s - ROUNDING)
+    return np.ceil((settings.horizon_s - first_s) / settings.time_step_s - ROUNDING)
 
 
 def step(
-    rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
+    settings: StepSettings, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
 ) -> tuple[State, Step]:
     """State after one step, and what happened in the step.
 
     ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` look at the state at every decision. Raises
     ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
-    actions = action_array(rules.learners, actions, state.n)
+    actions = action_array(settings.learners, actions, state.n)
     line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
     if not donate:
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
     scratch = scratch_for(wanted.shape[1])
     refused, failed = step_worlds(
-        line, car, clock, wanted, actions, scratch, out, reward, rules.learners, rules.time_step_s, rules.harm,
-        rules.terminal, rules.weights,
+        line, car, clock, wanted, actions, scratch, out, reward, settings.learners, settings.time_step_s, settings.harm,
+        settings.terminal, settings.weights,
     )  # fmt: skip
     if refused >= 0:
-        check_actions(rules.learners, actions[refused])
+        check_actions(settings.learners, actions[refused])
     if failed >= 0:
         raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
-    return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
+    return State(line, car, clock, know, wanted, memories), Step(reward, out, settings.time_step_s)
 
 
 def scripted(scripts: Mapping[int, Any], state: State) -> State:

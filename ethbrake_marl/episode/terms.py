@@ -36,7 +36,7 @@ from ethbrake_marl.episode.functions import called, check_finite, described
 from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.state import END, State, check_exact
-from ethbrake_marl.episode.step import TRUNCATED, Rules, Step
+from ethbrake_marl.episode.step import TRUNCATED, Step, StepSettings
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
 from ethbrake_marl.motion.layout import DROVE, PUSHED, TOTAL, Floats
@@ -157,18 +157,18 @@ def still_moving(before: State, step: Step, after: State) -> Floats:
     return 0.0 - step.out[TRUNCATED] * after.moving
 
 
-def potential(rules: Rules, state: State) -> Floats:
+def potential(settings: StepSettings, state: State) -> Floats:
     """Minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
 
     Each learner tries nine shares of its braking capacity, front to rear (several learners: twice); all others brake
     fully. Harm is counted as in the reward. The potential is 0 once an episode has ended.
     """
-    learners = rules.learners.tolist()
+    learners = settings.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
     further = state.line.copy()
     further[:, ROWS] = 0.0
     state = state._replace(line=further)
-    _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], rules.weights)
+    _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], settings.weights)
     least[state.ended] = 0.0
     return -least
 
@@ -176,17 +176,17 @@ def potential(rules: Rules, state: State) -> Floats:
 class Shaping(NamedTuple):
     """The term shaping. Its memory is the potential of the state, [n]."""
 
-    rules: Rules
+    settings: StepSettings
     discount: float
 
     def begin(self, state: State) -> Floats:
-        return potential(self.rules, state)
+        return potential(self.settings, state)
 
     def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
         """Value of the term, [n, N], and the new memory, [n]."""
-        new = potential(self.rules, after)
+        new = potential(self.settings, after)
         value = np.zeros((after.n, after.vehicles))
-        value[:, self.rules.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
+        value[:, self.settings.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
         return value, new
 
 

@@ -150,7 +150,7 @@ def ended(game: Game, alert: State, last: State) -> Given:
 
 def predicted_harm(game: Game, alert: State, last: State) -> Given:
     """Harm that the only predicting agent or shield predicted at the alert, in the count that it minimises."""
-    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.rules.learners.tolist())]
+    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.settings.learners.tolist())]
     predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
     return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
 

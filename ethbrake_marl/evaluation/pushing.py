@@ -44,7 +44,7 @@ class PushedAway:
     """
 
     def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
-        self.own_way_m = {body: own_way_m(alert, body, game.rules.horizon_s) for body in bodies}
+        self.own_way_m = {body: own_way_m(alert, body, game.settings.horizon_s) for body in bodies}
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
@@ -69,7 +69,7 @@ def pushed_m(game: Game, alert: State) -> PushedAway | None:
     """How far a vehicle ends beyond the place where it would stop by itself, by impacts and by pushes. In reality it
     brakes for something, so this is dangerous. Defined for vehicles that neither learn nor look at the state.
     """
-    bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.rules.learners and i not in game.scripts]
+    bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.settings.learners and i not in game.scripts]
     return PushedAway(bodies, game, alert) if bodies else None
 
 
@@ -106,7 +106,7 @@ class DroveTowards:
     """Watches the time before each line's first impact, and the part of it with a positive command."""
 
     def __init__(self, game: Game, alert: State) -> None:
-        self.learners, self.time_s = game.rules.learners, np.zeros(alert.n)
+        self.learners, self.time_s = game.settings.learners, np.zeros(alert.n)
         self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)
 
     def see(self, before: State, step: Step | None, after: State) -> None:

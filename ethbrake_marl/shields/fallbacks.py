@@ -31,7 +31,7 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
     One learner: E-V2X-BM. Several: full braking; E-V2X-BM of one learner while the others brake fully; and each
     learner's best share of its brakes, chosen one after the other.
     """
-    learners, n, until_s = game.rules.learners, state.n, state.clock[:, END]
+    learners, n, until_s = game.settings.learners, state.n, state.clock[:, END]
     full = alert._replace(wanted=state.wanted.copy())
     full.wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
     actions = []
@@ -47,7 +47,7 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
 
 def held(game: Game, actions: Floats) -> Floats:
     """Return plans [n, T, L] that repeat the actions [n, L] up to the horizon."""
-    decisions = int(np.ceil(game.rules.horizon_s / game.rules.time_step_s)) + 1
+    decisions = int(np.ceil(game.settings.horizon_s / game.settings.time_step_s)) + 1
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
@@ -58,7 +58,7 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
     several learners, one learner's other actions while the rest follow the plan. ``states`` may have several possible
     states of each world, one after the other: then the largest harm counts.
     """
-    learners, rows, each = game.rules.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
+    learners, rows, each = game.settings.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]
     actions = np.minimum(np.maximum(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0), 0.0)
     if len(learners) > 1:

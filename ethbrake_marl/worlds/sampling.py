@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.state import PHYSICS, State
-from ethbrake_marl.episode.step import at_alert, first_decision
+from ethbrake_marl.episode.step import StepSettings, at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
 from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, GAP, IMPACTS, LATENCY, Bools, Floats, Ints
@@ -180,7 +180,7 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
 def has_early_impact(scenario: Scenario, alert: State) -> Bools:
     """Whether an impact happens before or when the first learner can act, [n]. Nobody can prevent it."""
     deciders = np.array(scenario.learners, np.int64)
-    state = first_decision(alert, deciders, scenario.time_step_s, scenario.horizon_s)
+    state = first_decision(alert, deciders, StepSettings(deciders, scenario.time_step_s, scenario.horizon_s))
     return np.asarray(state.line[:, IMPACTS].any(axis=1))
 
 

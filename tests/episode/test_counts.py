@@ -91,7 +91,7 @@ def opened(name: str, count: str) -> tuple[Game, State]:
 def random_plans(game: Game, state: State, seed: int) -> np.ndarray:
     """Return plans [n, T, L] that often drive, and brake at the end, so that every row of a count is met."""
     rng, steps = np.random.default_rng(seed), 30
-    shape = state.n, steps, len(game.rules.learners)
+    shape = state.n, steps, len(game.settings.learners)
     plans = np.where(rng.random(shape) < 0.3, 1.0, rng.uniform(-1.0, 1.0, shape))
     plans[:, -1] = np.where(rng.random((state.n, 1)) < 0.7, -1.0, 1.0)
     return plans
@@ -133,10 +133,10 @@ def test_price__is_what_happens_to_the_bit_and_depends_on_no_other_world(name: s
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_hold__of_constant_commands_is_the_episode(name: str) -> None:
     game, state = opened(name, "honest")
-    learners, shares = game.rules.learners, np.array([-1.0, -0.4, 0.0, 0.7])
+    learners, shares = game.settings.learners, np.array([-1.0, -0.4, 0.0, 0.7])
     braking, driving = (state.car[:, row][:, np.newaxis, learners] for row in (BRAKING, DRIVING))
     tried = shares[:, np.newaxis] * np.where(shares[:, np.newaxis] < 0.0, braking, driving)
-    held = hold(state, state.wanted, learners, tried, game.rules.horizon_s, "honest")
+    held = hold(state, state.wanted, learners, tried, game.settings.horizon_s, "honest")
     for c, share in enumerate(shares):
         last, cost = played(game, state, np.full((N, 1, len(learners)), share), "honest")
         assert held[0, :, c] == near(cost, rel=1e-7, abs=1e-7)

@@ -67,10 +67,10 @@ class RobustShield(StepShield):
         Raises ``InvalidInput`` if the intervals do not fit the worlds.
         """
         states = opened(game, self.uncertainty.members(alert))
-        if (states.time_s >= game.rules.horizon_s).any():
+        if (states.time_s >= game.settings.horizon_s).any():
             raise InvalidInput(
                 f"uncertainty: {self.uncertainty}: the first decision may be as late as {states.time_s.max():g} s; must"
-                f" be before the horizon, {game.rules.horizon_s:g} s"
+                f" be before the horizon, {game.settings.horizon_s:g} s"
             )
         memory = self.first_memory(game, alert, state, states, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
@@ -96,7 +96,7 @@ class RobustShield(StepShield):
 
         ``states``: the members, M rows for each world of ``state``.
         """
-        learners, n, plans = game.rules.learners, state.n, super().plans(game, alert, state, states)
+        learners, n, plans = game.settings.learners, state.n, super().plans(game, alert, state, states)
         if states.n == n:
             return plans
         actions = np.repeat(SHARES[:, np.newaxis], len(learners), axis=1)

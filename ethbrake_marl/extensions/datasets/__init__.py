@@ -87,7 +87,7 @@ def to_parquet(
 
 def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
     """Simulate a team in n worlds; return its L learners' commands as actions, one array [n, L] for each decision."""
-    learners = game.rules.learners
+    learners = game.settings.learners
     return [
         actions_of(state, learners, state.wanted[:, learners]).astype(np.float32)
         for step, state in play(game, alert, team)
@@ -100,9 +100,9 @@ def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator
 
     The learners take ``actions``; after the last of these they repeat it.
     """
-    state, learners = game.reset(alert), game.rules.learners.tolist()
+    state, learners = game.reset(alert), game.settings.learners.tolist()
     while not state.ended.all():
-        rows, seen = ~state.ended, game.observe(state, game.rules.learners)
+        rows, seen = ~state.ended, game.observe(state, game.settings.learners)
         t = int(state.steps.max())
         action = actions[min(t, len(actions) - 1)]
         after, step = game.step(state, action.astype(np.float64))

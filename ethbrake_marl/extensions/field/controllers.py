@@ -231,7 +231,7 @@ class Controller:
         self.name, self.law, self.parameters, self.step_s = name, law, Parameters(**parameters), step_s
 
     def check(self, game: Game, body: int) -> None:
-        step_s = game.rules.time_step_s
+        step_s = game.settings.time_step_s
         if not math.isclose(step_s, self.step_s):
             raise InvalidInput(
                 f"agent {self.name!r} was made for decisions every {self.step_s:g} s, but scenario {game.name!r} has"

@@ -47,7 +47,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
     ``decide``: returns the learners' actions at a ``Moment``. ``gamma``: discount per step. If harm is the reward's
     only term, an episode also ends, after ``at_least`` steps, when no vehicle will ever move again.
     """
-    learners, only_harm = game.rules.learners, set(game.rewarding.counted) <= {"harm"}
+    learners, only_harm = game.settings.learners, set(game.rewarding.counted) <= {"harm"}
     gained, over = np.zeros((state.n, len(learners))), state.ended
     rows, ended, last = np.flatnonzero(~over), [np.flatnonzero(over)], [state.take(over)]
     now, discount, number = state.take(rows), 1.0, 0
@@ -56,7 +56,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
         gained[rows] += discount * step.reward[:, learners - 1]
         over = after.ended
         if only_harm and number >= at_least:
-            over |= stands_for_good(now, after, game.rules.weights)
+            over |= stands_for_good(now, after, game.settings.weights)
         if over.any():
             ended.append(rows[over])
             last.append(after.take(over))

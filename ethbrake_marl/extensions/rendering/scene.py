@@ -163,7 +163,7 @@ class Motion:
 
     def scene(self, time_s: float) -> Scene:
         line, front_m, impacts = self.at(time_s)
-        learners, ended = tuple(map(int, self.game.rules.learners)), self.ended and time_s == self.until_s
+        learners, ended = tuple(map(int, self.game.settings.learners)), self.ended and time_s == self.until_s
         return Scene(
             self.game.name, learners, ended, time_s, line, self.car, self.wanted, front_m, impacts, self.road_m
         )

@@ -130,8 +130,7 @@ class MappedGame(Game):
                 f"scenario {self.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
                 " a scenario that has physics: paper-map"
             )
-        rules = self.rules
-        state = one_step.first_decision(alert, self.deciders, rules.time_step_s, rules.horizon_s, rules.most_steps)
+        state = one_step.first_decision(alert, self.deciders, self.settings)
         if state.collided.any():
             raise InvalidInput(
                 f"scenario {self.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
@@ -140,8 +139,8 @@ class MappedGame(Game):
         return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        before, rules = decided(self, state, actions), self.rules
-        after, over = sample(before, rules.time_step_s), state.ended
+        before, settings = decided(self, state, actions), self.settings
+        after, over = sample(before, settings.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
         np.copyto(after.clock, before.clock, where=over[:, np.newaxis])
         last = after.clock[:, STEPS] >= after.clock[:, LAST]
@@ -152,15 +151,15 @@ class MappedGame(Game):
         ends = after.ended & ~over
         out[TERMINATED], out[TRUNCATED] = ends & after.at_rest, ends & ~after.at_rest
         out[SAFE_END] = ends & ~after.collided
-        out[COST] = rules.weights[OF_FIRST] * out[HARM] + rules.weights[OF_TOTAL] * out[TOTAL_HARM]
-        shared = rules.terminal * out[SAFE_END] - rules.harm * out[COST]
+        out[COST] = settings.weights[OF_FIRST] * out[HARM] + settings.weights[OF_TOTAL] * out[TOTAL_HARM]
+        shared = settings.terminal * out[SAFE_END] - settings.harm * out[COST]
         reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)
-        return after, Step(reward, out, rules.time_step_s)
+        return after, Step(reward, out, settings.time_step_s)
 
 
 def decided(game: Game, state: State, actions: Floats | None) -> State:
     """State with the commands of scripts and learners, as at the beginning of a step of a game."""
-    learners = game.rules.learners
+    learners = game.settings.learners
     given = proposal_array(learners, actions, state.n)
     if np.isnan(given).any():
         check_actions(learners, given[np.isnan(given).any(axis=1).argmax()])
@@ -180,7 +179,7 @@ class PaperMap:
     def game(self, game: Game) -> Game:
         """Return the game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
-        if game.rules.weights[OF_PASSED:].any() or counted:
+        if game.settings.weights[OF_PASSED:].any() or counted:
             what = f"the term {counted[0]}" if counted else "harm_count honest"
             raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
         terms = tuple(

@@ -260,7 +260,7 @@ def problem_of(
     """
     check_exact(alert, "a search for the best braking")
     check_count("count", count)
-    chosen = np.array(game.rules.learners if bodies is None else bodies, np.int64)
+    chosen = np.array(game.settings.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
         raise InvalidInput(f"vehicles {chosen.tolist()}: must be one or more of 1 to {alert.vehicles}, each once")
     for body, script in game.scripts.items():
@@ -269,11 +269,11 @@ def problem_of(
                 f"scenario {game.name!r}: vehicle_{body} is driven by {getattr(script, 'name', script)!r}, whose"
                 " commands are not known at the alert; a search needs scripts that hold one command"
             )
-    wanted = with_braking(alert, game.rules.learners).wanted
+    wanted = with_braking(alert, game.settings.learners).wanted
     wanted[:, chosen] = 0.0
-    dt, horizon_s, most_steps = game.rules.time_step_s, game.rules.horizon_s, game.rules.most_steps
+    dt = game.settings.time_step_s
     decide = chosen if deciders is None else np.array(deciders, np.int64)
-    state = first_decision(alert._replace(wanted=wanted, memories={}), decide, dt, horizon_s, most_steps)
+    state = first_decision(alert._replace(wanted=wanted, memories={}), decide, game.settings)
     shares = np.zeros((alert.n, 3, wanted.shape[1]))
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST, END]]]
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack(times))
