@@ -30,7 +30,7 @@ COUNTS = {  # name -> weights of these rows
     "total": np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
     "honest": np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]),
 }
-RULES = {"honest": "honest", "paper": "first"}  # short name -> count
+SHORT_NAMES = {"honest": "honest", "paper": "first"}  # short name -> count
 Count = str | Floats  # the name of a count, or its weights, [6]
 
 HARM = {"first": "first_impact_harm", "total": "total_harm"}  # counts of harm alone -> column of an evaluation

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.worlds.rules import CAR_ROWS, RECORDING, RULES, USUAL
+from ethbrake_marl.worlds.quantities import CAR_ROWS, QUANTITIES, RECORDING, USUAL
 from ethbrake_marl.worlds.sampling import Drawn, Texts
 
 if TYPE_CHECKING:
@@ -37,17 +37,17 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
     there = {key: np.isfinite(values[key]).any() for key in ("obstacle_gap_m", "brake_rate_mps3", "release_rate_mps3")}
     there |= {"harm_weight": (values["harm_weight"] != 1.0).any(), "friction": np.isfinite(values["friction"]).all()}
     return {
-        RULES[key].column_of(i): np.minimum(column, RULES[key].high)
-        for key in RULES
+        QUANTITIES[key].column_of(i): np.minimum(column, QUANTITIES[key].high)
+        for key in QUANTITIES
         if key in USUAL or there.get(key)
-        for i, column in enumerate(values[key].T[: RULES[key].count(worlds.vehicles)])
+        for i, column in enumerate(values[key].T[: QUANTITIES[key].count(worlds.vehicles)])
     }
 
 
 def fixed_columns(scenario: Scenario) -> set[str]:
     """Columns of ``quantities_of`` that are equal in all worlds, apart from gaps and speeds."""
     keys = [key for key in CAR_ROWS if key in USUAL or key in scenario.sources]
-    ends = {RULES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
+    ends = {QUANTITIES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
     return {name for name, (low, high) in ends.items() if low == high}
 
 

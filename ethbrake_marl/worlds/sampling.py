@@ -17,20 +17,20 @@ from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, GAP, IMPACTS, LATENCY
 from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.counters import Channel, Numbers, numbers_of, world_numbers
 from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
-from ethbrake_marl.worlds.quantity import pick
-from ethbrake_marl.worlds.roles import first_command
-from ethbrake_marl.worlds.rules import (
+from ethbrake_marl.worlds.quantities import (
     CAR_ROWS,
     MIXTURE,
     NEWS,
     OF_WORLD,
     PER_TYPE,
+    QUANTITIES,
     RECORDING,
     ROW,
-    RULES,
     TYPES,
     width_of,
 )
+from ethbrake_marl.worlds.quantity import pick
+from ethbrake_marl.worlds.roles import first_command
 from ethbrake_marl.worlds.table import TableColumn
 from ethbrake_marl.worlds.vehicle_types import WithLoad
 
@@ -112,7 +112,7 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
                     drawn[rows, i] = quantity
                     continue
                 # All columns of a table take their number from one place, so a world takes them from the same row.
-                stream, column = ROW if isinstance(quantity, TableColumn) else RULES[key].place(i)
+                stream, column = ROW if isinstance(quantity, TableColumn) else QUANTITIES[key].place(i)
                 u = numbers(width_of(stream, scenario.vehicles), stream)[rows, column]
                 of = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)
                 drawn[rows, i] = quantity.value(*of)

@@ -36,9 +36,9 @@ from ethbrake_marl.worlds.checks import ScenarioWording, check_whole
 from ethbrake_marl.worlds.counters import Channel
 from ethbrake_marl.worlds.derived import world_values
 from ethbrake_marl.worlds.mixture import WORDS, changed_content, with_members
+from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_count, table_columns
 from ethbrake_marl.worlds.quantity import Part, PerVehicle, Quantity, Weight, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
-from ethbrake_marl.worlds.rules import OF_A_TYPE, OPTIONAL, RULES, USUAL, check_count, table_columns
 from ethbrake_marl.worlds.sampling import Drawn, draw
 from ethbrake_marl.worlds.table import Table, TableColumn
 from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes
@@ -69,7 +69,7 @@ class Member(Part):
 
 
 def _quantity(key: str, default: Any = None, **more: Any) -> Any:
-    return Field(default=default, description=RULES[key].meaning, **more)
+    return Field(default=default, description=QUANTITIES[key].meaning, **more)
 
 
 class Scenario(Part):
@@ -196,10 +196,10 @@ class Scenario(Part):
             value.check_cells(table_columns((*USUAL, *OPTIONAL), info.data["vehicles"]))
         return value
 
-    @field_validator(*RULES)
+    @field_validator(*QUANTITIES)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        rule = RULES[str(info.field_name)]
+        rule = QUANTITIES[str(info.field_name)]
         if "vehicles" in info.data:
             check_count(value, rule.count(info.data["vehicles"]), rule.per)
         listed = isinstance(value, tuple)
@@ -296,7 +296,7 @@ class Scenario(Part):
         or column of the table.
         """
         sources = {}
-        for key, rule in RULES.items():
+        for key, rule in QUANTITIES.items():
             own, line, entries = getattr(self, key), self.types_of_line if key in OF_A_TYPE else None, []
             for i, outside in enumerate(own if isinstance(own, tuple) else (own,) * rule.count(self.vehicles)):
                 column = self.columns.get(rule.column_of(i))
@@ -314,7 +314,7 @@ class Scenario(Part):
 
         Capacities include the road's friction. An undeclared rate is the largest valid one.
         """
-        at_once = np.full((2, self.vehicles), RULES[key].high)
+        at_once = np.full((2, self.vehicles), QUANTITIES[key].high)
         each = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
         lows, highs = np.min(each, axis=0)[0], np.max(each, axis=0)[1]
         return tuple(zip(lows.tolist(), highs.tolist(), strict=True))

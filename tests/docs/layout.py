@@ -35,7 +35,7 @@ this. `python -m tests.docs.layout` makes this page from the code.
 | What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
 | Which agents are there? | `parts.py`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
 | Who lets agents drive? | `agents/drive.py`: `play`, `drive` |
-| What can a scenario file say? | `worlds/`: `scenario.py`, `rules.py`; [scenarios](../scenarios.md) |
+| What can a scenario file say? | `worlds/`: `scenario.py`, `quantities.py`; [scenarios](../scenarios.md) |
 | How does a training run? | `training/`: `train.py`, `ppo.py`, `sac.py`; between two updates: `updates.py` |
 | How do I add a column to an evaluation? | [a measure](../extend.md#a-measure) |
 

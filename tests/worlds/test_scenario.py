@@ -20,7 +20,7 @@ from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, l
 from ethbrake_marl.worlds.counters import numbers_of
 from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
 from ethbrake_marl.worlds.game import Pool, views_of
-from ethbrake_marl.worlds.rules import RULES
+from ethbrake_marl.worlds.quantities import QUANTITIES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
 from tests.refused import refused
@@ -309,7 +309,7 @@ def test_json_schema__accepts_what_the_reader_accepts() -> None:
     editor = jsonschema.Draft202012Validator(explain.scenario_json_schema())
     for entry in list_scenarios():
         assert not [*editor.iter_errors(read_yaml(entry.path).content)], entry.name
-    for key, rule in RULES.items():
+    for key, rule in QUANTITIES.items():
         inside, outside = rule.high, np.nextafter(rule.high, np.inf)
         for content in ({key: inside}, {key: {"uniform": [inside, inside]}}):
             assert editor.is_valid({"name": "x", **content}), key

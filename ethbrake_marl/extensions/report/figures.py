@@ -46,7 +46,7 @@ from ethbrake_marl.motion.layout import BRAKING, LATENCY, Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.describe import quantities_of
 from ethbrake_marl.worlds.game import AnyScenario
-from ethbrake_marl.worlds.rules import RULES, Rule
+from ethbrake_marl.worlds.quantities import QUANTITIES, Rule
 from ethbrake_marl.worlds.sampling import Drawn
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -384,7 +384,7 @@ def worlds_figure(scenario: Scenario, drawn: Drawn, *, seed: int) -> Figure:
 
 def _varying(drawn: Drawn) -> dict[Rule, dict[int, Floats]]:
     columns, varying = quantities_of(drawn.worlds, drawn.friction), dict[Rule, dict[int, Floats]]()
-    for rule in (rule for rule in RULES.values() if rule.column):
+    for rule in (rule for rule in QUANTITIES.values() if rule.column):
         for i in range(rule.count(drawn.worlds.vehicles)):
             values = columns.get(rule.column_of(i))
             if values is not None and np.nanmin(values) < np.nanmax(values):
