@@ -35,7 +35,7 @@ class Pool:
         """Copies of the worlds ``first`` to ``first + n - 1`` of the seed."""
         worlds = self.worlds
         if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
-            worlds = self.scenario.sample(max(4 * n, AT_ONCE), seed, first=first, channel="training")
+            worlds = self.scenario.sample(max(4 * n, AT_ONCE), seed, first=first, purpose="training")
             self.worlds, self.seed, self.first = worlds, seed, first
         return worlds.take(np.arange(first - self.first, first - self.first + n))
 

@@ -15,7 +15,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
 from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, GAP, IMPACTS, LATENCY, Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import PER_LINK
-from ethbrake_marl.worlds.counters import Channel, Numbers, numbers_of, world_numbers
+from ethbrake_marl.worlds.counters import Numbers, Purpose, numbers_of, world_numbers
 from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
 from ethbrake_marl.worlds.quantities import (
     CAR_ROWS,
@@ -59,24 +59,24 @@ class Drawn(NamedTuple):
         return cls(worlds, np.full(n, np.nan), np.full((n, worlds.vehicles), ""), np.full(n, ""), np.full(n, ""))
 
 
-def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) -> Drawn:
+def draw(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) -> Drawn:
     """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
 
     Raises ``InvalidInput`` for bad arguments, and for a world that is rejected ``MOST_ATTEMPTS`` times.
     """
-    index = world_numbers(n, seed, first, channel)
+    index = world_numbers(n, seed, first, purpose)
     if not scenario.members:
-        return _accepted(scenario, seed, channel, index)
-    chosen, parts = member_numbers(scenario, index, seed, channel), []
+        return _accepted(scenario, seed, purpose, index)
+    chosen, parts = member_numbers(scenario, index, seed, purpose), []
     for k in np.unique(chosen):
-        part = _accepted(scenario.members[k], seed, channel, index[chosen == k])
+        part = _accepted(scenario.members[k], seed, purpose, index[chosen == k])
         parts.append(part._replace(scenarios=np.full(part.worlds.n, scenario.members[k].name)))
     return merged(parts, np.argsort(chosen, kind="stable"))
 
 
-def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel = "list") -> Ints:
+def member_numbers(scenario: Scenario, index: Ints, seed: int, purpose: Purpose = "list") -> Ints:
     """Number (from 0) of the member from which each of the worlds ``index`` [n], ascending, is drawn, [n]."""
-    u = numbers_of(seed, channel, 0, index)(OF_WORLD, MIXTURE)[:, 0]
+    u = numbers_of(seed, purpose, 0, index)(OF_WORLD, MIXTURE)[:, 0]
     return pick([member.weight for member in scenario.mixture or ()], u)
 
 
@@ -153,15 +153,15 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
     return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 
-def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn:
+def _accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> Drawn:
     """Worlds ``index``; worlds with an early impact are drawn again if the scenario rejects them."""
-    drawn = draw_once(scenario, numbers_of(seed, channel, 0, index), index)
+    drawn = draw_once(scenario, numbers_of(seed, purpose, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn
     pending, rejected, attempt = np.flatnonzero(has_early_impact(scenario, drawn.worlds)), 0, 0
     while len(pending) and attempt < MOST_ATTEMPTS - 1:
         rejected, attempt = rejected + len(pending), attempt + 1
-        again = draw_once(scenario, numbers_of(seed, channel, attempt, index[pending]), index[pending])
+        again = draw_once(scenario, numbers_of(seed, purpose, attempt, index[pending]), index[pending])
         drawn.worlds.put(pending, again.worlds, donate=True)
         for whole, part in zip(drawn[1:5], again[1:5], strict=True):
             whole[pending] = part

@@ -33,7 +33,7 @@ from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import V2X
 from ethbrake_marl.worlds.checks import ScenarioWording, check_whole
-from ethbrake_marl.worlds.counters import Channel
+from ethbrake_marl.worlds.counters import Purpose
 from ethbrake_marl.worlds.derived import world_values
 from ethbrake_marl.worlds.mixture import WORDS, changed_content, with_members
 from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_count, table_columns
@@ -231,18 +231,18 @@ class Scenario(Part):
 
     # ---- its worlds
 
-    def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> State:
+    def sample(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> State:
         """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed, at the alert.
 
-        World k always has the same bits. A seed has two independent lists: ``channel="list"`` for evaluation,
+        World k always has the same bits. A seed has two independent lists: ``purpose="list"`` for evaluation,
         ``"training"`` for training. Raises ``InvalidInput`` for bad arguments, and if ``early_impacts: reject`` leaves
         no world.
         """
-        return self.draw(n, seed, first=first, channel=channel).worlds
+        return self.draw(n, seed, first=first, purpose=purpose).worlds
 
-    def draw(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Drawn:
+    def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> Drawn:
         """Worlds as in ``sample``, with their types, members and recordings, and the number of rejected draws."""
-        return draw(self, n, seed, first, channel)
+        return draw(self, n, seed, first, purpose)
 
     # ---- who is in the line
 

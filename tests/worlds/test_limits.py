@@ -60,7 +60,7 @@ def below(key: str) -> float:
 
 def above(key: str) -> float:
     """Return the smallest number that is too large."""
-    return math.nextafter(3600.0 if RANGES[key][1] == IN_TIME else EXAMPLES[key][1], math.inf)
+    return math.nextafter(3600.0 if RANGES[key][1] == IN_TIME else RANGES[key][1], math.inf)
 
 
 def ends(key: str, value: float) -> dict[str, Any]:

@@ -67,8 +67,8 @@ def test_random_numbers__are_those_of_numpys_own_generator() -> None:
 def test_random_numbers__differ_by_seed_channel_attempt_and_stream() -> None:
     index = np.arange(3)
     drawn = [
-        numbers_of(seed, channel, attempt, index)(8, stream).tobytes()
-        for seed, channel, attempt, stream in [
+        numbers_of(seed, purpose, attempt, index)(8, stream).tobytes()
+        for seed, purpose, attempt, stream in [
             (7, "list", 0, ()), (8, "list", 0, ()), (7, "training", 0, ()), (7, "list", 1, ()), (7, "list", 0, TYPES),
             (7, "list", 0, NEWS),
         ]
