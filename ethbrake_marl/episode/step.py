@@ -115,39 +115,29 @@ class Step(NamedTuple):
         return self.out[SAFE_END] == 1.0
 
 
-@kernel
-def stands(line, wanted):
-    """Whether every vehicle of one world is at rest, and no command (``wanted``) or force would move it."""
-    at_rest = True
-    for i in range(1, line.shape[1]):
-        at_rest = at_rest and line[SPEED, i] == 0.0 and wanted[i] <= 0.0 and line[FORCE, i] <= 0.0
-    return at_rest
+def step(
+    settings: StepSettings, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
+) -> tuple[State, Step]:
+    """State after one step, and what happened in the step.
 
-
-@kernel
-def note_motion(line):
-    """Store each vehicle's squared speed at the end in the row MOVING of one world's ``line``."""
-    for i in range(1, line.shape[1]):
-        line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
-
-
-@kernel
-def advance(line, car, clock, wanted, scratch, time_step_s):
-    """Advance one running world to its next decision, in place; return ``move_line``'s result, and whether all rests.
-
-    Arguments as in ``step_worlds``, without the axis of worlds. Decision times are multiples of the time step after the
-    first decision, so that they never differ by rounding.
+    ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` look at the state at every decision. Raises
+    ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
-    clock[STEPS] += 1.0
-    over = clock[STEPS] >= clock[LAST]
-    until = clock[END] if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
-    met = move_line(line, car, wanted, scratch, clock[TIME], until)
-    clock[TIME] = until
-    at_rest = met != FAILED and stands(line, wanted)
-    clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
-    if over:
-        note_motion(line)
-    return met, at_rest
+    actions = action_array(settings.learners, actions, state.n)
+    line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
+    if not donate:
+        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
+    reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
+    scratch = scratch_for(wanted.shape[1])
+    refused, failed = step_worlds(
+        line, car, clock, wanted, actions, scratch, out, reward, settings.learners, settings.time_step_s, settings.harm,
+        settings.terminal, settings.weights,
+    )  # fmt: skip
+    if refused >= 0:
+        check_actions(settings.learners, actions[refused])
+    if failed >= 0:
+        raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
+    return State(line, car, clock, know, wanted, memories), Step(reward, out, settings.time_step_s)
 
 
 @large
@@ -197,6 +187,41 @@ def step_worlds(
     return -1, failed
 
 
+@kernel
+def advance(line, car, clock, wanted, scratch, time_step_s):
+    """Advance one running world to its next decision, in place; return ``move_line``'s result, and whether all rests.
+
+    Arguments as in ``step_worlds``, without the axis of worlds. Decision times are multiples of the time step after the
+    first decision, so that they never differ by rounding.
+    """
+    clock[STEPS] += 1.0
+    over = clock[STEPS] >= clock[LAST]
+    until = clock[END] if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
+    met = move_line(line, car, wanted, scratch, clock[TIME], until)
+    clock[TIME] = until
+    at_rest = met != FAILED and stands(line, wanted)
+    clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
+    if over:
+        note_motion(line)
+    return met, at_rest
+
+
+@kernel
+def stands(line, wanted):
+    """Whether every vehicle of one world is at rest, and no command (``wanted``) or force would move it."""
+    at_rest = True
+    for i in range(1, line.shape[1]):
+        at_rest = at_rest and line[SPEED, i] == 0.0 and wanted[i] <= 0.0 and line[FORCE, i] <= 0.0
+    return at_rest
+
+
+@kernel
+def note_motion(line):
+    """Store each vehicle's squared speed at the end in the row MOVING of one world's ``line``."""
+    for i in range(1, line.shape[1]):
+        line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
+
+
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:
     """State of worlds at the alert, when Vehicle 1 begins to brake and nobody has decided yet.
 
@@ -205,17 +230,6 @@ def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: I
     clock = np.zeros((len(line), CLOCK_COLUMNS))
     clock[:, NUMBER] = numbers
     return State(line, car, clock, know, wanted, {})
-
-
-def advanced(state: State, until_s: Floats) -> State:
-    """State at ``until_s`` [n] if all vehicles hold their commands."""
-    line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
-    car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others
-    failed = move_lines(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
-    if failed >= 0:
-        raise failure(state, failed, state.time_s[failed], until_s[failed])
-    clock[:, TIME] = until_s
-    return state._replace(line=line, car=car, clock=clock, wanted=wanted)
 
 
 def first_decision(alert: State, deciders: Ints, settings: StepSettings) -> State:
@@ -237,29 +251,15 @@ def steps_to_horizon(first_s: Any, settings: StepSettings) -> Any:
     return np.ceil((settings.horizon_s - first_s) / settings.time_step_s - ROUNDING)
 
 
-def step(
-    settings: StepSettings, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
-) -> tuple[State, Step]:
-    """State after one step, and what happened in the step.
-
-    ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` look at the state at every decision. Raises
-    ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
-    """
-    actions = action_array(settings.learners, actions, state.n)
-    line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
-    if not donate:
-        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
-    reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
-    scratch = scratch_for(wanted.shape[1])
-    refused, failed = step_worlds(
-        line, car, clock, wanted, actions, scratch, out, reward, settings.learners, settings.time_step_s, settings.harm,
-        settings.terminal, settings.weights,
-    )  # fmt: skip
-    if refused >= 0:
-        check_actions(settings.learners, actions[refused])
+def advanced(state: State, until_s: Floats) -> State:
+    """State at ``until_s`` [n] if all vehicles hold their commands."""
+    line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
+    car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others
+    failed = move_lines(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
     if failed >= 0:
-        raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
-    return State(line, car, clock, know, wanted, memories), Step(reward, out, settings.time_step_s)
+        raise failure(state, failed, state.time_s[failed], until_s[failed])
+    clock[:, TIME] = until_s
+    return state._replace(line=line, car=car, clock=clock, wanted=wanted)
 
 
 def scripted(scripts: Mapping[int, Any], state: State) -> State:
