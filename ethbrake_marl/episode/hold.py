@@ -16,11 +16,7 @@ from ethbrake_marl.episode.step import note_motion
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.interval import FAILED, move_line
-from ethbrake_marl.motion.layout import BRAKING, LINE_ROWS, Floats, scratch_for
-
-
-def working_memory(bodies: int) -> tuple[Floats, Floats, Floats]:
-    return scratch_for(bodies), np.zeros((LINE_ROWS, bodies)), np.zeros(bodies)
+from ethbrake_marl.motion.layout import BRAKING, Floats, scratch_for
 
 
 @large
@@ -29,7 +25,7 @@ def hold_worlds(line, car, wanted, bodies, tried, time, until, weights, tie_weig
 
     The other bodies hold ``wanted``. Row 0 of ``out`` counts by ``weights`` [6], row 1 by ``tie_weights``. ``time``
     and ``until`` [n] (s): from when to when they hold. ``line``, ``car`` and ``wanted`` are arrays of a ``State``;
-    ``memory``: ``working_memory``, overwritten.
+    ``memory``: working memory of the physics, of one line and of its commands, overwritten.
     """
     scratch, here, commands = memory
     for k in range(tried.shape[0]):
@@ -58,9 +54,10 @@ def hold(
     others = "e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping"
     check_exact(state, f"a plan of constant commands ({others})")
     out, weights = np.empty((2, *tried.shape[:2])), (weights_of(count), weights_of(other_count(count)))
+    memory = scratch_for(wanted.shape[1]), np.zeros(state.line.shape[1:]), np.zeros(wanted.shape[1])
     hold_worlds(
         state.line, state.car, wanted, np.asarray(bodies, np.int64), np.ascontiguousarray(tried),
-        state.time_s.copy(), np.full(state.n, until_s, np.float64), *weights, working_memory(wanted.shape[1]), out,
+        state.time_s.copy(), np.full(state.n, until_s, np.float64), *weights, memory, out,
     )  # fmt: skip
     return out
 
