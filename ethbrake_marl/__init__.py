@@ -42,7 +42,8 @@ if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game as Game
     from ethbrake_marl.episode.state import State as State
     from ethbrake_marl.episode.step import Step as Step
-    from ethbrake_marl.episode.play import hold as hold, price as price
+    from ethbrake_marl.episode.hold import hold as hold
+    from ethbrake_marl.episode.play import price as price
     from ethbrake_marl.episode.observe import View as View
     from ethbrake_marl.episode.reward import RewardParams as RewardParams
 

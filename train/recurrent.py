@@ -61,7 +61,7 @@ def train(scenario: eb.Scenario, observation: list[str], args: argparse.Namespac
     """Return the trained network. Every ten updates, print the mean of what the reward counts."""
     torch.manual_seed(args.seed)
     _, game = eb.open_game(scenario, observation=observation, reward={"harm_count": args.harm_count})
-    learners = game.rules.learners
+    learners = game.settings.learners
     n, shape = args.worlds, (args.worlds, len(learners))
     network = Recurrent(len(eb.View(observation).names), not args.memoryless)
     optimiser = torch.optim.Adam(network.parameters(), lr=RATE)

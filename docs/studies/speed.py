@@ -138,7 +138,7 @@ def stepping(n: int, steps: int = 100) -> Work:
             if len(rows):
                 state = state.put(rows, game.reset(game.draw(len(rows), SEED, first)), donate=True)
                 first += len(rows)
-            game.observe(state, game.rules.learners)
+            game.observe(state, game.settings.learners)
         return steps * n
 
     return work

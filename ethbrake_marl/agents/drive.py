@@ -8,11 +8,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game, Script, Shield
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step, asked, begin
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+from ethbrake_marl.motion.layout import Floats
 
 # what an agent needs to know, from little to much
 SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
@@ -83,7 +84,7 @@ class Team(NamedTuple):
         Raises ``InvalidInput`` unless the team drives exactly the learners, for a shield without learners, and if the
         game already has another shield.
         """
-        driven, wanted = sorted(self.drivers), sorted(game.rules.learners.tolist())
+        driven, wanted = sorted(self.drivers), sorted(game.settings.learners.tolist())
         if driven != wanted:
             theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
             raise InvalidInput(f"team {self.name!r}: drives {theirs}; must drive exactly {right}")
@@ -130,7 +131,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
         memories = {body: begin(agent, alert, body) for body, agent in agents.items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.
-        game = game._replace(scripts={**game.scripts, **agents}, rules=game.rules._replace(learners=NOBODY))
+        game = game._replace(scripts={**game.scripts, **agents}, settings=game.settings._replace(learners=NOBODY))
     else:
         state, actions = game.reset(alert), None
     yield None, state
@@ -154,17 +155,5 @@ def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, A
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
         commands, after[body] = asked(agent, state, memories[body], body)
-        actions[:, column] = to_action(state, body, commands)
+        actions[:, column] = actions_of(state, body, commands)
     return actions, after
-
-
-def to_command(state: State, body: int, actions: Floats) -> Floats:
-    """Return commands, [n] m/s2, for actions [n] from -1 (full braking) to 1 (full driving)."""
-    return np.where(actions < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body]) * actions
-
-
-def to_action(state: State, body: int, commands: Floats) -> Floats:
-    """Return actions in [-1, 1] for commands [n] (m/s2), clipped to the vehicle's capacities."""
-    capacity = np.where(commands < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body])
-    share = np.divide(commands, capacity, out=np.zeros_like(capacity), where=capacity > 0.0)
-    return np.clip(share, -1.0, 1.0)

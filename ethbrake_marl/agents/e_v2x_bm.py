@@ -15,12 +15,12 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import MODEL, NOBODY, STATE
 from ethbrake_marl.agents.pairwise import Choice, closed_form, pairwise
-from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Rules, failure, first_decision, step
+from ethbrake_marl.episode.step import StepSettings, failure, first_decision, step
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.roles import HELD, LEARNER
 
@@ -41,7 +41,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
     """
     until_s = np.full(alert.n, horizon_s, np.float64)
     braking = np.maximum(-alert.wanted, 0.0)
-    braking[:, body] = alert.car[:, BRAKING, body]
+    braking[:, body] = alert.braking_capacity_mps2[:, body - 1]
     best = closed_form(alert, braking, body).deceleration_mps2
     harm = harms(alert, body, best[:, np.newaxis], count, until_s)[:, :, 0]
     rows = np.flatnonzero(harm.any(axis=0))
@@ -69,7 +69,7 @@ def search(alert: State, body: int, count: str, until_s: Floats) -> Floats:
     ends.
     """
     best = np.full((alert.n, 3), np.inf)
-    rows, step = np.arange(alert.n), alert.car[:, BRAKING, body] / FIRST_PARTS
+    rows, step = np.arange(alert.n), alert.braking_capacity_mps2[:, body - 1] / FIRST_PARTS
     at = step[:, np.newaxis] * np.arange(FIRST_PARTS + 1)
     harm = harms(alert, body, at, count, until_s)
     while len(rows):
@@ -149,7 +149,7 @@ class EV2XBM:
     If they do, the predicted harm is, to the last bit, the harm of the episode.
 
     Args:
-        rules: rules of the episodes (``Game.rules``).
+        settings: settings of the episodes (``Game.settings``).
         agents: body -> role, for vehicles driven by agents whose commands are not known at the alert.
         count: harm to minimise: ``first``, ``total`` or ``honest`` (``episode.counts``).
 
@@ -157,8 +157,10 @@ class EV2XBM:
 
     name, knows = "e_v2x_bm", MODEL
 
-    def __init__(self, rules: Rules, agents: Mapping[int, str] = MappingProxyType({}), count: str = "first") -> None:
-        self.rules, self.agents, self.count = rules, dict(agents), count
+    def __init__(
+        self, settings: StepSettings, agents: Mapping[int, str] = MappingProxyType({}), count: str = "first"
+    ) -> None:
+        self.settings, self.agents, self.count = settings, dict(agents), count
 
     def begin(self, alert: State, body: int) -> Memory:
         """Choose the deceleration. Raises ``InvalidInput`` if another vehicle is driven by an agent."""
@@ -168,12 +170,12 @@ class EV2XBM:
                     f"agent {self.name!r}: vehicle_{other} is driven by {role!r}, whose commands are not known at the"
                     " alert; use e_v2x_bm:pairwise, which assumes that its neighbours brake fully"
                 )
-        wanted, learners = alert.wanted.copy(), self.rules.learners
-        wanted[:, learners] = -alert.car[:, BRAKING][:, learners]
+        wanted, learners = alert.wanted.copy(), self.settings.learners
+        wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
         alert = alert._replace(wanted=wanted)
-        command = -coupled(alert, body, self.count, self.rules.horizon_s).deceleration_mps2
+        command = -coupled(alert, body, self.count, self.settings.horizon_s).deceleration_mps2
         wanted[:, body] = command
-        return Memory(command, last_if_held(alert, self.rules).harm(self.count))
+        return Memory(command, last_if_held(alert, self.settings).harm(self.count))
 
     def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
         return memory.command, memory
@@ -193,11 +195,11 @@ class EV2XBMPairwise:
         return memory.command, memory
 
 
-def last_if_held(alert: State, rules: Rules) -> State:
-    state = first_decision(alert, rules.learners, rules.time_step_s, rules.horizon_s)
-    rules, nothing = rules._replace(learners=NOBODY), np.zeros((alert.n, 0))
+def last_if_held(alert: State, settings: StepSettings) -> State:
+    state = first_decision(alert, settings.learners, settings)
+    settings, nothing = settings._replace(learners=NOBODY), np.zeros((alert.n, 0))
     while not state.ended.all():
-        state, _ = step(rules, {}, state, nothing, donate=True)
+        state, _ = step(settings, {}, state, nothing, donate=True)
     return state
 
 
@@ -209,8 +211,8 @@ def make_e_v2x_bm(argument: str | None, settings: Any) -> EV2XBM | EV2XBMPairwis
     scenario = settings.needed_scenario()
     roles = dict(enumerate(scenario.roles.values(), 1))
     agents = {body: role for body, role in roles.items() if role.partition(":")[0] not in (LEARNER, *HELD)}
-    rules = Rules(np.array(scenario.learners, np.int64), scenario.time_step_s, scenario.horizon_s)
-    return EV2XBM(rules, agents, settings.harm_count)
+    step_settings = StepSettings(np.array(scenario.learners, np.int64), scenario.time_step_s, scenario.horizon_s)
+    return EV2XBM(step_settings, agents, settings.harm_count)
 
 
 E_V2X_BM = Part(

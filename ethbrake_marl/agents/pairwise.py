@@ -21,6 +21,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.contact import contact
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, GAP, LATENCY, RELEASE_RATE, SPEED, Floats
 
@@ -175,4 +176,4 @@ def pairwise(alert: State, body: int) -> Choice:
             raise InvalidInput(
                 f"e_v2x_bm:pairwise: {what} in row {np.argmax(wrong)}, where the closed form does not hold"
             )
-    return closed_form(alert, np.ascontiguousarray(alert.car[:, BRAKING]), body)
+    return closed_form(alert, np.ascontiguousarray(capacities(alert.car, BRAKING, alert.time_s)), body)

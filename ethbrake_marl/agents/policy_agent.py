@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.drive import MESSAGES, to_command
+from ethbrake_marl.agents.drive import MESSAGES
 from ethbrake_marl.agents.foreign import (
     Ask,
     ask_function,
@@ -23,11 +23,11 @@ from ethbrake_marl.agents.foreign import (
     features_of,
     onnx_file,
 )
+from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import NUMBER, State, mapped
-from ethbrake_marl.episode.step import LARGEST_ACTION
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
@@ -61,7 +61,7 @@ class LearnedAgent:
 
     def check(self, game: Game, body: int) -> None:
         """Warn (``Unfamiliar``) if the policy was trained with another physics or another time step."""
-        manifest, step_s = self.policy.manifest, game.rules.time_step_s
+        manifest, step_s = self.policy.manifest, game.settings.time_step_s
         then, now = manifest.versions.get(PHYSICS), physics_digest()
         if then not in (None, now):
             warnings.warn(
@@ -85,7 +85,7 @@ class LearnedAgent:
         policy = self.policy
         view = self.observation or policy.observation
         seen = view.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
-        return to_command(state, body, policy(seen)[:, 0].astype(np.float64)), None
+        return commands_of(state, body, policy(seen)[:, 0].astype(np.float64)), None
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class PolicyAgent:
                 right = "with initial_state must return a pair of actions and state"
                 raise AgentFailed(self.name, None, f"vehicle_{body}: returned {both!r:.60}; {right}")
             answer, memory = both[0], self._own(both[1], state.n)
-        return to_command(state, body, self._actions(answer, state, body)), memory
+        return commands_of(state, body, self._actions(answer, state, body)), memory
 
     def _own(self, memory: Any, n: int) -> Any:
         def copied(part: Any) -> NDArray[Any]:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from ethbrake_marl.agents.drive import SENSORS
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.roles import check_role, first_command
 
@@ -18,7 +18,7 @@ class Held(NamedTuple):
     knows: str = SENSORS
 
     def begin(self, alert: State, body: int) -> Floats:
-        return first_command(self.name, alert.car[:, BRAKING, body])
+        return first_command(self.name, alert.braking_capacity_mps2[:, body - 1])
 
     def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
         return memory, memory

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ethbrake_marl.episode.counts import RULES
+from ethbrake_marl.episode.counts import SHORT_NAMES
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.files.yaml import flow_text
@@ -78,12 +78,12 @@ def _counted(rules: Override, given: Sequence[Override], owner: str) -> Override
     settings ``given`` sets the same.
     """
     name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
-    if not isinstance(name, str) or name not in RULES:
-        raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(RULES)}")
+    if not isinstance(name, str) or name not in SHORT_NAMES:
+        raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(SHORT_NAMES)}")
     for other in given:
         inside = other.path[1:] if owner == other.top == "recipe" else other.path
         if inside and inside == path[: len(inside)]:
             raise InvalidInput(
                 f"--set rules: sets {'.'.join(path)}, which --set {other.key} sets, too; leave one of them out"
             )
-    return Override(rules.text, path, RULES[name])
+    return Override(rules.text, path, SHORT_NAMES[name])

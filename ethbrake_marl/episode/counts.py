@@ -19,17 +19,18 @@ from __future__ import annotations
 import numpy as np
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.motion.compiling import kernel
+from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import DROVE, FIRST, MOVING, PASSED, PUSHED, TOTAL, Floats
 
 ROWS = [FIRST, TOTAL, PASSED, PUSHED, DROVE, MOVING]  # rows of a line that can count
+OF_FIRST, OF_TOTAL, OF_PASSED, OF_PUSHED, OF_DROVE, OF_MOVING = range(6)  # places of their weights
 
-COUNTS = {  # name -> weight of each row
+COUNTS = {  # name -> weights of these rows
     "first": np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
     "total": np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]),
     "honest": np.array([0.0, 1.0, 1.0, 10.0, 10.0, 1.0]),
 }
-RULES = {"honest": "honest", "paper": "first"}  # short name -> count
+SHORT_NAMES = {"honest": "honest", "paper": "first"}  # short name -> count
 Count = str | Floats  # the name of a count, or its weights, [6]
 
 HARM = {"first": "first_impact_harm", "total": "total_harm"}  # counts of harm alone -> column of an evaluation
@@ -52,9 +53,10 @@ def other_count(count: Count) -> str:
 
 
 @kernel
-def own_amount(line, p, weights):
+def unshared_amount(line, p, weights):
     """Part of ``pair_amount`` for conduct (m2/s2), which the rear vehicle of the pair bears alone."""
-    return weights[3] * line[PUSHED, p] + weights[4] * line[DROVE, p] + weights[5] * line[MOVING, p]
+    pushed, drove = weights[OF_PUSHED] * line[PUSHED, p], weights[OF_DROVE] * line[DROVE, p]
+    return pushed + drove + weights[OF_MOVING] * line[MOVING, p]
 
 
 @kernel
@@ -63,8 +65,8 @@ def pair_amount(line, p, weights):
 
     ``weights`` [6] are a value of ``COUNTS``.
     """
-    harm = weights[0] * line[FIRST, p] + weights[1] * line[TOTAL, p]
-    return harm + (weights[2] * line[PASSED, p] + own_amount(line, p, weights))
+    harm = weights[OF_FIRST] * line[FIRST, p] + weights[OF_TOTAL] * line[TOTAL, p]
+    return harm + (weights[OF_PASSED] * line[PASSED, p] + unshared_amount(line, p, weights))
 
 
 @kernel
@@ -76,17 +78,32 @@ def amount_so_far(line, weights):
     return amount
 
 
-def pair_amounts(line: Floats, count: Count) -> Floats:
-    """Harm of each pair so far, as ``count`` counts it, [n, N + 1] m2/s2; column 0 is the pair with the obstacle.
+@kernel
+def beside_harm(line: Floats, weights: Floats) -> float:
+    """Part of ``amount_so_far`` beside the harm of impacts, in one world (m2/s2).
 
-    ``line``: the array of a ``State``.
+    It sums in another order than ``amount_so_far``, on which the last bits of rewards depend.
     """
-    first, total, passed, *_ = weights_of(count)
-    harm = first * line[:, FIRST] + total * line[:, TOTAL]
-    return harm + (passed * line[:, PASSED] + own_amounts(line, count))
+    amount = 0.0
+    for p in range(line.shape[1] - 1):
+        amount += weights[OF_PASSED] * line[PASSED, p] + weights[OF_PUSHED] * line[PUSHED, p]
+        amount += weights[OF_DROVE] * line[DROVE, p] + weights[OF_MOVING] * line[MOVING, p]
+    return amount
 
 
-def own_amounts(line: Floats, count: Count) -> Floats:
-    """Part of ``pair_amounts`` for conduct, which the rear vehicle bears alone, [n, N + 1] m2/s2."""
-    push, drove, moving = weights_of(count)[3:]
-    return np.asarray(push * line[:, PUSHED] + drove * line[:, DROVE] + moving * line[:, MOVING])
+@large
+def _amounts(line, weights, out):
+    for k in range(out.shape[1]):
+        for p in range(out.shape[2]):
+            out[0, k, p] = pair_amount(line[k], p, weights)
+            out[1, k, p] = unshared_amount(line[k], p, weights)
+
+
+def pair_amounts(line: Floats, count: Count) -> Floats:
+    """``pair_amount`` and ``unshared_amount`` of every pair, [2, n, N + 1] m2/s2; ``line``: array of a ``State``.
+
+    Column 0 is the pair with the obstacle.
+    """
+    out = np.empty((2, len(line), line.shape[2]))
+    _amounts(line, weights_of(count), out)
+    return out

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ethbrake_marl.episode import step as one_step
+from ethbrake_marl.episode.commands import proposal_array
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.episode.step import Rules, Step
+from ethbrake_marl.episode.step import Step, StepSettings
 from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
 
@@ -48,7 +49,7 @@ class Shield(Protocol):
 
 
 class Game(NamedTuple):
-    """Worlds to draw, rules, scripts, observations, rewards, and perhaps a shield.
+    """Worlds to draw, settings, scripts, observations, rewards, and perhaps a shield.
 
     ``draw`` returns worlds at the alert; ``reset`` moves them to the first decision, and ``step`` to the next one.
     Environments, evaluation, search and shields all use this ``step``.
@@ -65,7 +66,7 @@ class Game(NamedTuple):
 
     draw: Callable[[int, int, int], State]  # (n, seed, first) -> worlds of the training stream at the alert
     name: str  # of the scenario
-    rules: Rules
+    settings: StepSettings
     rewarding: Rewarding
     views: tuple[View, ...]  # what each body observes; entry 0 belongs to the obstacle and is not used
     deciders: Ints  # bodies; the first decision is when the shortest of their latencies has elapsed
@@ -98,7 +99,7 @@ class Game(NamedTuple):
         """
         if self.shield is not None:
             if actions is not None:
-                actions = one_step.proposals(self.rules, actions, state.n)
+                actions = proposal_array(self.settings.learners, actions, state.n)
             actions, memory = self.shield.decide(self, state, actions, donate=donate)
             state = state._replace(memories={**state.memories, "shield": memory})
         if self.rewarding.is_compiled:
@@ -112,12 +113,11 @@ class Game(NamedTuple):
         Raises ``InvalidInput`` for worlds of another physics.
         """
         check_exact(alert, f"scenario {self.name!r}")
-        rules = self.rules
-        return one_step.first_decision(alert, self.deciders, rules.time_step_s, rules.horizon_s, rules.most_steps)
+        return one_step.first_decision(alert, self.deciders, self.settings)
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """``step`` (same arguments) without the shield, and without reward terms other than harm and terminal."""
-        return one_step.step(self.rules, self.scripts, state, actions, donate=donate)
+        return one_step.step(self.settings, self.scripts, state, actions, donate=donate)
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
         """The agents, body -> agent, each limited to what its vehicle may know. Here they see everything."""
@@ -135,9 +135,9 @@ class Game(NamedTuple):
 
     def observe(self, state: State, bodies: Ints) -> list[Observations]:
         """Observations of each body: a list of arrays [n, F], with the F features that this body observes."""
-        return [self.views[i].observe(state, np.array([i]), self.rules.time_step_s)[:, 0] for i in bodies.tolist()]
+        return [self.views[i].observe(state, np.array([i]), self.settings.time_step_s)[:, 0] for i in bodies.tolist()]
 
     def observe_alike(self, state: State, bodies: Sequence[int] | Ints) -> Observations:
         """Observations, [n, len(bodies), F], of ``bodies`` that observe the same features."""
         bodies = np.asarray(bodies, np.int64)
-        return self.views[bodies[0]].observe(state, bodies, self.rules.time_step_s)
+        return self.views[bodies[0]].observe(state, bodies, self.settings.time_step_s)

@@ -24,12 +24,13 @@ from typing import Any
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import action_of
 from ethbrake_marl.episode.counts import COUNTS, amount_so_far
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import LISTED, NUMBER, TIME, State, split_world
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.layout import BRAKING, COUNT, DRIVING, FIRST, FORCE, MASS, TOTAL, Floats, Ints
+from ethbrake_marl.motion.layout import FIRST, FORCE, IMPACTS, MASS, TOTAL, Floats, Ints
 
 NUMBERS = (
     "time_s",
@@ -42,8 +43,8 @@ NUMBERS = (
     "chosen_command_mps2",
     "chosen_action",
 )
-COLLIDED = NUMBERS.index("collided")
-OF_FIRST, OF_ALL = COUNTS["first"], COUNTS["total"]
+TIME_NOW, FORCE_NOW, BORNE_FIRST, BORNE_TOTAL, LINE_FIRST, LINE_TOTAL, COLLIDED, COMMAND, ACTION = range(len(NUMBERS))
+FIRST_WEIGHTS, TOTAL_WEIGHTS = COUNTS["first"], COUNTS["total"]
 
 
 @large
@@ -55,16 +56,17 @@ def report(line, car, clock, wanted, bodies, borne, out):
     for k in range(len(out)):
         split_world(line[k, FIRST], car[k, MASS], borne[0])
         split_world(line[k, TOTAL], car[k, MASS], borne[1])
-        first, total, impacts = amount_so_far(line[k], OF_FIRST), amount_so_far(line[k], OF_ALL), 0.0
+        first, total = amount_so_far(line[k], FIRST_WEIGHTS), amount_so_far(line[k], TOTAL_WEIGHTS)
+        impacts = 0.0
         for p in range(line.shape[2] - 1):
-            impacts += line[k, COUNT, p]
+            impacts += line[k, IMPACTS, p]
         for o in range(len(bodies)):
             i = bodies[o]
-            command, world = wanted[k, i], out[k, o]
-            world[0], world[1], world[2], world[3] = clock[k, TIME], line[k, FORCE, i], borne[0, i - 1], borne[1, i - 1]
-            world[4], world[5], world[6], world[7] = first, total, 1.0 if impacts > 0.0 else 0.0, command
-            capacity = car[k, BRAKING if command < 0.0 else DRIVING, i]
-            world[8] = min(max(command / capacity, -1.0), 1.0) if capacity > 0.0 else 0.0
+            info, time, command = out[k, o], clock[k, TIME], wanted[k, i]
+            info[TIME_NOW], info[FORCE_NOW], info[COLLIDED] = time, line[k, FORCE, i], 1.0 if impacts > 0.0 else 0.0
+            info[BORNE_FIRST], info[BORNE_TOTAL] = borne[0, i - 1], borne[1, i - 1]
+            info[LINE_FIRST], info[LINE_TOTAL] = first, total
+            info[COMMAND], info[ACTION] = command, action_of(car[k], i, command, time)
 
 
 def numbers(state: State, bodies: Ints) -> Floats:
@@ -89,7 +91,7 @@ def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str,
         nothing = np.zeros(state.n)
         return {"cost": nothing, **worlds, **{f"reward_{name}": nothing for name in reported}}
     terms = step.terms or game.rewarding.shared(step)
-    return {"cost": step.counted, **worlds, **{f"reward_{name}": terms[name] for name in reported}}
+    return {"cost": step.cost, **worlds, **{f"reward_{name}": terms[name] for name in reported}}
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:

@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import own_amounts, pair_amounts
+from ethbrake_marl.episode.counts import pair_amounts
 from ethbrake_marl.episode.functions import called, described
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -56,18 +56,18 @@ class Harm(NamedTuple):
     car: Floats  # [n, CAR_ROWS, N + 1] parameters (`motion.layout`)
 
     @classmethod
-    def of(cls, pairs: Floats, own: Floats, car: Floats) -> Harm:
-        """Harm of pairs, vehicles and line, from the harm ``pairs`` of each pair (column 0: with the obstacle).
+    def of(cls, amounts: Floats, car: Floats) -> Harm:
+        """Harm of pairs, vehicles and line, from ``pair_amounts`` and the parameters ``car`` of a ``State``.
 
-        The rear vehicle of a pair bears the part ``own``, its conduct, alone; the two share the rest by their masses.
-        ``pairs`` and ``own`` are [n, N + 1] m2/s2, ``car`` the parameters of a ``State``.
+        The rear vehicle of a pair bears its conduct alone; the two share the rest by their masses.
         """
+        pairs, unshared = amounts
         whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
             whole = whole + pairs[:, p]
-        impacts = np.maximum(pairs - own, 0.0)
+        impacts = np.maximum(pairs - unshared, 0.0)
         split_harm(impacts, car[:, MASS], borne)
-        return cls(impacts, borne + own[:, :-1], whole, car)
+        return cls(impacts, borne + unshared[:, :-1], whole, car)
 
     def weighted(self, weights: Floats) -> Floats:
         """``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for ``weights`` [n, N]; summed from front to rear."""
@@ -231,13 +231,12 @@ def amounts(objectives: Sequence[Objective], before: State | None, after: State,
     A weighted sum is computed from the harm since then; other objectives are amount after minus amount before.
     ``count`` says which harm (``episode.counts``).
     """
-    now, own = pair_amounts(after.line, count), own_amounts(after.line, count)
-    whole = Harm.of(now, own, after.car)
+    now = pair_amounts(after.line, count)
+    whole = Harm.of(now, after.car)
     if before is None:
         return np.stack([each.amount(whole, i) for i, each in enumerate(objectives)], axis=1)
-    earlier, earlier_own = pair_amounts(before.line, count), own_amounts(before.line, count)
-    since = Harm.of(now - earlier, own - earlier_own, after.car)
-    then = Harm.of(earlier, earlier_own, after.car)
+    earlier = pair_amounts(before.line, count)
+    since, then = Harm.of(now - earlier, after.car), Harm.of(earlier, after.car)
     columns = [
         each.amount(since, i) if each.is_sum else each.amount(whole, i) - each.amount(then, i)
         for i, each in enumerate(objectives)

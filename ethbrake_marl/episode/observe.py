@@ -27,6 +27,7 @@ from ethbrake_marl.episode.features import (
 from ethbrake_marl.episode.functions import called, check_finite
 from ethbrake_marl.episode.state import TIME, State
 from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.forces import capacity
 from ethbrake_marl.motion.layout import (
     BRAKING,
     DRIVING,
@@ -43,6 +44,16 @@ from ethbrake_marl.motion.layout import (
 )
 
 Observations = NDArray[np.float32]
+# places of the features in their groups (`episode.features`)
+OWN_SPEED, OWN_ACCELERATION, OWN_BRAKING, OWN_DRIVING, OWN_MASS, OWN_LATENCY_LEFT, OWN_RESTITUTION = range(len(OWN))
+(
+    NEAR_KNOWN, NEAR_GAP, NEAR_CLOSING_SPEED, NEAR_ACCELERATION, NEAR_BRAKING, NEAR_MASS, NEAR_LATENCY_LEFT, NEAR_HIT,
+    NEAR_STOPPING_MARGIN, NEAR_FITTING_DECELERATION,
+) = range(len(NEIGHBOUR))  # fmt: skip
+ROLE_AHEAD, ROLE_BEHIND = range(len(ROLE))
+(
+    OBSTACLE_KNOWN, OBSTACLE_GAP, OBSTACLE_HIT, OBSTACLE_STOPPING_MARGIN, OBSTACLE_FITTING_DECELERATION,
+) = range(len(OBSTACLE))  # fmt: skip
 N_OWN, N_NEIGHBOUR, N_ROLE, N_OBSTACLE = len(OWN), len(NEIGHBOUR), len(ROLE), len(OBSTACLE)
 
 
@@ -198,37 +209,42 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
         for o in range(len(observers)):
             i = observers[o]
             left = max(c[OWN_LATENCY, i] - time, 0.0)
-            own = full_stop_m(w[SPEED, i], left, c[BRAKING, i])
-            value[0], value[1], value[2], value[3] = w[SPEED, i], w[FORCE, i], c[BRAKING, i], c[DRIVING, i]
-            value[4], value[5], value[6] = c[MASS, i], left, c[RESTITUTION, i]
+            own_stop = full_stop_m(w[SPEED, i], left, capacity(c, BRAKING, i, time))
+            value[OWN_SPEED], value[OWN_ACCELERATION], value[OWN_MASS] = w[SPEED, i], w[FORCE, i], c[MASS, i]
+            value[OWN_BRAKING], value[OWN_DRIVING] = c[BRAKING, i], c[DRIVING, i]
+            value[OWN_LATENCY_LEFT], value[OWN_RESTITUTION] = left, c[RESTITUTION, i]
             f = N_OWN
             for offset in offsets:
                 j = i + offset
-                value[f : f + N_NEIGHBOUR] = 0.0
+                near = value[f : f + N_NEIGHBOUR]
+                near[:] = 0.0
                 if 0 < j < bodies and time >= know[k, i, j]:
                     gap, front = 0.0, j < i
                     for p in range(min(i, j), max(i, j)):
                         gap += w[GAP, p]
                     wait = max(c[OWN_LATENCY, j] - time, 0.0)
-                    stop = full_stop_m(w[SPEED, j], wait, c[BRAKING, j])
-                    value[f], value[f + 1], value[f + 3] = 1.0, gap, w[FORCE, j]
-                    value[f + 2] = w[SPEED, i] - w[SPEED, j] if front else w[SPEED, j] - w[SPEED, i]
-                    value[f + 4], value[f + 5], value[f + 6] = c[BRAKING, j], c[MASS, j], wait
-                    value[f + 7] = w[HIT, i - 1 if front else i]
-                    value[f + 8] = gap + stop - own if front else gap + own - stop
-                    value[f + 9] = fitting_deceleration(w[SPEED, i], left, gap + stop if front else stop - gap)
+                    stop = full_stop_m(w[SPEED, j], wait, capacity(c, BRAKING, j, time))
+                    room = gap + stop if front else stop - gap
+                    near[NEAR_KNOWN], near[NEAR_GAP], near[NEAR_ACCELERATION] = 1.0, gap, w[FORCE, j]
+                    near[NEAR_CLOSING_SPEED] = w[SPEED, i] - w[SPEED, j] if front else w[SPEED, j] - w[SPEED, i]
+                    near[NEAR_BRAKING], near[NEAR_MASS], near[NEAR_LATENCY_LEFT] = c[BRAKING, j], c[MASS, j], wait
+                    near[NEAR_HIT] = w[HIT, i - 1 if front else i]
+                    near[NEAR_STOPPING_MARGIN] = gap + stop - own_stop if front else gap + own_stop - stop
+                    near[NEAR_FITTING_DECELERATION] = fitting_deceleration(w[SPEED, i], left, room)
                 f += N_NEIGHBOUR
             if role:
-                value[f], value[f + 1] = i - 1, bodies - 1 - i
+                value[f + ROLE_AHEAD], value[f + ROLE_BEHIND] = i - 1, bodies - 1 - i
                 f += N_ROLE
             if obstacle:
-                value[f : f + N_OBSTACLE] = 0.0
+                ahead = value[f : f + N_OBSTACLE]
+                ahead[:] = 0.0
                 if w[GAP, 0] < FAR_M and (i == 1 or time >= know[k, i, 1]):
                     gap = 0.0
                     for p in range(i):
                         gap += w[GAP, p]
-                    value[f], value[f + 1], value[f + 2] = 1.0, gap, w[HIT, 0]
-                    value[f + 3], value[f + 4] = gap - own, fitting_deceleration(w[SPEED, i], left, gap)
+                    ahead[OBSTACLE_KNOWN], ahead[OBSTACLE_GAP], ahead[OBSTACLE_HIT] = 1.0, gap, w[HIT, 0]
+                    ahead[OBSTACLE_STOPPING_MARGIN] = gap - own_stop
+                    ahead[OBSTACLE_FITTING_DECELERATION] = fitting_deceleration(w[SPEED, i], left, gap)
             if len(places) == 0:
                 for f in range(scaling.shape[1]):
                     out[k, o, f] = bounded(value[f], scaling, f)

@@ -11,11 +11,10 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from ethbrake_marl.episode.conduct import drove, push, still_moving
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.objectives import OBJECTIVES, Declared, objectives_of, parse_objective
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import SAFE_END, Rules, Step
+from ethbrake_marl.episode.step import SAFE_END, Step, StepSettings
 from ethbrake_marl.episode.terms import (
     BUILT_IN,
     TERMS,
@@ -24,9 +23,12 @@ from ethbrake_marl.episode.terms import (
     collision,
     component,
     components_of,
+    drove,
     growth,
     jerk,
+    push,
     risk,
+    still_moving,
 )
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.model import UNSHOWN, FileModel, first_mistake, require
@@ -198,8 +200,8 @@ class Rewarding(NamedTuple):
         times: tuple[float, float],
         vector: Any,
         report: Sequence[str] = (),
-    ) -> tuple[Rewarding, Rules]:
-        """The reward, and the rules of a step with its weights.
+    ) -> tuple[Rewarding, StepSettings]:
+        """The reward, and the settings of a step with its weights.
 
         ``objective`` is the scenario's; ``times`` are time step and horizon (s); ``vector`` lists the components of a
         vector reward, or is None; ``report`` lists terms whose value infos contain, with or without a weight. Warns if
@@ -232,7 +234,7 @@ class Rewarding(NamedTuple):
                 f" {vehicles - 1} pairs of vehicles"
             )
         harm = params.harm if line_only else 0.0  # the compiled step rewards the line's harm; `growth` any other
-        rules = Rules(learners, *times, harm, params.terminal, COUNTS[params.harm_count])
+        settings = StepSettings(learners, *times, harm, params.terminal, COUNTS[params.harm_count])
         counted = tuple(name for name, weight in params.weights.items() if weight != 0.0)
         reported = tuple(dict.fromkeys((*counted, *report)))
         components = () if vector is None else components_of(vector, counted, vehicles)
@@ -249,8 +251,8 @@ class Rewarding(NamedTuple):
         }
         needed = {*reported, *components} - ({"harm"} if line_only else set())
         terms = tuple((n, params.weights.get(n, 0.0), function) for n, function in functions.items() if n in needed)
-        shaping = Shaping(rules, params.shaping_discount) if "shaping" in reported else None
-        return cls(params, counted, reported, terms, shaping, components), rules
+        shaping = Shaping(settings, params.shaping_discount) if "shaping" in reported else None
+        return cls(params, counted, reported, terms, shaping, components), settings
 
     @property
     def is_compiled(self) -> bool:
@@ -280,7 +282,7 @@ class Rewarding(NamedTuple):
 
     def shared(self, step: Step) -> dict[str, Floats]:
         """Values of the terms that the compiled step computes, name -> [n]."""
-        known = {"harm": -step.counted, "terminal": step.out[SAFE_END]}
+        known = {"harm": -step.cost, "terminal": step.out[SAFE_END]}
         return {name: value for name, value in known.items() if name in self.reported}
 
 

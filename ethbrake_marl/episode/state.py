@@ -7,17 +7,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import Count, amount_so_far, own_amounts, pair_amounts, weights_of
+from ethbrake_marl.episode.counts import Count, amount_so_far, pair_amounts, weights_of
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import (
     BRAKING,
-    COUNT,
     DRIVING,
     FAR_M,
     FORCE,
     GAP,
     HIT,
+    IMPACTS,
     LATENCY,
     MASS,
     RESTITUTION,
@@ -34,7 +35,7 @@ STEPS = 2  # number of steps taken
 LAST = 3  # number of the last step, unless all vehicles come to rest before
 ENDED = 4  # 1 once the episode has ended
 NUMBER = 5  # number of the world in its list; -1: the caller has made it
-END = 6  # time at which the last step ends (s): the horizon, or earlier after `Rules.most_steps`
+END = 6  # time at which the last step ends (s): the horizon, or earlier after `StepSettings.most_steps`
 LISTED = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
 CLOCK_COLUMNS = 7
 
@@ -156,13 +157,13 @@ class State(NamedTuple):
 
     @property
     def braking_capacity_mps2(self) -> Floats:
-        """Largest deceleration on this road, [n, N] m/s2."""
-        return self.car[:, BRAKING, 1:]
+        """Largest deceleration now, [n, N] m/s2."""
+        return capacities(self.car, BRAKING, self.time_s)[:, 1:]
 
     @property
     def driving_capacity_mps2(self) -> Floats:
-        """Largest forward acceleration on this road, [n, N] m/s2."""
-        return self.car[:, DRIVING, 1:]
+        """Largest forward acceleration now, [n, N] m/s2."""
+        return capacities(self.car, DRIVING, self.time_s)[:, 1:]
 
     @property
     def mass_t(self) -> Floats:
@@ -182,7 +183,7 @@ class State(NamedTuple):
     @property
     def collided(self) -> Bools:
         """Whether the world has had an impact, [n]."""
-        return np.asarray(self.line[:, COUNT].any(axis=1))
+        return np.asarray(self.line[:, IMPACTS].any(axis=1))
 
     def harm(self, count: Count = "first") -> Floats:
         """Harm of each world so far, [n] m2/s2; ``count`` says which harm (``episode.counts``)."""
@@ -197,14 +198,14 @@ class State(NamedTuple):
         Without impacts with the obstacle and, in the honest cost, Vehicle 1's own driving and motion.
         """
         self._check_count(count)
-        return pair_amounts(self.line, count)[:, 1:-1]
+        return pair_amounts(self.line, count)[0, :, 1:-1]
 
     def borne_harm(self, count: Count = "first") -> Floats:
         """Harm that each vehicle has borne so far, [n, N] m2/s2. The two shares of a pair sum to its harm."""
         self._check_count(count)
-        own, out = own_amounts(self.line, count), np.empty((self.n, self.vehicles))
-        split_harm(pair_amounts(self.line, count) - own, self.car[:, MASS], out)
-        return out + own[:, :-1]
+        (pairs, unshared), out = pair_amounts(self.line, count), np.empty((self.n, self.vehicles))
+        split_harm(pairs - unshared, self.car[:, MASS], out)
+        return out + unshared[:, :-1]
 
     def _check_count(self, count: Count) -> None:
         if PHYSICS not in self.memories:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.commands import LARGEST_ACTION, action_array, check_actions, write_commands
+from ethbrake_marl.episode.counts import COUNTS, OF_FIRST, OF_TOTAL, beside_harm
 from ethbrake_marl.episode.state import (
     CLOCK_COLUMNS,
     END,
@@ -19,24 +20,20 @@ from ethbrake_marl.episode.state import (
     STEPS,
     TIME,
     State,
-    check_exact,
     mapped,
 )
-from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, PhysicsError, describe_error
+from ethbrake_marl.errors import AgentFailed, EthBrakeError, PhysicsError, describe_error
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import FAILED, MET, drive, drive_worlds
+from ethbrake_marl.motion.interval import FAILED, MET, move_line, move_lines
 from ethbrake_marl.motion.layout import (
     BRAKING,
-    COUNT,
     DRIVING,
-    DROVE,
     FORCE,
+    IMPACTS,
     LATENCY,
     MOVING,
     NEW_FIRST,
     NEW_TOTAL,
-    PASSED,
-    PUSHED,
     SPEED,
     Bools,
     Floats,
@@ -50,14 +47,13 @@ TOTAL_HARM = 1  # harm of all impacts of the step (m2/s2)
 TERMINATED = 2  # 1 if all vehicles have come to rest
 TRUNCATED = 3  # 1 if the end of the last step has come first
 SAFE_END = 4  # 1 if the episode has ended without any impact
-COUNTED = 5  # harm of the step in the reward's count (m2/s2)
+COST = 5  # harm of the step in the reward's count (m2/s2)
 OUT_ROWS = 6
 
-LARGEST_ACTION = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # counts as 1: the next float32 number
 ROUNDING = 1e-9  # fraction of a step: a horizon that exceeds whole steps by less needs no further step
 
 
-class Rules(NamedTuple):
+class StepSettings(NamedTuple):
     """The numbers that a step needs."""
 
     learners: Ints  # [L] bodies (1: Vehicle 1) whose actions are given
@@ -65,7 +61,7 @@ class Rules(NamedTuple):
     horizon_s: float
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
-    counting: Floats = COUNTS["first"]  # weights of what counts in the reward (``episode.counts``)
+    weights: Floats = COUNTS["first"]  # of what counts as harm in the reward (``episode.counts``)
     most_steps: float = np.inf  # number of steps after which an episode is truncated, as at the horizon
 
 
@@ -99,9 +95,9 @@ class Step(NamedTuple):
         return self.out[TOTAL_HARM]
 
     @property
-    def counted(self) -> Floats:
+    def cost(self) -> Floats:
         """Harm of the line in this step in the reward's count, [n] m2/s2."""
-        return self.out[COUNTED]
+        return self.out[COST]
 
     @property
     def terminated(self) -> Bools:
@@ -110,7 +106,7 @@ class Step(NamedTuple):
 
     @property
     def truncated(self) -> Bools:
-        """Whether the episode ended in this step at the horizon, or after the most steps (``Rules``), [n]."""
+        """Whether the episode ended in this step at the horizon, or after the most steps (``StepSettings``), [n]."""
         return self.out[TRUNCATED] == 1.0
 
     @property
@@ -119,15 +115,95 @@ class Step(NamedTuple):
         return self.out[SAFE_END] == 1.0
 
 
-@kernel
-def command(car, wanted, learners, actions):
-    """Write one world's commands (m/s2) to ``wanted`` [N + 1], from the ``actions`` [L] of the bodies ``learners`` [L].
+def step(
+    settings: StepSettings, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
+) -> tuple[State, Step]:
+    """State after one step, and what happened in the step.
 
-    Action -1: full braking; 0: coasting; 1: full driving.
+    ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` look at the state at every decision. Raises
+    ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
-    for j in range(learners.shape[0]):
-        i, action = learners[j], min(max(actions[j], -1.0), 1.0)
-        wanted[i] = action * car[BRAKING, i] if action < 0.0 else action * car[DRIVING, i]
+    actions = action_array(settings.learners, actions, state.n)
+    line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
+    if not donate:
+        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
+    reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
+    scratch = scratch_for(wanted.shape[1])
+    refused, failed = step_worlds(
+        line, car, clock, wanted, actions, scratch, out, reward, settings.learners, settings.time_step_s, settings.harm,
+        settings.terminal, settings.weights,
+    )  # fmt: skip
+    if refused >= 0:
+        check_actions(settings.learners, actions[refused])
+    if failed >= 0:
+        raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
+    return State(line, car, clock, know, wanted, memories), Step(reward, out, settings.time_step_s)
+
+
+@large
+def step_worlds(
+    line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, harm, terminal, weights
+):
+    """Advance every running episode by one step, in place; return the row of an invalid action and of a failed world.
+
+    -1 stands for none. An action is invalid if it is not a number in [-1, 1]; then nothing has moved. ``line`` to
+    ``wanted`` are arrays of a ``State``, ``out`` and ``reward`` of a ``Step``; ``scratch`` is the physics' working
+    memory. ``harm`` and ``terminal`` are weights of the reward, ``weights`` [6] those of the harm in it (``COUNTS``).
+    """
+    n, bodies = wanted.shape
+    for k in range(n):
+        for c in range(learners.shape[0]):
+            if not -LARGEST_ACTION <= actions[k, c] <= LARGEST_ACTION:
+                return k, -1
+    failed = -1
+    for k in range(n):
+        for row in range(out.shape[0]):
+            out[row, k] = 0.0
+        for i in range(bodies - 1):
+            reward[k, i] = 0.0
+        if clock[k, ENDED] == 1.0:
+            continue
+        write_commands(car[k], wanted[k], learners, actions[k], clock[k, TIME])
+        before = beside_harm(line[k], weights)
+        met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
+        if met == FAILED:
+            failed = k
+        impacts = 0.0
+        for p in range(bodies - 1):
+            impacts += line[k, IMPACTS, p]
+            if met == MET:
+                out[HARM, k] += scratch[NEW_FIRST, p]
+                out[TOTAL_HARM, k] += scratch[NEW_TOTAL, p]
+        over = clock[k, ENDED] == 1.0
+        out[TERMINATED, k] = 1.0 if at_rest else 0.0
+        out[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
+        out[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
+        impact_harm = weights[OF_FIRST] * out[HARM, k] + weights[OF_TOTAL] * out[TOTAL_HARM, k]
+        cost = impact_harm + (beside_harm(line[k], weights) - before)
+        shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * cost
+        out[COST, k] = cost
+        for i in range(bodies - 1):
+            reward[k, i] = shared
+    return -1, failed
+
+
+@kernel
+def advance(line, car, clock, wanted, scratch, time_step_s):
+    """Advance one running world to its next decision, in place; return ``move_line``'s result, and whether all rests.
+
+    Arguments as in ``step_worlds``, without the axis of worlds. Decision times are multiples of the time step after the
+    first decision, so that they never differ by rounding.
+    """
+    clock[STEPS] += 1.0
+    over = clock[STEPS] >= clock[LAST]
+    until = clock[END] if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
+    met = move_line(line, car, wanted, scratch, clock[TIME], until)
+    clock[TIME] = until
+    at_rest = met != FAILED and stands(line, wanted)
+    clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
+    if over:
+        note_motion(line)
+    return met, at_rest
 
 
 @kernel
@@ -146,106 +222,6 @@ def note_motion(line):
         line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
 
 
-@kernel
-def advance(line, car, clock, wanted, scratch, time_step_s):
-    """Advance one running world to its next decision, in place; return ``drive``'s result, and whether all is at rest.
-
-    Arguments as in ``step_worlds``, without the axis of worlds. Decision times are multiples of the time step after the
-    first decision, so that they never differ by rounding.
-    """
-    clock[STEPS] += 1.0
-    over = clock[STEPS] >= clock[LAST]
-    until = clock[END] if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
-    met = drive(line, car, wanted, scratch, clock[TIME], until)
-    clock[TIME] = until
-    at_rest = met != FAILED and stands(line, wanted)
-    clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
-    if over:
-        note_motion(line)
-    return met, at_rest
-
-
-@kernel
-def beside_harm(line: Floats, count: Floats) -> float:
-    """Part of the honest cost beside the harm of impacts, in one world so far (m2/s2); ``count`` [6] from ``COUNTS``.
-
-    ``amount_so_far`` sums in another order; the last bits of rewards depend on this one.
-    """
-    amount = 0.0
-    for p in range(line.shape[1] - 1):
-        amount += count[2] * line[PASSED, p] + count[3] * line[PUSHED, p]
-        amount += count[4] * line[DROVE, p] + count[5] * line[MOVING, p]
-    return amount
-
-
-@large
-def step_worlds(line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, harm, terminal, count):
-    """Advance every running episode by one step, in place; return the row of an invalid action and of a failed world.
-
-    -1 stands for none. An action is invalid if it is not a number in [-1, 1]; then nothing has moved. ``line`` to
-    ``wanted`` are arrays of a ``State``, ``out`` and ``reward`` of a ``Step``; ``scratch`` is the physics' working
-    memory. ``harm`` and ``terminal`` are weights of the reward, ``count`` [6] those of the harm in it (``COUNTS``).
-    """
-    n, bodies = wanted.shape
-    for k in range(n):
-        for c in range(learners.shape[0]):
-            if not -LARGEST_ACTION <= actions[k, c] <= LARGEST_ACTION:
-                return k, -1
-    failed = -1
-    for k in range(n):
-        for row in range(out.shape[0]):
-            out[row, k] = 0.0
-        for i in range(bodies - 1):
-            reward[k, i] = 0.0
-        if clock[k, ENDED] == 1.0:
-            continue
-        command(car[k], wanted[k], learners, actions[k])
-        before = beside_harm(line[k], count)
-        met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
-        if met == FAILED:
-            failed = k
-        impacts = 0.0
-        for p in range(bodies - 1):
-            impacts += line[k, COUNT, p]
-            if met == MET:
-                out[HARM, k] += scratch[NEW_FIRST, p]
-                out[TOTAL_HARM, k] += scratch[NEW_TOTAL, p]
-        over = clock[k, ENDED] == 1.0
-        out[TERMINATED, k] = 1.0 if at_rest else 0.0
-        out[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
-        out[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
-        counted = count[0] * out[HARM, k] + count[1] * out[TOTAL_HARM, k] + (beside_harm(line[k], count) - before)
-        shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * counted
-        out[COUNTED, k] = counted
-        for i in range(bodies - 1):
-            reward[k, i] = shared
-    return -1, failed
-
-
-def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wanted: Floats, scratch: Floats) -> int:
-    """Advance every world from ``time`` to ``until`` [n] (s), ``line`` in place; return a failed row, or -1.
-
-    The other arrays are described in ``motion.layout``; all vehicles hold the commands ``wanted`` [n, N + 1] (m/s2).
-    """
-    moved = line.copy()  # arrays of any layout become alike, because a kernel is compiled for each layout
-    failed: int = drive_worlds(moved, car.copy(), time.copy(), until.copy(), wanted.copy(), scratch)
-    line[:] = moved
-    return failed
-
-
-def driven_again(before: State, after: State, these: Bools) -> Iterator[tuple[int, Floats]]:
-    """Simulate ``these`` worlds [n] again from ``before`` to ``after``; yield each row and the physics' scratch memory.
-
-    There must be no decision between the states.
-    """
-    check_exact(before, "a quantity of single impacts")
-    scratch = scratch_for(after.vehicles + 1)
-    for k in np.flatnonzero(these).tolist():
-        line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
-        drive(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
-        yield k, scratch
-
-
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:
     """State of worlds at the alert, when Vehicle 1 begins to brake and nobody has decided yet.
 
@@ -256,61 +232,34 @@ def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: I
     return State(line, car, clock, know, wanted, {})
 
 
+def first_decision(alert: State, deciders: Ints, settings: StepSettings) -> State:
+    """Episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
+
+    Until then all vehicles hold ``alert.wanted``.
+    """
+    first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
+    state, most = advanced(alert, first), settings.most_steps
+    state.clock[:, FIRST_DECISION] = first
+    steps = steps_to_horizon(first, settings)
+    state.clock[:, LAST] = np.minimum(steps, most)
+    state.clock[:, END] = np.where(steps <= most, settings.horizon_s, first + most * settings.time_step_s)
+    return state
+
+
+def steps_to_horizon(first_s: Any, settings: StepSettings) -> Any:
+    """Number of the step that ends at the horizon, if the first decision is at ``first_s``."""
+    return np.ceil((settings.horizon_s - first_s) / settings.time_step_s - ROUNDING)
+
+
 def advanced(state: State, until_s: Floats) -> State:
     """State at ``until_s`` [n] if all vehicles hold their commands."""
     line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
     car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others
-    failed = drive_worlds(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
+    failed = move_lines(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))
     if failed >= 0:
         raise failure(state, failed, state.time_s[failed], until_s[failed])
     clock[:, TIME] = until_s
     return state._replace(line=line, car=car, clock=clock, wanted=wanted)
-
-
-def first_decision(
-    alert: State, deciders: Ints, time_step_s: float, horizon_s: float, most_steps: float = np.inf
-) -> State:
-    """Episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
-
-    Until then all vehicles hold ``alert.wanted``. The other arguments are those of ``Rules``.
-    """
-    first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
-    state = advanced(alert, first)
-    state.clock[:, FIRST_DECISION] = first
-    steps = last_step(first, time_step_s, horizon_s)
-    state.clock[:, LAST] = np.minimum(steps, most_steps)
-    state.clock[:, END] = np.where(steps <= most_steps, horizon_s, first + most_steps * time_step_s)
-    return state
-
-
-def last_step(first_s: Any, time_step_s: float, horizon_s: float) -> Any:
-    """Number of the step that ends at the horizon, if the first decision is at ``first_s``."""
-    return np.ceil((horizon_s - first_s) / time_step_s - ROUNDING)
-
-
-def step(
-    rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None, *, donate: bool = False
-) -> tuple[State, Step]:
-    """State after one step, and what happened in the step.
-
-    ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` look at the state at every decision. Raises
-    ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
-    """
-    actions = numbers_of(rules, actions, state.n)
-    line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
-    if not donate:
-        line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
-    reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
-    scratch = scratch_for(wanted.shape[1])
-    refused, failed = step_worlds(
-        line, car, clock, wanted, actions, scratch, out, reward, rules.learners, rules.time_step_s, rules.harm,
-        rules.terminal, rules.counting,
-    )  # fmt: skip
-    if refused >= 0:
-        _check_actions(rules, actions[refused])
-    if failed >= 0:
-        raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
-    return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
 
 
 def scripted(scripts: Mapping[int, Any], state: State) -> State:
@@ -322,37 +271,6 @@ def scripted(scripts: Mapping[int, Any], state: State) -> State:
     for i, command_mps2 in commands.items():
         np.copyto(wanted[:, i], command_mps2, where=running)
     return state._replace(wanted=wanted, memories=memories)
-
-
-def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None) -> State:
-    """State with the commands of scripts and learners, as at the beginning of a step; arguments of ``step``."""
-    given = proposals(rules, numbers_of(rules, actions, state.n), state.n)
-    if np.isnan(given).any():
-        _check_actions(rules, given[np.isnan(given).any(axis=1).argmax()])
-    state, learners = scripted(scripts, state), rules.learners
-    capacity = np.where(given < 0.0, state.car[:, BRAKING, learners], state.car[:, DRIVING, learners])
-    running = ~state.ended[:, np.newaxis]
-    state.wanted[:, learners] = np.where(running, given * capacity, state.wanted[:, learners])
-    return state
-
-
-def numbers_of(rules: Rules, actions: Floats | None, n: int) -> Floats:
-    """Actions of the L learners as float64 [n, L]. Raises ``InvalidInput`` for another type or shape."""
-    shape = n, len(rules.learners)
-    if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
-        raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
-    return np.ascontiguousarray(actions, np.float64)
-
-
-def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
-    """Copy of proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput``."""
-    actions = numbers_of(rules, actions, n)
-    size = np.abs(actions)
-    if not (size > 1.0).any():
-        return actions.copy()
-    for row in actions[(size > LARGEST_ACTION).any(axis=1)]:
-        _check_actions(rules, np.where(np.isnan(row), 0.0, row))
-    return np.clip(actions, -1.0, 1.0)
 
 
 def begin(script: Any, alert: State, body: int) -> Any:
@@ -420,14 +338,6 @@ def _called(script: Any, method: str, state: State, *given: Any) -> Any:
     except Exception as error:
         name, body = getattr(script, "name", type(script).__name__), given[-1]
         raise AgentFailed(name, None, f"vehicle_{body}: {method} fails: {describe_error(error)}") from error
-
-
-def _check_actions(rules: Rules, actions: Floats) -> None:
-    for body, action in zip(rules.learners, actions, strict=True):
-        if not -LARGEST_ACTION <= action <= LARGEST_ACTION:
-            raise InvalidInput(
-                f"action of vehicle_{body} = {float(action)!r}: must be from -1 (full braking) to 1 (full driving)"
-            )
 
 
 def failure(state: State, row: int, start_s: float, until_s: float) -> PhysicsError:

@@ -31,15 +31,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import ROWS, own_amounts, pair_amounts
+from ethbrake_marl.episode.counts import ROWS, pair_amounts
 from ethbrake_marl.episode.functions import called, check_finite, described
+from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
-from ethbrake_marl.episode.play import descend
 from ethbrake_marl.episode.state import END, State, check_exact
-from ethbrake_marl.episode.step import Rules, Step
+from ethbrake_marl.episode.step import TRUNCATED, Step, StepSettings
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.motion.elementary import logistic
-from ethbrake_marl.motion.layout import TOTAL, Floats
+from ethbrake_marl.motion.layout import DROVE, PUSHED, TOTAL, Floats
 from ethbrake_marl.registry import Registry
 
 TermFunction = Callable[[State, Step, State], Floats]
@@ -133,18 +133,42 @@ def risk(params: Any, before: State, step: Step, after: State) -> Floats:
     return total
 
 
-def potential(rules: Rules, state: State) -> Floats:
+def push(before: State, step: Step, after: State) -> Floats:
+    """Term push, [n]: minus the push (m/s) of all contacts in the step.
+
+    It includes the contact with the obstacle. Formula: ``motion.push``.
+    """
+    check_exact(before, "the term push")
+    return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
+
+
+def drove(before: State, step: Step, after: State) -> Floats:
+    """Term drove, [n, N]: minus the speed that the engine alone gives (m/s).
+
+    That is the integral of the force where it is positive (``motion.forces``).
+    """
+    check_exact(before, "the term drove")
+    return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
+
+
+def still_moving(before: State, step: Step, after: State) -> Floats:
+    """Term still_moving, [n]: -1 if a vehicle moves at the horizon, otherwise 0."""
+    check_exact(before, "the term still_moving")
+    return 0.0 - step.out[TRUNCATED] * after.moving
+
+
+def potential(settings: StepSettings, state: State) -> Floats:
     """Minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
 
     Each learner tries nine shares of its braking capacity, front to rear (several learners: twice); all others brake
     fully. Harm is counted as in the reward. The potential is 0 once an episode has ended.
     """
-    learners = rules.learners.tolist()
+    learners = settings.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
     further = state.line.copy()
     further[:, ROWS] = 0.0
     state = state._replace(line=further)
-    _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], rules.counting)
+    _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], settings.weights)
     least[state.ended] = 0.0
     return -least
 
@@ -152,17 +176,17 @@ def potential(rules: Rules, state: State) -> Floats:
 class Shaping(NamedTuple):
     """The term shaping. Its memory is the potential of the state, [n]."""
 
-    rules: Rules
+    settings: StepSettings
     discount: float
 
     def begin(self, state: State) -> Floats:
-        return potential(self.rules, state)
+        return potential(self.settings, state)
 
     def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
         """Value of the term, [n, N], and the new memory, [n]."""
-        new = potential(self.rules, after)
+        new = potential(self.settings, after)
         value = np.zeros((after.n, after.vehicles))
-        value[:, self.rules.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
+        value[:, self.settings.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
         return value, new
 
 
@@ -182,17 +206,15 @@ def component(name: str, count: str) -> TermFunction:
 
 
 def _borne(vehicle: int, count: str, before: State, step: Step, after: State) -> Floats:
-    pairs = _grown(pair_amounts, count, before, after)
-    own = _grown(own_amounts, count, before, after)
-    return 0.0 - Harm.of(pairs, own, after.car).borne[:, vehicle]
+    return 0.0 - Harm.of(_increase(count, before, after), after.car).borne[:, vehicle]
 
 
 def _of_pair(pair: int, count: str, before: State, step: Step, after: State) -> Floats:
-    return 0.0 - _grown(pair_amounts, count, before, after)[:, pair]
+    return 0.0 - _increase(count, before, after)[0, :, pair]
 
 
-def _grown(amounts_of: Callable[..., Floats], count: str, before: State, after: State) -> Floats:
-    return amounts_of(after.line, count) - amounts_of(before.line, count)
+def _increase(count: str, before: State, after: State) -> Floats:
+    return pair_amounts(after.line, count) - pair_amounts(before.line, count)
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:

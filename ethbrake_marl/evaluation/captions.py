@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.errors import count_of
-from ethbrake_marl.worlds.rules import RULES
+from ethbrake_marl.worlds.quantities import QUANTITIES
 
 SYMBOLS = {
     "gaps_m": ("d", "m"), "speeds_mps": ("v", "m/s"), "braking_capacity_mps2": ("braking capacity", "m/s²"),
@@ -27,7 +27,7 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
     vehicle has are left out.
     """
     ranges: dict[str, Any] = {}
-    for key, rule in RULES.items():
+    for key, rule in QUANTITIES.items():
         names = [name for i in range(len(worlds)) if (name := rule.column_of(i)) in worlds] if rule.column else []
         here = [worlds[name] for name in dict.fromkeys(names) if not np.isnan(worlds[name]).all()]
         ends = [[float(np.nanmin(each)), float(np.nanmax(each))] for each in here]
@@ -42,7 +42,7 @@ def caption(parameters: Mapping[str, Any]) -> str:
     parts = []
     for key, (symbol, unit) in SYMBOLS.items():
         if key in parameters:
-            entries = [parameters[key]] if RULES[key].per == "world" else parameters[key]
+            entries = [parameters[key]] if QUANTITIES[key].per == "world" else parameters[key]
             texts = [f"{e[0]:.3g}–{e[1]:.3g}" if isinstance(e, list) else f"{e:.4g}" for e in entries]
             value = texts[0] if len(set(texts)) == 1 else f"({f',{STAY}'.join(texts)})"
             parts.append(f"{symbol}{STAY}={STAY}{value}{f'{STAY}{unit}' if unit else ''}")

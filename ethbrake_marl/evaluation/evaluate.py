@@ -153,7 +153,7 @@ def evaluate(
         parts.append(part)
         if on_done is not None:
             on_done(min(len(parts) * CHUNK, n))
-    learners = game.rules.learners.tolist()
+    learners = game.settings.learners.tolist()
     columns: Columns = {**of_worlds}
     if (columns["world"] < 0).all():  # the user has made these worlds
         columns["world"] = np.arange(n)
@@ -168,8 +168,8 @@ def evaluate(
             "seed": None,
             "count": n,
             "controlled_vehicles": [f"vehicle_{body}" for body in learners],
-            "time_step_s": game.rules.time_step_s,
-            "horizon_s": game.rules.horizon_s,
+            "time_step_s": game.settings.time_step_s,
+            "horizon_s": game.settings.horizon_s,
             "rejected_draws": drawn.rejected,
             **(about or {}),
             "worlds_sha256": worlds_sha256(alert),
@@ -226,7 +226,7 @@ def hidden_from(alert: State, game: Game) -> Bools:
     say, because it waits for messages itself.
     """
     late, hidden = alert.car[:, LATENCY] > alert.car[:, OWN_LATENCY], np.zeros(alert.n, np.bool_)
-    for i in game.rules.learners.tolist():
+    for i in game.settings.learners.tolist():
         hidden |= np.delete(game.hides(alert, i) | late, [0, i], axis=1).any(axis=1)
     return hidden
 

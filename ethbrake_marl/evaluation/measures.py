@@ -43,7 +43,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import PHYSICS, State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
-from ethbrake_marl.motion.layout import COUNT, FIRST
+from ethbrake_marl.motion.layout import FIRST, IMPACTS
 
 Values = NDArray[Any]
 Given = Values | Mapping[str, Values] | None
@@ -130,7 +130,7 @@ def harm(count: str, game: Game, alert: State, last: State) -> Given:
 
 def impacts(game: Game, alert: State, last: State) -> Given:
     """Number of impacts in each world, those with an obstacle included."""
-    return np.asarray(last.line[:, COUNT].sum(axis=1), np.int64)
+    return np.asarray(last.line[:, IMPACTS].sum(axis=1), np.int64)
 
 
 def hardest_impact_mps(game: Game, alert: State, last: State) -> Given:
@@ -150,7 +150,7 @@ def ended(game: Game, alert: State, last: State) -> Given:
 
 def predicted_harm(game: Game, alert: State, last: State) -> Given:
     """Harm that the only predicting agent or shield predicted at the alert, in the count that it minimises."""
-    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.rules.learners.tolist())]
+    memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.settings.learners.tolist())]
     predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
     return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
 

@@ -14,14 +14,13 @@ from inspect import signature
 
 import numpy as np
 
-from ethbrake_marl.episode.conduct import drove, push
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, name_of, objectives_of
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import PHYSICS, State
 from ethbrake_marl.episode.step import Step
-from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision, jerk, risk
+from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision, drove, jerk, push, risk
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
 from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Watch
 from ethbrake_marl.files.python_file import load_from_file

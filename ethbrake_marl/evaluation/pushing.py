@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.conduct import driving_s, first_impact_s
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.episode.step import Step, advance_worlds
+from ethbrake_marl.episode.step import Step
 from ethbrake_marl.evaluation.measures import Given, Statistic
+from ethbrake_marl.evaluation.resimulation import advance_worlds, simulate_again
 from ethbrake_marl.evaluation.summary_row import PUSHED_FAR_M
-from ethbrake_marl.motion.layout import FAR_M, GAP, PUSHED, Floats, scratch_for
+from ethbrake_marl.motion.layout import FAR_M, GAP, IMPACTS, LATENCY, NEXT_TIME, PUSHED, Floats, scratch_for
 from ethbrake_marl.registry import Part
 
 POST_M = 1e5  # distance of a post that nobody reaches, from which ways are measured to 1e-10 m
@@ -44,7 +44,7 @@ class PushedAway:
     """
 
     def __init__(self, bodies: list[int], game: Game, alert: State) -> None:
-        self.own_way_m = {body: own_way_m(alert, body, game.rules.horizon_s) for body in bodies}
+        self.own_way_m = {body: own_way_m(alert, body, game.settings.horizon_s) for body in bodies}
         self.gaps_m, self.way_m = alert.gaps_m.copy(), np.zeros(alert.n)
 
     def see(self, before: State, step: Step | None, after: State) -> None:
@@ -69,7 +69,7 @@ def pushed_m(game: Game, alert: State) -> PushedAway | None:
     """How far a vehicle ends beyond the place where it would stop by itself, by impacts and by pushes. In reality it
     brakes for something, so this is dangerous. Defined for vehicles that neither learn nor look at the state.
     """
-    bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.rules.learners and i not in game.scripts]
+    bodies = [i for i in range(1, alert.vehicles + 1) if i not in game.settings.learners and i not in game.scripts]
     return PushedAway(bodies, game, alert) if bodies else None
 
 
@@ -84,11 +84,29 @@ def pushed_mps(game: Game, alert: State, last: State) -> Given:
     return {"": of_pair.sum(axis=1), **behind, "obstacle": of_pair[:, 0]}
 
 
+def first_impact_s(before: State, after: State) -> Floats:
+    """Time of the line's first impact, [n] s; ``before.time_s`` if it was earlier, ``after.time_s`` if later or never.
+
+    There must be no decision between the two states.
+    """
+    until: Floats = np.where(before.collided, before.time_s, after.time_s)
+    for k, scratch in simulate_again(before, after, ~before.collided & after.collided):
+        struck = after.line[k, IMPACTS] > 0.0
+        until[k] = before.time_s[k] + scratch[NEXT_TIME, struck].min()
+    return until
+
+
+def driving_s(before: State, after: State, until_s: Floats) -> Floats:
+    """Time from ``before`` to ``until_s`` [n] with a positive command in force, [n, N] s."""
+    begun_s = np.maximum(before.car[:, LATENCY, 1:], before.time_s[:, np.newaxis])
+    return np.where(after.commands_mps2 > 0.0, np.maximum(until_s[:, np.newaxis] - begun_s, 0.0), 0.0)
+
+
 class DroveTowards:
     """Watches the time before each line's first impact, and the part of it with a positive command."""
 
     def __init__(self, game: Game, alert: State) -> None:
-        self.learners, self.time_s = game.rules.learners, np.zeros(alert.n)
+        self.learners, self.time_s = game.settings.learners, np.zeros(alert.n)
         self.driving_s, self.hard = np.zeros((alert.n, alert.vehicles)), np.zeros(alert.n, np.bool_)
 
     def see(self, before: State, step: Step | None, after: State) -> None:

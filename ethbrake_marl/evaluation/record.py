@@ -14,14 +14,14 @@ import numpy as np
 from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.episode.step import advance_worlds
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.pushing import with_post
+from ethbrake_marl.evaluation.resimulation import advance_worlds
 from ethbrake_marl.motion.layout import (
-    COUNT,
     FIRST,
     FORCE,
     GAP,
+    IMPACTS,
     LATENCY,
     NEXT_CLOSING,
     NEXT_TIME,
@@ -157,7 +157,7 @@ def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impac
 
     Pieces with impacts are simulated again, for the time of the first one.
     """
-    rows = [FIRST, TOTAL, COUNT]
+    rows = [FIRST, TOTAL, IMPACTS]
     made = lines[:, 1, rows] - lines[:, 0, rows]
     piece, pair = np.nonzero(made[:, 2])
     firsts = np.empty((len(piece), 2))

@@ -29,12 +29,12 @@ class Face:
         (self.scenario, self.game), self.render_mode = opened, render_mode
         if most_steps is not None:
             check_whole_number("number of steps of an episode", most_steps, 1)
-            self.game = self.game._replace(rules=self.game.rules._replace(most_steps=float(most_steps)))
+            self.game = self.game._replace(settings=self.game.settings._replace(most_steps=float(most_steps)))
         self.stream, self.renderer = Stream(self.scenario, self.game), make_renderer(self, render_mode)
         self._of_state = self.scenario.horizon_s, self.scenario.has_obstacle
 
     def _need_learner(self) -> None:
-        if not len(self.game.rules.learners):
+        if not len(self.game.settings.learners):
             raise InvalidInput(f"scenario {self.scenario.name!r} has no learner; pass learners=['vehicle_2']")
 
     def _begun(self, what: str) -> State:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import last_step
+from ethbrake_marl.episode.step import steps_to_horizon
 from ethbrake_marl.errors import check_one_learner
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import Metadata
@@ -42,14 +42,14 @@ class OneLearner(Face):
     def _longest(self) -> int:
         """Return the largest number of steps of an episode in the scenario's worlds."""
         first_s = min(self.scenario.bounds("latency_s")[i - 1][0] for i in self.game.deciders)
-        longest = last_step(first_s, self.scenario.time_step_s, self.scenario.horizon_s)
-        return int(min(longest, self.game.rules.most_steps))
+        settings = self.game.settings
+        return int(min(steps_to_horizon(first_s, settings), settings.most_steps))
 
     def _open_one(
         self, game: tuple[Any, ...], render_mode: str | None, actions: int | None, most_steps: int | None
     ) -> tuple[Any, Any]:
         self._open(open_game(*game), render_mode, most_steps)
-        self.bodies, self.actions = self.game.rules.learners, actions
+        self.bodies, self.actions = self.game.settings.learners, actions
         names = [self.scenario.vehicle_names[i - 1] for i in self.bodies]
         advice = "pass learners=['vehicle_2'], or use parallel_env or make_sb3_vec_env"
         check_one_learner(self.scenario.name, names, f"this environment needs exactly one learner: {advice}")

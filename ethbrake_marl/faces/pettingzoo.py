@@ -80,7 +80,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
             raise InvalidInput(f"agents = {agents!r}: must be 'all' or 'learners'")
         if agents == "learners" or actions is not None:
             self._need_learner()
-        names, learning = self.scenario.vehicle_names, self.game.rules.learners
+        names, learning = self.scenario.vehicle_names, self.game.settings.learners
         self.actions, self.bodies = actions, np.arange(1, len(names) + 1) if agents == "all" else learning
         self.possible_agents = [names[i - 1] for i in self.bodies]
         self._learners = {names[i - 1]: c for c, i in enumerate(learning)}

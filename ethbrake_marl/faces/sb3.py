@@ -100,7 +100,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         actions: int | None = None,
         max_cycles: int | None = None,
     ) -> None:
-        self.bodies = game.rules.learners
+        self.bodies = game.settings.learners
         self.n, self.num_envs, self.actions = n, n * len(self.bodies), actions
         self.horizon_is_end, self.appended, self.step_infos = horizon_is_end, appended, step_infos
         self._open((scenario, game), render_mode, max_cycles)

@@ -64,7 +64,7 @@ class Stream(NamedTuple):
         """Return the next world of each row, and ``next`` after it."""
         if isinstance(seed, int):
             return self.game.draw(len(rows), seed, first), first + len(rows)
-        drawn = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), channel="training") for k in rows]
+        drawn = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), purpose="training") for k in rows]
         return State.join(drawn), first + np.isin(np.arange(len(first)), rows)
 
     def seeds_of(self, state: State, rows: Any = slice(None)) -> Any:
@@ -81,7 +81,7 @@ class Stream(NamedTuple):
         place, parts = np.arange(state.n), [] if self.given is None else [self.given[0]]
         of_stream = np.flatnonzero(numbers >= 0)
         place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
-        parts += [self.scenario.draw(1, int(seeds[k]), first=int(numbers[k]), channel="training") for k in of_stream]
+        parts += [self.scenario.draw(1, int(seeds[k]), first=int(numbers[k]), purpose="training") for k in of_stream]
         drawn = merged(parts, np.arange(sum(part.worlds.n for part in parts)))
         columns = {name: column[place] for name, column in columns_of(drawn).items()}
         names = names_of_worlds(state, self.seeds_of(state))

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from ethbrake_marl.motion.drive import drive_worlds
+from ethbrake_marl.motion.interval import move_lines
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
@@ -73,7 +73,7 @@ def played(vehicles: int) -> list[Floats]:
         wanted[:, 1:] = np.where(
             share < 0.0, np.maximum(share, -1.0) * car[:, BRAKING, 1:], share * car[:, DRIVING, 1:]
         )
-        drive_worlds(line, car, time, time + length_s, wanted, scratch)
+        move_lines(line, car, time, time + length_s, wanted, scratch)
         time = time + length_s
         lines.append(line.copy())
     return lines

@@ -64,6 +64,17 @@ def driving(force, wanted, brake_rate, release_rate, duration):
 
 
 @kernel
+def capacity(car, row, i, time):
+    """Largest deceleration (``row`` BRAKING) or acceleration (DRIVING) of body i of one world at ``time`` (s), m/s2."""
+    return car[row, i]
+
+
+def capacities(car: Floats, row: int, time_s: Floats) -> Floats:
+    """``capacity`` of all bodies of n worlds at ``time_s`` [n], [n, N + 1] m/s2."""
+    return car[:, row]
+
+
+@kernel
 def plan_force(line, car, scratch, i, builds):
     """Set how the force of body i goes on: its rate, its next goal and the time until then.
 

@@ -34,8 +34,8 @@ from ethbrake_marl.motion.layout import (
     JERK,
     LAST_TIME,
     MASS,
-    NEW_COUNT,
     NEW_FIRST,
+    NEW_IMPACTS,
     NEW_TOTAL,
     NEXT_CLOSING,
     NEXT_TIME,
@@ -101,6 +101,12 @@ def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk
 
 
 @kernel
+def restitution(car, closing):
+    """Coefficient of restitution of an impact of one world, 0 to 1; ``closing`` is its largest closing speed (m/s)."""
+    return car[RESTITUTION, 0] if closing >= PLASTIC_MPS else 0.0
+
+
+@kernel
 def resolve_cluster(line, car, scratch, first, last):
     """Replace the speeds of the touching bodies ``first..last`` by their speeds after the impact.
 
@@ -112,7 +118,7 @@ def resolve_cluster(line, car, scratch, first, last):
     largest = 0.0
     for p in range(first, last):
         largest = max(largest, scratch[CLOSING, p])
-    bounce, end = car[RESTITUTION, 0] if largest >= PLASTIC_MPS else 0.0, last + 1
+    bounce, end = restitution(car, largest), last + 1
     blocks = pool(
         car[MASS], line[SPEED], line[SPEED], scratch[ZERO], scratch[ZERO], scratch, first, last, scratch[POOLED],
         scratch[JERK],
@@ -159,7 +165,7 @@ def after_impact_of(car, scratch, first, last, body):
         car[MASS], scratch[BEFORE], scratch[BEFORE], scratch[ZERO], scratch[ZERO], scratch, first, last,
         scratch[POOLED], scratch[JERK],
     )  # fmt: skip
-    bounce = car[RESTITUTION, 0] if largest >= PLASTIC_MPS else 0.0
+    bounce = restitution(car, largest)
     return scratch[POOLED, body] + bounce * (scratch[POOLED, body] - before)
 
 
@@ -191,7 +197,7 @@ def next_of_series(car, scratch, now, first, last):
     after the other, the hardest impact first. It is known by a pair that had an impact at this moment: after a plastic
     impact at once no pair closes.
     """
-    if car[RESTITUTION, 0] > 0.0 or last - first < 2:
+    if restitution(car, math.inf) > 0.0 or last - first < 2:
         return -1
     hardest, again = first, False
     for p in range(first, last):
@@ -246,7 +252,7 @@ def resolve_impacts(line, car, scratch, now, ahead):
         if scratch[CLOSING, p] > TOUCH_MPS:
             harm = scratch[CLOSING, p] * scratch[CLOSING, p]
             scratch[NEW_TOTAL, p] += harm
-            scratch[NEW_COUNT, p] += 1.0
+            scratch[NEW_IMPACTS, p] += 1.0
             scratch[LAST_TIME, p] = now
             if scratch[NEXT_TIME, p] == math.inf:
                 scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p] = now, scratch[CLOSING, p]

@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent, propose, to_action
+from ethbrake_marl.agents.drive import MODEL, Agent, propose
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
+from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import END, State
@@ -72,7 +73,7 @@ class EpisodeShield:
         remembered = begin(game.agents({body: agent})[body], alert, body)
         known = alert._replace(wanted=state.wanted)
         choice = coupled(known, body, self.count, state.clock[:, END]) if self.coupled else pairwise(known, body)
-        backup = to_action(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
+        backup = actions_of(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
         held_back = held(game, backup)
         own = state._replace(memories={**state.memories, body: remembered})
         policy_harm = price(game, state, rollout(game, self.drivers, own, held_back, self.count), self.count)

@@ -48,8 +48,8 @@ def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
 
 
 def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:
-    if list(drivers) != game.rules.learners.tolist():
-        theirs, right = (", ".join(f"vehicle_{i}" for i in each) for each in (drivers, game.rules.learners))
+    if list(drivers) != game.settings.learners.tolist():
+        theirs, right = (", ".join(f"vehicle_{i}" for i in each) for each in (drivers, game.settings.learners))
         raise InvalidInput(f"shield: has agents for {theirs}; must have one for each learner, {right or 'none'}")
 
 
@@ -60,7 +60,7 @@ def check_harm_count(count: str) -> None:
 def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
     """Return values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
     wide = np.full((state.n, state.vehicles), other, columns.dtype)
-    wide[:, game.rules.learners - 1] = columns
+    wide[:, game.settings.learners - 1] = columns
     return wide
 
 

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent, propose, to_action
+from ethbrake_marl.agents.drive import Agent, propose
 from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import descend, hold
+from ethbrake_marl.episode.hold import descend, hold
 from ethbrake_marl.episode.state import END, State
-from ethbrake_marl.motion.layout import BRAKING, Floats
+from ethbrake_marl.motion.layout import Floats
 
 SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
 ROUNDS = 2  # in which they try them
@@ -30,24 +31,23 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
     One learner: E-V2X-BM. Several: full braking; E-V2X-BM of one learner while the others brake fully; and each
     learner's best share of its brakes, chosen one after the other.
     """
-    learners, n, until_s = game.rules.learners, state.n, state.clock[:, END]
+    learners, n, until_s = game.settings.learners, state.n, state.clock[:, END]
     full = alert._replace(wanted=state.wanted.copy())
-    full.wanted[:, learners] = -alert.car[:, BRAKING, learners]
+    full.wanted[:, learners] = -alert.braking_capacity_mps2[:, learners - 1]
     actions = []
     for column, body in enumerate(learners.tolist()):
         action = np.full((n, len(learners)), -1.0)
-        action[:, column] = to_action(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
+        action[:, column] = actions_of(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
         actions.append(action)
     if len(learners) > 1:
         wanted, _ = descend(state, learners.tolist(), SHARES, ROUNDS, until_s, count)
-        descended = [to_action(alert, body, wanted[:, body]) for body in learners.tolist()]
-        actions += [np.stack(descended, axis=1), np.full((n, len(learners)), -1.0)]
+        actions += [actions_of(alert, learners, wanted[:, learners]), np.full((n, len(learners)), -1.0)]
     return [held(game, action) for action in actions]
 
 
 def held(game: Game, actions: Floats) -> Floats:
     """Return plans [n, T, L] that repeat the actions [n, L] up to the horizon."""
-    decisions = int(np.ceil(game.rules.horizon_s / game.rules.time_step_s)) + 1
+    decisions = int(np.ceil(game.settings.horizon_s / game.settings.time_step_s)) + 1
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
@@ -58,7 +58,7 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
     several learners, one learner's other actions while the rest follow the plan. ``states`` may have several possible
     states of each world, one after the other: then the largest harm counts.
     """
-    learners, rows, each = game.rules.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
+    learners, rows, each = game.settings.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
     planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]
     actions = np.minimum(np.maximum(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0), 0.0)
     if len(learners) > 1:
@@ -66,7 +66,7 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
         for column in range(len(learners)):
             alone[:, column * len(ALONE) : (column + 1) * len(ALONE), column] = ALONE
         actions = np.concatenate([actions, alone], axis=1)
-    commands = actions.repeat(each, axis=0) * states.car[:, np.newaxis, BRAKING, learners]
+    commands = actions.repeat(each, axis=0) * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
     harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], count)[0]
     harm = harm.reshape(len(plans), each, -1).max(axis=1)
     best = harm.argmin(axis=1)

@@ -166,7 +166,7 @@ class StepShield:
             plan[better], harm[better] = own[better], value[better]
         last, _ = played(game, state, plan, self.count)
         settles: Bools = (last.line[:, SPEED] == 0.0).all(axis=1) & (last.line[:, FORCE] <= 0.0).all(axis=1)
-        nothing = np.zeros((state.n, len(game.rules.learners)))
+        nothing = np.zeros((state.n, len(game.settings.learners)))
         return Memory(
             plan, harm, harm.copy(), caps, settles, tuple(agents.values()), nothing, nothing,
             np.full(nothing.shape, NO_DECISION), nothing, np.zeros((state.n, state.vehicles), np.bool_),

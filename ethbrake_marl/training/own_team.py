@@ -42,7 +42,7 @@ def save_team(
 
     """
     scenario, game = env.unwrapped.scenario, env.unwrapped.game
-    views = {scenario.vehicle_names[body - 1]: game.views[body] for body in game.rules.learners.tolist()}
+    views = {scenario.vehicle_names[body - 1]: game.views[body] for body in game.settings.learners.tolist()}
     if actors.keys() != views.keys():
         raise InvalidInput(
             f"save_team: has actors of {', '.join(actors) or 'nobody'}; must have one of each learner of the"

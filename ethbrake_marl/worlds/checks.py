@@ -11,9 +11,9 @@ from ethbrake_marl.files.model import UNSHOWN, Wording, refuse, require, suggest
 from ethbrake_marl.files.yaml import YamlPath
 from ethbrake_marl.worlds.derived import mistakes, world_values
 from ethbrake_marl.worlds.physics import PHYSICS
+from ethbrake_marl.worlds.quantities import ALTERNATIVES, OF_A_TYPE, QUANTITIES, USUAL
 from ethbrake_marl.worlds.quantity import DISTRIBUTIONS
 from ethbrake_marl.worlds.roles import HELD, LEARNER
-from ethbrake_marl.worlds.rules import ALTERNATIVES, OF_A_TYPE, RULES, USUAL
 from ethbrake_marl.worlds.vehicle_types import check_types
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def check_whole(scenario: Scenario) -> None:
 
 def _check_declared_once(scenario: Scenario) -> None:
     """Refuse a quantity that is declared twice, or missing, for some vehicle."""
-    for key, rule in RULES.items():
+    for key, rule in QUANTITIES.items():
         value = getattr(scenario, key)
         kinds = scenario.vehicle_types or {} if key in OF_A_TYPE else {}
         silent = [name for name, kind in kinds.items() if getattr(kind, key) is None]
@@ -118,14 +118,14 @@ class ScenarioWording(Wording):
         return _INSTEAD.get(key, "")
 
     def needed(self, path: YamlPath) -> str:
-        rule, key = RULES.get(str(path[-1])), str(path[-1])
+        rule, key = QUANTITIES.get(str(path[-1])), str(path[-1])
         if rule is None:
             return f"write, for instance, {_EXAMPLES[key]}" if key in _EXAMPLES else f"write {_DISTRIBUTION}"
-        other = f", or {ALTERNATIVES[key]}: {RULES[ALTERNATIVES[key]].example}" if key in ALTERNATIVES else ""
+        other = f", or {ALTERNATIVES[key]}: {QUANTITIES[ALTERNATIVES[key]].example}" if key in ALTERNATIVES else ""
         return f"write, for instance, {key}: {rule.example}{other} ({rule.meaning})"
 
     def owner(self, path: YamlPath) -> str:
-        rule = RULES.get(str(path[0])) if len(path) > 1 else None
+        rule = QUANTITIES.get(str(path[0])) if len(path) > 1 else None
         return rule.owner(path[1]) if rule is not None and isinstance(path[1], int) else ""
 
     def right(self, detail: ErrorDetails) -> str:

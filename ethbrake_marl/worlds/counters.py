@@ -10,38 +10,38 @@ import numpy as np
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.motion.layout import Floats, Ints
 
-Channel = Literal["list", "training"]  # worlds for evaluation, or for training: two independent lists of one seed
+Purpose = Literal["list", "training"]  # worlds for evaluation, or for training: two independent lists of one seed
 
 Numbers = Callable[[int, tuple[int, ...]], Floats]  # (width, stream) -> uniform numbers of each world, [n, width]
 
-CHANNELS: dict[str, int] = {"list": 0, "training": 1}
+PURPOSES: dict[str, int] = {"list": 0, "training": 1}
 
 MOST_AT_ONCE = 10_000_000  # worlds of one call
 _MOST_WORLDS = 2**62  # worlds of one seed: their numbers are 64-bit integers
 _PER_COUNTER = 4  # 64-bit integers that Philox makes from one counter
 
 
-def world_numbers(n: int, seed: int, first: int, channel: str) -> Ints:
+def world_numbers(n: int, seed: int, first: int, purpose: str) -> Ints:
     """Numbers ``first`` to ``first + n - 1`` of worlds, [n]. Raises ``InvalidInput`` for any bad argument."""
     check_whole_number("number of worlds", n, 1, MOST_AT_ONCE)
     check_whole_number("seed of the list", seed, 0)
     check_whole_number("first world", first, 0, _MOST_WORLDS)
-    if channel not in CHANNELS:
-        raise InvalidInput(f"sample: channel = {channel!r}: must be one of {', '.join(CHANNELS)}")
+    if purpose not in PURPOSES:
+        raise InvalidInput(f"sample: purpose = {purpose!r}: must be one of {', '.join(PURPOSES)}")
     return np.arange(int(first), int(first) + int(n), dtype=np.int64)
 
 
-def numbers_of(seed: int, channel: str, attempt: int, index: Ints) -> Numbers:
+def numbers_of(seed: int, purpose: str, attempt: int, index: Ints) -> Numbers:
     """Function ``(width, stream)`` -> uniform numbers in [0, 1) of the worlds ``index`` [n], ascending, [n, width].
 
     ``stream`` names an independent sequence of random numbers; ``attempt`` counts from 0 if worlds are drawn again. A
-    number is the upper 53 bits of an integer from Philox, divided by 2^53. The key of Philox comes from seed, channel,
+    number is the upper 53 bits of an integer from Philox, divided by 2^53. The key of Philox comes from seed, purpose,
     attempt and stream; world k has the counters from ``k width / 4`` on. A width is a multiple of 4.
     """
     first, count = int(index[0]), int(index[-1]) - int(index[0]) + 1
 
     def numbers(width: int, stream: tuple[int, ...]) -> Floats:
-        sequence = np.random.SeedSequence([int(seed)], spawn_key=(CHANNELS[channel], attempt, *stream))
+        sequence = np.random.SeedSequence([int(seed)], spawn_key=(PURPOSES[purpose], attempt, *stream))
         key = sequence.generate_state(2, np.uint64)
         philox = np.random.Philox(key=key, counter=first * (width // _PER_COUNTER))
         integers = np.asarray(philox.random_raw(count * width)).reshape(count, width)

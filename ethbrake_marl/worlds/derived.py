@@ -9,8 +9,8 @@ import numpy as np
 
 from ethbrake_marl.motion.forces import stopping_distances
 from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.worlds.quantities import OPTIONAL, USUAL
 from ethbrake_marl.worlds.roles import deceleration_of
-from ethbrake_marl.worlds.rules import OPTIONAL, USUAL
 
 if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.state import NUMBER, State
-from ethbrake_marl.motion.layout import RESTITUTION, Floats
-from ethbrake_marl.worlds.rules import CAR_ROWS, RECORDING, RULES, USUAL
+from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.worlds.quantities import CAR_ROWS, QUANTITIES, RECORDING, USUAL
 from ethbrake_marl.worlds.sampling import Drawn, Texts
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
     Capacities include the road's ``friction`` [n]. Friction is a column if every world has one; obstacle, rates and
     weights if some world has them. A missing obstacle is NaN; an infinite rate becomes the largest valid number.
     """
-    values = {"gaps_m": worlds.gaps_m, "speeds_mps": worlds.speeds_mps, "restitution": worlds.car[:, RESTITUTION, 1:2]}
+    values = {"gaps_m": worlds.gaps_m, "speeds_mps": worlds.speeds_mps}
     values |= {key: worlds.car[:, row, 1:] for key, row in CAR_ROWS.items()}
     gap = worlds.obstacle_gap_m[:, np.newaxis]
     values["obstacle_gap_m"] = np.where(np.isfinite(gap), gap, np.nan)
@@ -37,17 +37,17 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
     there = {key: np.isfinite(values[key]).any() for key in ("obstacle_gap_m", "brake_rate_mps3", "release_rate_mps3")}
     there |= {"harm_weight": (values["harm_weight"] != 1.0).any(), "friction": np.isfinite(values["friction"]).all()}
     return {
-        RULES[key].column_of(i): np.minimum(column, RULES[key].high)
-        for key in RULES
+        QUANTITIES[key].column_of(i): np.minimum(column, QUANTITIES[key].high)
+        for key in QUANTITIES
         if key in USUAL or there.get(key)
-        for i, column in enumerate(values[key].T)
+        for i, column in enumerate(values[key].T[: QUANTITIES[key].count(worlds.vehicles)])
     }
 
 
 def fixed_columns(scenario: Scenario) -> set[str]:
     """Columns of ``quantities_of`` that are equal in all worlds, apart from gaps and speeds."""
-    keys = [key for key in CAR_ROWS if key in USUAL or key in scenario.sources] + ["restitution"]
-    ends = {RULES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
+    keys = [key for key in CAR_ROWS if key in USUAL or key in scenario.sources]
+    ends = {QUANTITIES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
     return {name for name, (low, high) in ends.items() if low == high}
 
 

@@ -15,8 +15,8 @@ from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import SIZE_LIMIT, flow_text, parse_yaml
 from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path
 from ethbrake_marl.worlds.mixture import WORDS
+from ethbrake_marl.worlds.quantities import ALTERNATIVES, QUANTITIES
 from ethbrake_marl.worlds.roles import LEARNER
-from ethbrake_marl.worlds.rules import ALTERNATIVES, RULES
 from ethbrake_marl.worlds.scenario import Scenario
 
 
@@ -30,7 +30,7 @@ class Key(NamedTuple):
 def listed_keys() -> list[Key]:
     keys, others = [], {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}
     for name, field in Scenario.model_fields.items():
-        about, rule = str(field.description), RULES.get(name)
+        about, rule = str(field.description), QUANTITIES.get(name)
         example = _EXAMPLES.get(name) or flow_text(field.default) if rule is None else rule.example
         either = [f"give either this key or {others[name]}"] if name in others else []
         keys.append(Key(name, example, about, "; ".join([about, *([rule.interval] if rule else []), *either])))
@@ -52,7 +52,7 @@ def sentences(scenario: Scenario) -> Iterator[str]:
             value = {each.name: entry.weight for each, entry in zip(scenario.members, value, strict=True)}
         if key.name == "table" and value is not None:
             value = f"{len(value.rows):,} rows with the columns {', '.join(value.columns)}"
-        own = key.name in RULES and scenario.members  # a mixture itself has no quantities
+        own = key.name in QUANTITIES and scenario.members  # a mixture itself has no quantities
         if key.name not in ("name", "title", "description", "vehicles", "roles") and value is not None and not own:
             yield f"{key.name}: {flow_text(value)} ({key.about})."
 
@@ -124,10 +124,10 @@ def whole_text(scenario: str | Path) -> str:
 def scenario_json_schema() -> dict[str, Any]:
     schema = Scenario.model_json_schema(schema_generator=FileSchema)
     for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
-        for key in properties.keys() & RULES.keys():
+        for key in properties.keys() & QUANTITIES.keys():
             properties[key]["allOf"] = [{"$ref": f"#/$defs/range_{key}"}]
     for key, described in schema["properties"].items():
         if key not in ("name", *WORDS, "based_on"):  # null takes the key of another scenario away
             schema["properties"][key] = {"anyOf": [described, {"type": "null"}]}
-    ranges = {f"range_{key}": rule.schema for key, rule in RULES.items()}
+    ranges = {f"range_{key}": rule.schema for key, rule in QUANTITIES.items()}
     return FileSchema.publish({**schema, "$defs": {**schema["$defs"], **ranges}})

@@ -1,4 +1,4 @@
-"""Makes a game from a scenario: worlds, rules, scripts, observations and rewards."""
+"""Makes a game from a scenario: worlds, settings, scripts, observations and rewards."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Pool:
         """Copies of the worlds ``first`` to ``first + n - 1`` of the seed."""
         worlds = self.worlds
         if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
-            worlds = self.scenario.sample(max(4 * n, AT_ONCE), seed, first=first, channel="training")
+            worlds = self.scenario.sample(max(4 * n, AT_ONCE), seed, first=first, purpose="training")
             self.worlds, self.seed, self.first = worlds, seed, first
         return worlds.take(np.arange(first - self.first, first - self.first + n))
 
@@ -59,14 +59,14 @@ def game_of(
             observation={**now, **observation} if isinstance(observation, Mapping) else observation
         )
     bodies = np.array(scenario.learners, np.int64)
-    rewarding, rules = Rewarding.of(
+    rewarding, settings = Rewarding.of(
         reward, scenario.objective, scenario.vehicles, bodies, (scenario.time_step_s, scenario.horizon_s),
         reward_vector, report,
     )  # fmt: skip
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))
-    game = Game(Pool(scenario), scenario.name, rules, rewarding, views, bodies, scripts)
+    game = Game(Pool(scenario), scenario.name, settings, rewarding, views, bodies, scripts)
     for extension in (scenario.members or (scenario,))[0].v2x.extensions:  # members of a mixture have the same
         game = extension.game(game)
     if scenario.physics is not None:

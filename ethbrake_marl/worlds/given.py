@@ -19,7 +19,7 @@ from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.derived import mistakes, obstacle_gap, world_values
 from ethbrake_marl.worlds.game import AnyScenario
-from ethbrake_marl.worlds.rules import OPTIONAL, RULES, USUAL, Entry, table_columns
+from ethbrake_marl.worlds.quantities import OPTIONAL, QUANTITIES, USUAL, Entry, table_columns
 from ethbrake_marl.worlds.sampling import state_of
 from ethbrake_marl.worlds.scenario import Scenario
 from ethbrake_marl.worlds.table import CsvFile
@@ -36,10 +36,10 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
     columns = dict[Entry, Floats]()
     for key, value in initial_state.items():
         _check_known(f"{where}: unknown key {key!r}", str(key), given_keys(scenario))
-        count, numbers = RULES[key].count(scenario.vehicles), _numbers(f"{where}: {key}", value)
+        count, numbers = QUANTITIES[key].count(scenario.vehicles), _numbers(f"{where}: {key}", value)
         if numbers.shape not in ((), (count,)):
             several = f"must be a list of {count} numbers (for {scenario.vehicles} vehicles), or one number for all"
-            right = "must be one number" if RULES[key].per == "world" else several
+            right = "must be one number" if QUANTITIES[key].per == "world" else several
             raise InvalidInput(f"{where}: {key} has shape {list(numbers.shape)}; {right}")
         columns |= {(key, i): number for i, number in enumerate(np.broadcast_to(numbers, (count,))[:, np.newaxis])}
     return _worlds(scenario, columns, where)
@@ -132,8 +132,8 @@ def _worlds(
     n = len(next(iter(given.values()))) if given else 1
 
     def refuse(key: str, i: int, row: int, right: str) -> NoReturn:
-        by_key = key if RULES[key].per == "world" else f"{key}[{i}]"
-        place = f": {by_key}" if row_text is None else f"{row_text(row)}, column {RULES[key].column_of(i)}"
+        by_key = key if QUANTITIES[key].per == "world" else f"{key}[{i}]"
+        place = f": {by_key}" if row_text is None else f"{row_text(row)}, column {QUANTITIES[key].column_of(i)}"
         raise InvalidInput(f"{where}{place}{right}")
 
     def fixed(key: str) -> Floats:
@@ -141,7 +141,7 @@ def _worlds(
         return np.where(low == high, low, np.nan)[np.newaxis]
 
     def settle(key: str, known: Floats) -> Floats:
-        rule, whole = RULES[key], np.empty((n, known.shape[1]))
+        rule, whole = QUANTITIES[key], np.empty((n, known.shape[1]))
         for i in range(whole.shape[1]):
             column = whole[:, i] = given.get((key, i), known[:, i])
             if (key, i) not in given and np.isnan(column).any():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import UNSHOWN, refuse, require
 from ethbrake_marl.files.yaml import flow_text
-from ethbrake_marl.worlds.rules import ALTERNATIVES
+from ethbrake_marl.worlds.quantities import ALTERNATIVES
 
 if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario

@@ -10,27 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.state import PHYSICS, State
-from ethbrake_marl.episode.step import at_alert, first_decision
+from ethbrake_marl.episode.step import StepSettings, at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
-from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, FAR_M, GAP, LATENCY, Bools, Floats, Ints
+from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, GAP, IMPACTS, LATENCY, Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import PER_LINK
-from ethbrake_marl.worlds.counters import Channel, Numbers, numbers_of, world_numbers
+from ethbrake_marl.worlds.counters import Numbers, Purpose, numbers_of, world_numbers
 from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
-from ethbrake_marl.worlds.quantity import pick
-from ethbrake_marl.worlds.roles import first_command
-from ethbrake_marl.worlds.rules import (
+from ethbrake_marl.worlds.quantities import (
     CAR_ROWS,
     MIXTURE,
     NEWS,
     OF_WORLD,
     PER_TYPE,
+    QUANTITIES,
     RECORDING,
     ROW,
-    RULES,
     TYPES,
     width_of,
 )
+from ethbrake_marl.worlds.quantity import pick
+from ethbrake_marl.worlds.roles import first_command
 from ethbrake_marl.worlds.table import TableColumn
 from ethbrake_marl.worlds.vehicle_types import WithLoad
 
@@ -59,24 +59,24 @@ class Drawn(NamedTuple):
         return cls(worlds, np.full(n, np.nan), np.full((n, worlds.vehicles), ""), np.full(n, ""), np.full(n, ""))
 
 
-def draw(scenario: Scenario, n: int, seed: int, first: int, channel: Channel) -> Drawn:
+def draw(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) -> Drawn:
     """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
 
     Raises ``InvalidInput`` for bad arguments, and for a world that is rejected ``MOST_ATTEMPTS`` times.
     """
-    index = world_numbers(n, seed, first, channel)
+    index = world_numbers(n, seed, first, purpose)
     if not scenario.members:
-        return _accepted(scenario, seed, channel, index)
-    chosen, parts = member_numbers(scenario, index, seed, channel), []
+        return _accepted(scenario, seed, purpose, index)
+    chosen, parts = member_numbers(scenario, index, seed, purpose), []
     for k in np.unique(chosen):
-        part = _accepted(scenario.members[k], seed, channel, index[chosen == k])
+        part = _accepted(scenario.members[k], seed, purpose, index[chosen == k])
         parts.append(part._replace(scenarios=np.full(part.worlds.n, scenario.members[k].name)))
     return merged(parts, np.argsort(chosen, kind="stable"))
 
 
-def member_numbers(scenario: Scenario, index: Ints, seed: int, channel: Channel = "list") -> Ints:
+def member_numbers(scenario: Scenario, index: Ints, seed: int, purpose: Purpose = "list") -> Ints:
     """Number (from 0) of the member from which each of the worlds ``index`` [n], ascending, is drawn, [n]."""
-    u = numbers_of(seed, channel, 0, index)(OF_WORLD, MIXTURE)[:, 0]
+    u = numbers_of(seed, purpose, 0, index)(OF_WORLD, MIXTURE)[:, 0]
     return pick([member.weight for member in scenario.mixture or ()], u)
 
 
@@ -112,7 +112,7 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
                     drawn[rows, i] = quantity
                     continue
                 # All columns of a table take their number from one place, so a world takes them from the same row.
-                stream, column = ROW if isinstance(quantity, TableColumn) else RULES[key].place(i)
+                stream, column = ROW if isinstance(quantity, TableColumn) else QUANTITIES[key].place(i)
                 u = numbers(width_of(stream, scenario.vehicles), stream)[rows, column]
                 of = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)
                 drawn[rows, i] = quantity.value(*of)
@@ -141,7 +141,7 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
         line[rows, layout.SPEED, 1:], line[rows, GAP, 0] = whole["speeds_mps"][rows], obstacle[rows, 0]
         line[rows, GAP, 1:N], line[rows, GAP, N] = whole["gaps_m"][rows], np.inf
         car[rows, layout.MASS, 0] = car[rows, BRAKE_RATE] = car[rows, layout.RELEASE_RATE] = np.inf
-        car[rows, layout.RESTITUTION], car[rows, layout.WEIGHT, 1:] = whole["restitution"][rows], 1.0
+        car[rows, layout.RESTITUTION, 0], car[rows, layout.WEIGHT, 1:] = whole["restitution"][rows, 0], 1.0
         for row, each in of_car:
             car[rows, row, 1:] = each[rows]
         know[rows, 1:, 1:] = known[rows]
@@ -153,15 +153,15 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
     return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 
-def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn:
+def _accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> Drawn:
     """Worlds ``index``; worlds with an early impact are drawn again if the scenario rejects them."""
-    drawn = draw_once(scenario, numbers_of(seed, channel, 0, index), index)
+    drawn = draw_once(scenario, numbers_of(seed, purpose, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn
     pending, rejected, attempt = np.flatnonzero(has_early_impact(scenario, drawn.worlds)), 0, 0
     while len(pending) and attempt < MOST_ATTEMPTS - 1:
         rejected, attempt = rejected + len(pending), attempt + 1
-        again = draw_once(scenario, numbers_of(seed, channel, attempt, index[pending]), index[pending])
+        again = draw_once(scenario, numbers_of(seed, purpose, attempt, index[pending]), index[pending])
         drawn.worlds.put(pending, again.worlds, donate=True)
         for whole, part in zip(drawn[1:5], again[1:5], strict=True):
             whole[pending] = part
@@ -180,8 +180,8 @@ def _accepted(scenario: Scenario, seed: int, channel: str, index: Ints) -> Drawn
 def has_early_impact(scenario: Scenario, alert: State) -> Bools:
     """Whether an impact happens before or when the first learner can act, [n]. Nobody can prevent it."""
     deciders = np.array(scenario.learners, np.int64)
-    state = first_decision(alert, deciders, scenario.time_step_s, scenario.horizon_s)
-    return np.asarray(state.line[:, COUNT].any(axis=1))
+    state = first_decision(alert, deciders, StepSettings(deciders, scenario.time_step_s, scenario.horizon_s))
+    return np.asarray(state.line[:, IMPACTS].any(axis=1))
 
 
 def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:

@@ -33,12 +33,12 @@ from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import V2X
 from ethbrake_marl.worlds.checks import ScenarioWording, check_whole
-from ethbrake_marl.worlds.counters import Channel
+from ethbrake_marl.worlds.counters import Purpose
 from ethbrake_marl.worlds.derived import world_values
 from ethbrake_marl.worlds.mixture import WORDS, changed_content, with_members
+from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_count, table_columns
 from ethbrake_marl.worlds.quantity import Part, PerVehicle, Quantity, Weight, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
-from ethbrake_marl.worlds.rules import OF_A_TYPE, OPTIONAL, RULES, USUAL, check_count, table_columns
 from ethbrake_marl.worlds.sampling import Drawn, draw
 from ethbrake_marl.worlds.table import Table, TableColumn
 from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes
@@ -69,7 +69,7 @@ class Member(Part):
 
 
 def _quantity(key: str, default: Any = None, **more: Any) -> Any:
-    return Field(default=default, description=RULES[key].meaning, **more)
+    return Field(default=default, description=QUANTITIES[key].meaning, **more)
 
 
 class Scenario(Part):
@@ -196,10 +196,10 @@ class Scenario(Part):
             value.check_cells(table_columns((*USUAL, *OPTIONAL), info.data["vehicles"]))
         return value
 
-    @field_validator(*RULES)
+    @field_validator(*QUANTITIES)
     @classmethod
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
-        rule = RULES[str(info.field_name)]
+        rule = QUANTITIES[str(info.field_name)]
         if "vehicles" in info.data:
             check_count(value, rule.count(info.data["vehicles"]), rule.per)
         listed = isinstance(value, tuple)
@@ -231,18 +231,18 @@ class Scenario(Part):
 
     # ---- its worlds
 
-    def sample(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> State:
+    def sample(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> State:
         """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed, at the alert.
 
-        World k always has the same bits. A seed has two independent lists: ``channel="list"`` for evaluation,
+        World k always has the same bits. A seed has two independent lists: ``purpose="list"`` for evaluation,
         ``"training"`` for training. Raises ``InvalidInput`` for bad arguments, and if ``early_impacts: reject`` leaves
         no world.
         """
-        return self.draw(n, seed, first=first, channel=channel).worlds
+        return self.draw(n, seed, first=first, purpose=purpose).worlds
 
-    def draw(self, n: int, seed: int, *, first: int = 0, channel: Channel = "list") -> Drawn:
+    def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> Drawn:
         """Worlds as in ``sample``, with their types, members and recordings, and the number of rejected draws."""
-        return draw(self, n, seed, first, channel)
+        return draw(self, n, seed, first, purpose)
 
     # ---- who is in the line
 
@@ -296,7 +296,7 @@ class Scenario(Part):
         or column of the table.
         """
         sources = {}
-        for key, rule in RULES.items():
+        for key, rule in QUANTITIES.items():
             own, line, entries = getattr(self, key), self.types_of_line if key in OF_A_TYPE else None, []
             for i, outside in enumerate(own if isinstance(own, tuple) else (own,) * rule.count(self.vehicles)):
                 column = self.columns.get(rule.column_of(i))
@@ -314,7 +314,7 @@ class Scenario(Part):
 
         Capacities include the road's friction. An undeclared rate is the largest valid one.
         """
-        at_once = np.full((2, self.vehicles), RULES[key].high)
+        at_once = np.full((2, self.vehicles), QUANTITIES[key].high)
         each = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
         lows, highs = np.min(each, axis=0)[0], np.max(each, axis=0)[1]
         return tuple(zip(lows.tolist(), highs.tolist(), strict=True))

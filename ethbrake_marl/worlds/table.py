@@ -20,8 +20,8 @@ from ethbrake_marl.files.model import UNSHOWN, require, suggestion
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.motion.layout import Floats
+from ethbrake_marl.worlds.quantities import QUANTITIES, RECORDING, Entry
 from ethbrake_marl.worlds.quantity import Number, Part, pick
-from ethbrake_marl.worlds.rules import RECORDING, RULES, Entry
 
 SIZE_LIMIT = 64 << 20  # bytes of a CSV file
 
@@ -81,7 +81,7 @@ class Table(Part):
         for c, name in enumerate(self.columns):
             unknown = f"unknown column; {suggestion(name, known) or hint}"
             require(name in known or name == RECORDING, ("columns",), name, unknown)
-            rule = RULES[known[name][0]] if name in known else None
+            rule = QUANTITIES[known[name][0]] if name in known else None
             right = f"{name} must be {rule.interval if rule else 'a printable text, such as drive_1.csv: 2-3-4'}"
             for k, cell in enumerate(row[c] for row in self.rows or ()):
                 if isinstance(cell, str):

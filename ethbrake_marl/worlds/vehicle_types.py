@@ -16,8 +16,8 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, 
 from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, require, suggestion
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import Equipage
+from ethbrake_marl.worlds.quantities import OF_A_TYPE, QUANTITIES, USUAL, check_count
 from ethbrake_marl.worlds.quantity import ONE_OR_EACH, Pair, Part, Quantity, Uniform, Weight, pick, support, values
-from ethbrake_marl.worlds.rules import OF_A_TYPE, RULES, USUAL, check_count
 
 ANY = "any"  # every type, in proportion to its weight
 
@@ -50,7 +50,7 @@ TypeQuantity = Annotated[Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, 
 
 
 def _own(key: str) -> Any:
-    return Field(default=None, exclude_if=None if key in USUAL else not_, description=RULES[key].meaning)
+    return Field(default=None, exclude_if=None if key in USUAL else not_, description=QUANTITIES[key].meaning)
 
 
 class VehicleType(Part):
@@ -77,7 +77,7 @@ class VehicleType(Part):
     @field_validator(*OF_A_TYPE)
     @classmethod
     def _in_range(cls, value: Any, info: ValidationInfo) -> Any:
-        RULES[str(info.field_name)].check(value)
+        QUANTITIES[str(info.field_name)].check(value)
         return value
 
     @field_validator("load")

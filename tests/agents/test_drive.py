@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.drive import Team, drive, play, propose, to_action, to_command
+from ethbrake_marl.agents.drive import Team, drive, play, propose
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.faces.shield import shield
-from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import make_agent, open_game, register_agent
 from ethbrake_marl.shields.step import StepShield
 from tests.refused import refused
@@ -194,18 +194,6 @@ def test_error_at_the_alert__names_the_vehicle(body: int) -> None:
 def test_a_constant__beyond_the_capacity_is_refused() -> None:
     with pytest.raises(InvalidInput, match=r"agent 'constant:20', world 5, vehicle_2 at .* command -20 m/s2; must be"):
         drive(GAME, PAPER.sample(2, 7, first=5), Team("constant:20", {2: Held("constant:20")}))
-
-
-def test_commands_and_actions__are_each_others_inverse_and_clipped() -> None:
-    state = PAPER.sample(200, 7)
-    state.car[:, DRIVING, 2] = 3.0
-    actions = np.random.default_rng(1).uniform(-1.0, 1.0, 200)
-    commands = to_command(state, 2, actions)
-    assert (commands == actions * np.where(actions < 0.0, state.car[:, BRAKING, 2], state.car[:, DRIVING, 2])).all()
-    assert np.abs(to_action(state, 2, commands) - actions).max() < 1e-15
-    assert (to_action(state, 2, np.sign(actions) * 100.0) == np.sign(actions)).all()
-    state.car[:, DRIVING, 2] = 0.0
-    assert (to_action(state, 2, np.ones(200)) == 0.0).all()
 
 
 def test_proposals__stand_in_the_order_of_the_drivers() -> None:

@@ -270,7 +270,7 @@ def test_choice__does_not_depend_on_the_batch_nor_on_coasting_before():
     best = coupled(worlds, 2)
     for k in (0, 17, 59):
         assert [column[0] for column in coupled(worlds.take([k]), 2)] == [column[k] for column in best]
-    later = first_decision(worlds, game.deciders, 0.1, 8.0)
+    later = first_decision(worlds, game.deciders, game.settings)
     for choose in (coupled, pairwise):
         np.testing.assert_allclose(choose(later, 2).harm, choose(worlds, 2).harm, rtol=0.0, atol=1e-9)
 

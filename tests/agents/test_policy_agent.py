@@ -144,7 +144,7 @@ def test_model__drives_as_in_its_own_librarys_rollout() -> None:
     while not over:
         seen, reward, terminated, truncated, _ = env.step(predicted(model, seen))
         total, over = total + float(reward), terminated or truncated
-    worlds = PAPER.sample(1, 3, channel="training")
+    worlds = PAPER.sample(1, 3, purpose="training")
     assert harms(policy_agent(model), worlds=worlds)[0] == pytest.approx(-total, rel=1e-5, abs=1e-5)
 
 

@@ -130,7 +130,7 @@ class Interface:
 class Parallel(Interface):
     def __init__(self, scenario: eb.Scenario, n: int, wrap: Wrap = unchanged, **settings: Any) -> None:
         self.env = wrap(eb.EthBrakeParallelEnv(scenario, **settings))
-        self.agent = self.env.possible_agents[self.env.unwrapped.game.rules.learners[0] - 1]
+        self.agent = self.env.possible_agents[self.env.unwrapped.game.settings.learners[0] - 1]
         self.space = self.env.observation_space(self.agent)
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Array:

@@ -164,7 +164,7 @@ NEWS = {"preset": "nominal", "link_latency_s": 0.6, "hears": "front", "sensing_s
 )
 def test_batch__row_k_is_the_world_alone(name: str, scenario: Scenario) -> None:
     n, seed = 5, 7
-    worlds = scenario.sample(n, seed, channel="training")
+    worlds = scenario.sample(n, seed, purpose="training")
     batch = BARE["vector"](scenario, n)
     start, columns = batch.reset(seed), actions(3, 80, n)
     turns = [batch.step(action) for action in columns]
@@ -285,7 +285,7 @@ DRAWN = load_scenario(
 
 
 def drawn(seed: int, world: int) -> dict[str, Any]:
-    columns = columns_of(DRAWN.draw(1, seed, first=world, channel="training"))
+    columns = columns_of(DRAWN.draw(1, seed, first=world, purpose="training"))
     assert "scenario" in columns
     return {"world_seed": seed} | {name: column[0].item() for name, column in columns.items()}
 

@@ -29,13 +29,13 @@ this. `python -m tests.docs.layout` makes this page from the code.
 | What does one impact cost? | `motion/impact.py`; who bears it: `state.py`, `split_harm`; in infos: `infos.py` |
 | How does a scenario become a game? | `worlds/`: `catalogue.py`, `game.py`; worlds are drawn in `sampling.py` |
 | How do environments play it? | `faces/face.py`, on `faces/stream.py`: its episodes, drawn again when they end |
-| What would happen? | `episode/play.py`: `played`, `price` (a plan), `hold` (constant commands) |
+| What would happen? | `episode/play.py`: `price` (a plan); `episode/hold.py`: `hold` (constant commands) |
 | Where does a number in a table come from? | `evaluation/`: `measures.py`, `statistics.py`, `summary.py` |
 | Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/decision.py` |
 | What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
 | Which agents are there? | `parts.py`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
 | Who lets agents drive? | `agents/drive.py`: `play`, `drive` |
-| What can a scenario file say? | `worlds/`: `scenario.py`, `rules.py`; [scenarios](../scenarios.md) |
+| What can a scenario file say? | `worlds/`: `scenario.py`, `quantities.py`; [scenarios](../scenarios.md) |
 | How does a training run? | `training/`: `train.py`, `ppo.py`, `sac.py`; between two updates: `updates.py` |
 | How do I add a column to an evaluation? | [a measure](../extend.md#a-measure) |
 
@@ -51,7 +51,7 @@ evaluation/evaluate.py  evaluate, _driven
 agents/drive.py         play, and in each step:
 episode/game.py           Game.step
 episode/step.py           step; asked: agents/policy_agent.py, policies/actor.py
-motion/drive.py           drive; motion/impact.py, resolve_impacts: the harm
+motion/interval.py        move_line; motion/impact.py, resolve_impacts: the harm
 evaluation/measures.py  harm: episode/state.py, State.harm
 evaluation/summary.py   summarise; statistics.py, mean
 files/sheet.py          Sheet: columns become text

@@ -9,7 +9,7 @@ import numpy as np
 from ethbrake_marl.episode.state import TIME, State
 from ethbrake_marl.episode.step import OUT_ROWS, SAFE_END, Step, at_alert
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.motion.drive import FAILED
+from ethbrake_marl.motion.interval import FAILED
 from tests.motion.lines import driven, lines
 
 

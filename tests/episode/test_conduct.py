@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.episode.conduct import driving_s, first_impact_s
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.names import open_game
 from tests.contract.interfaces import CRASH, REST
@@ -23,22 +22,8 @@ DRIVEN = later(CLOSE, [0.0, 2.0, 1.0], 4.0)
 
 
 def test_drove__counts_what_the_engine_does() -> None:
-    assert first_impact_s(CLOSE, DRIVEN).tolist() == near([1.5])
-    assert driving_s(CLOSE, DRIVEN, first_impact_s(CLOSE, DRIVEN))[0].tolist() == near([0.0, 1.0, 1.5])
     terms = paid({"harm": 0.0, "drove": 1.0}, CLOSE, DRIVEN).terms
     assert terms["drove"][0].tolist() == near([0.0, -7.0, -4.0])
-    after = later(DRIVEN, [0.0, 2.0, 1.0], 5.0)
-    assert first_impact_s(DRIVEN, after).tolist() == [4.0]
-    assert not driving_s(DRIVEN, after, DRIVEN.time_s).any()
-    braked = later(CLOSE, [0.0, -2.0, 1.0], 1.0)
-    assert first_impact_s(CLOSE, braked).tolist() == [1.0]
-    assert driving_s(CLOSE, braked, np.ones(1))[0].tolist() == [0.0, 0.0, 1.0]
-
-
-def test_first_impact__with_the_obstacle() -> None:
-    ahead = state_of([9.0], [10.0, 10.0], obstacle_gap_m=5.0)
-    after = later(ahead, [0.0, 4.0], 1.0)
-    assert first_impact_s(ahead, after).tolist() == near([0.5])
 
 
 def test_push__is_the_push_of_the_step_of_all_pairs() -> None:

@@ -9,8 +9,9 @@ import pytest
 
 from ethbrake_marl.episode.counts import COUNTS, ROWS, pair_amounts
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.objectives import amounts, objectives_of
-from ethbrake_marl.episode.play import hold, played, price
+from ethbrake_marl.episode.play import played, price
 from ethbrake_marl.episode.reward import RewardParams, reward_params
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.door import evaluate
@@ -37,10 +38,10 @@ def test_honest__is_total_harm_and_the_price_of_push_driving_and_motion_at_the_h
     while not state.ended[0]:
         assert not state.line[:, MOVING].any()
         state, step = game.step(state, np.zeros((1, 1)))
-        counted += step.counted[0]
+        counted += step.cost[0]
         assert step.vector is not None
         borne -= step.vector[0, 0]
-        assert step.reward[0].tolist() == [-step.counted[0]] * 2
+        assert step.reward[0].tolist() == [-step.cost[0]] * 2
     assert state.line[0, PUSHED].tolist() == near([0.0, 1.8, 0.0])
     assert state.line[0, MOVING].tolist() == near([18.05**2, 18.05**2, 0.0])
     assert (state.harm("first"), state.harm("total")) == (near([36.0]), near([36.0]))
@@ -72,7 +73,7 @@ def test_amounts__of_pairs_and_worlds_have_the_weights_of_the_count() -> None:
     state = state_of([5.0, 5.0], [1.0, 1.0, 1.0])
     state.line[0, ROWS] = np.arange(1.0, 7.0)[:, np.newaxis] * [1.0, 10.0, 100.0, 0.0]
     for count, weight in (("first", 1.0), ("total", 2.0), ("honest", 2.0 + 3.0 + 40.0 + 50.0 + 6.0)):
-        assert pair_amounts(state.line, count)[0].tolist() == [weight, 10.0 * weight, 100.0 * weight, 0.0]
+        assert pair_amounts(state.line, count)[0, 0].tolist() == [weight, 10.0 * weight, 100.0 * weight, 0.0]
         assert state.harm(count).tolist() == [111.0 * weight]
         assert state.pair_harm(count).tolist() == [[10.0 * weight, 100.0 * weight]]
     own = np.array([0.5, 0.0, 0.0, 0.0, 2.0, 0.0])
@@ -90,7 +91,7 @@ def opened(name: str, count: str) -> tuple[Game, State]:
 def random_plans(game: Game, state: State, seed: int) -> np.ndarray:
     """Return plans [n, T, L] that often drive, and brake at the end, so that every row of a count is met."""
     rng, steps = np.random.default_rng(seed), 30
-    shape = state.n, steps, len(game.rules.learners)
+    shape = state.n, steps, len(game.settings.learners)
     plans = np.where(rng.random(shape) < 0.3, 1.0, rng.uniform(-1.0, 1.0, shape))
     plans[:, -1] = np.where(rng.random((state.n, 1)) < 0.7, -1.0, 1.0)
     return plans
@@ -105,7 +106,7 @@ def test_counts__are_ordered_never_fall_and_are_the_sum_of_what_steps_count(name
             before = {each: state.harm(each) for each in COUNTS}
             now = np.minimum(state.steps, plans.shape[1] - 1)
             state, step = game.step(state, plans[np.arange(N), now])
-            counted = counted + step.counted
+            counted = counted + step.cost
             for each in COUNTS:
                 assert (state.harm(each) >= before[each]).all()
             assert (state.harm("honest") >= state.harm("total")).all()
@@ -132,10 +133,10 @@ def test_price__is_what_happens_to_the_bit_and_depends_on_no_other_world(name: s
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_hold__of_constant_commands_is_the_episode(name: str) -> None:
     game, state = opened(name, "honest")
-    learners, shares = game.rules.learners, np.array([-1.0, -0.4, 0.0, 0.7])
+    learners, shares = game.settings.learners, np.array([-1.0, -0.4, 0.0, 0.7])
     braking, driving = (state.car[:, row][:, np.newaxis, learners] for row in (BRAKING, DRIVING))
     tried = shares[:, np.newaxis] * np.where(shares[:, np.newaxis] < 0.0, braking, driving)
-    held = hold(state, state.wanted, learners, tried, game.rules.horizon_s, "honest")
+    held = hold(state, state.wanted, learners, tried, game.settings.horizon_s, "honest")
     for c, share in enumerate(shares):
         last, cost = played(game, state, np.full((N, 1, len(learners)), share), "honest")
         assert held[0, :, c] == near(cost, rel=1e-7, abs=1e-7)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import hold, price
+from ethbrake_marl.episode.hold import hold
+from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.layout import GAP, SPEED

@@ -175,7 +175,7 @@ def test_full_state__has_every_vehicle_pair_time_and_obstacle(name: str, size: i
     scenario, game = open_game(name)
     state = game.reset(scenario.sample(5, 7))
     for _ in range(steps):
-        state, _ = game.step(state, np.full((5, len(game.rules.learners)), -0.5))
+        state, _ = game.step(state, np.full((5, len(game.settings.learners)), -0.5))
     obstacle = scenario.has_obstacle
     features = state_features(scenario.vehicles, scenario.horizon_s, obstacle)
     found: Any = full_state(state, scenario.horizon_s, obstacle)

@@ -60,7 +60,7 @@ def test_counts__differ_by_the_later_impacts() -> None:
         state = later(state, [-16.0, 4.0], until)
     assert state.pair_harm("first").tolist() == [[64.0]]
     assert np.round(state.pair_harm("total"), 9).tolist() == [[64.0 + 16.0 + 4.0]]
-    assert state.line[0, at.COUNT, 1] == 3.0 and state.collided.tolist() == state.pair_hit[:, 0].tolist() == [True]
+    assert state.line[0, at.IMPACTS, 1] == 3.0 and state.collided.tolist() == state.pair_hit[:, 0].tolist() == [True]
     assert state.harm("first").tolist() == [64.0] and state.borne_harm("first").sum() == 64.0
 
 
@@ -82,7 +82,7 @@ def test_harm_of_the_obstacle__is_that_of_vehicle_1() -> None:
 def met(pairs: tuple[float, float] = (12.0, 9.0), total: tuple[float, float] = (12.0, 30.0)) -> State:
     """Pair 1 met with 12 m2/s2 (masses 1, 2), pair 2 with 9 (masses 2, 1), then with 21 more; e = 0.5."""
     state = state_of([0.0, 0.0], [0.0, 0.0, 0.0], mass_t=[1.0, 2.0, 1.0], restitution=0.5, harm_weight=[0.0, 1.0, 3.0])
-    state.line[0, at.FIRST, 1:3], state.line[0, at.TOTAL, 1:3], state.line[0, at.COUNT, 1:3] = pairs, total, (1, 2)
+    state.line[0, at.FIRST, 1:3], state.line[0, at.TOTAL, 1:3], state.line[0, at.IMPACTS, 1:3] = pairs, total, (1, 2)
     return state
 
 

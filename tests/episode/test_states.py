@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import descend, hold, price
+from ethbrake_marl.episode.hold import descend, hold
+from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
@@ -33,7 +34,7 @@ def game(request: pytest.FixtureRequest) -> Game:
 
 def actions(game: Game, seed: int, n: int = N) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    drawn = rng.uniform(-1.0, 1.0, (n, len(game.rules.learners)))
+    drawn = rng.uniform(-1.0, 1.0, (n, len(game.settings.learners)))
     return np.where(rng.random(drawn.shape) < 0.4, -1.0, drawn)
 
 
@@ -110,7 +111,7 @@ def test_bad_action__is_refused_and_changes_nothing(game: Game, bad: float) -> N
     state.clock[:, 4] = 0.0
     before, wrong = bits(state), actions(game, 1, 3)
     wrong[1, -1] = bad
-    with pytest.raises(InvalidInput, match=rf"action of vehicle_{game.rules.learners[-1]} = .*: must be from -1"):
+    with pytest.raises(InvalidInput, match=rf"action of vehicle_{game.settings.learners[-1]} = .*: must be from -1"):
         game.step(state, wrong, donate=True)
     assert bits(state) == before
 
@@ -118,7 +119,7 @@ def test_bad_action__is_refused_and_changes_nothing(game: Game, bad: float) -> N
 @pytest.mark.parametrize("count", ["first", "total"])
 def test_price__is_the_harm_that_happens_to_the_last_bit(game: Game, count: str) -> None:
     state = middle(game)
-    plans = np.random.default_rng(0).uniform(-1.0, 1.0, (N, 60, len(game.rules.learners)))
+    plans = np.random.default_rng(0).uniform(-1.0, 1.0, (N, 60, len(game.settings.learners)))
     expected, now = price(game, state, plans, count), state
     while not now.ended.all():
         now, _ = game.step(now, plans[np.arange(N), np.minimum(now.steps, 59)])
@@ -129,7 +130,7 @@ def test_hold__is_the_harm_of_constant_commands() -> None:
     _, game = open_game("paper-random-obstacle")
     state = game.reset(game.draw(N, 3, 0))
     tried = -state.car[:, BRAKING, [2]] * np.array([0.0, 0.5, 1.0])
-    found = hold(state, state.wanted, [2], tried[:, :, np.newaxis], game.rules.horizon_s, "total")
+    found = hold(state, state.wanted, [2], tried[:, :, np.newaxis], game.settings.horizon_s, "total")
     for c, share in enumerate((0.0, -0.5, -1.0)):
         now = state
         while not now.ended.all():
@@ -139,7 +140,7 @@ def test_hold__is_the_harm_of_constant_commands() -> None:
 
 def test_descend__returns_the_commands_whose_harm_it_tells() -> None:
     scenario, game = open_game("cooperation-3-pair")
-    state, shares, learners = scenario.sample(50, 3), np.linspace(0.0, 1.0, 5), game.rules.learners.tolist()
+    state, shares, learners = scenario.sample(50, 3), np.linspace(0.0, 1.0, 5), game.settings.learners.tolist()
     wanted, least = descend(state, learners, shares, 2, 8.0, "first")
     found = hold(state, wanted, learners, wanted[:, np.newaxis, learners], 8.0, "first")[0, :, 0]
     assert found.tolist() == least.tolist()

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.objectives import amounts, objectives_of
-from ethbrake_marl.episode.play import hold
 from ethbrake_marl.episode.reward import REWARDS, Rewarding, RewardParams, WithoutEffect, reward_params
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import COUNTED, Step
+from ethbrake_marl.episode.step import COST, Step
 from ethbrake_marl.episode.terms import potential, register_term
 from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.motion.layout import BRAKING, FIRST, GAP, SPEED, TOTAL
@@ -33,10 +33,12 @@ def moved(gaps: list[float], speeds: list[float], seconds: float, commands: Any 
 
 
 def paid(reward: dict[str, Any], before: State, after: State, **settings: Any) -> Step:
-    rewarding, rules = Rewarding.of(reward, "total", after.vehicles, LEARNERS, (0.5, 8.0), settings.pop("vector", None))
+    rewarding, step_settings = Rewarding.of(
+        reward, "total", after.vehicles, LEARNERS, (0.5, 8.0), settings.pop("vector", None)
+    )
     step = step_between(before, after, **settings)
-    step.out[COUNTED] = harm = after.harm(rules.counting) - before.harm(rules.counting)
-    compiled = (rules.terminal * step.safe_end - rules.harm * harm)[:, np.newaxis]
+    step.out[COST] = harm = after.harm(step_settings.weights) - before.harm(step_settings.weights)
+    compiled = (step_settings.terminal * step.safe_end - step_settings.harm * harm)[:, np.newaxis]
     return rewarding.complete(before, step._replace(reward=np.repeat(compiled, after.vehicles, axis=1)), after)[1]
 
 
@@ -159,7 +161,7 @@ def test_potential__counts_only_what_is_still_to_come() -> None:
     _, game = open_game("paper-random", reward={"harm": 1.0, "harm_count": "total"})
     state = later(state_of([0.5, 60.0], [10.0, 20.0, 5.0]), -16.0, 8.0)
     assert state.harm("total") > 0.0 and (state.line[:, SPEED, 1:] == 0.0).all()
-    assert potential(game.rules, state) == 0.0
+    assert potential(game.settings, state) == 0.0
 
 
 # ---------------------------------------------------------------- a vector of components
@@ -183,7 +185,7 @@ def test_components__of_vehicles_add_up_to_the_reward() -> None:
     _, game = open_game("cooperation-4-all", reward="harm", reward_vector="vehicles")
     state = game.reset(game.draw(30, 1, 0))
     while not state.ended.all():
-        state, step = game.step(state, np.full((30, len(game.rules.learners)), -0.2))
+        state, step = game.step(state, np.full((30, len(game.settings.learners)), -0.2))
         assert step.vector is not None and step.vector.shape == (30, 3, 3)
         assert step.vector.sum(axis=2) == near(step.reward, abs=1e-9)
     assert state.collided.any()
@@ -225,7 +227,7 @@ def test_objective__without_a_weight_of_harm_has_no_effect_and_warns() -> None:
     own = load_scenario("cooperation-3-pair").replace(objective="own")
     with pytest.warns(WithoutEffect, match="the scenario's objective, own, has no effect"):
         _, game = open_game(own, reward="paper")
-    assert game.rules.harm == 0.0 and "harm" not in game.rewarding.counted
+    assert game.settings.harm == 0.0 and "harm" not in game.rewarding.counted
     open_game(own, reward={"harm": 1.0, "risk": 0.1})
 
 

@@ -77,7 +77,7 @@ def evaluated(
     scenario: Any, n: int = 40, agents: Any = (FULL_BRAKE, GENTLE), measures: Any = (), **more: Any
 ) -> Result:
     loaded, game = open_game(Scenario(**scenario) if isinstance(scenario, dict) else scenario)
-    (body,) = game.rules.learners.tolist()
+    (body,) = game.settings.learners.tolist()
     drawn = loaded.draw(n, 7)
     return evaluate(
         drawn, teams(*agents, body=body), game, measures_called(measures), about=about_scenario(loaded, 7), **more

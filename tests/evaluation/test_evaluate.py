@@ -109,7 +109,7 @@ def test_driving__before_the_first_impact_by_hand(command: float, hard: bool) ->
 def test_conduct__is_measured_in_every_line() -> None:
     for name in ("cooperation-4-all", "paper-random-obstacle", "cooperation-2-five"):
         scenario, game = open_game(name)
-        alert, learners = scenario.sample(20, 7), game.rules.learners.tolist()
+        alert, learners = scenario.sample(20, 7), game.settings.learners.tolist()
         team = Team("coast", {body: COAST for body in learners})
         asked = measures_called("pushed_mps,pushed_m,drove_towards,still_moving,drove")
         columns = evaluate(alert, {"coast": team}, game, asked)["coast"]
@@ -150,7 +150,7 @@ def test_measure_of_ones_own__is_a_column_with_its_statistic(monkeypatch: pytest
 
     def near(game: Any, alert: State, last: State) -> Any:
         """Whether the last gap is below 1 m."""
-        return last.gaps_m < 1.0 if game.rules.learners[0] == 1 else last.gaps_m[:, -1] < 1.0
+        return last.gaps_m < 1.0 if game.settings.learners[0] == 1 else last.gaps_m[:, -1] < 1.0
 
     register_measure("near", near, unit="", shown=[Statistic("near_rate", "rate", "Near")])
     register_measure("near", near, unit="", shown=[Statistic("near_rate", "rate", "Near")])  # twice the same
@@ -397,7 +397,7 @@ def test_our_agents__are_sent_to_processes_and_report_what_they_predict(monkeypa
     scenario, game = open_game("paper-random")
     ppo = {2: LearnedAgent(load_shipped("ppo"), "ppo")}
     agents = {
-        "e_v2x_bm": Team("e", {2: EV2XBM(game.rules)}), "ppo": Team("p", ppo),
+        "e_v2x_bm": Team("e", {2: EV2XBM(game.settings)}), "ppo": Team("p", ppo),
         "ppo+step": Team("s", ppo, StepShield(ppo)), "ppo+episode": Team("a", ppo, EpisodeShield(ppo)),
     }  # fmt: skip
     monkeypatch.setattr(evaluating, "CHUNK", 40)

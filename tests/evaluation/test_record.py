@@ -17,7 +17,7 @@ from tests.refused import refused
 
 def recorded(scenario: Any, agent: Any = FULL_BRAKE, number: int = 0, **more: Any) -> EpisodeRecord:
     loaded, game = open_game(scenario)
-    (body,) = game.rules.learners.tolist()
+    (body,) = game.settings.learners.tolist()
     return record_episode(loaded.sample(1, 7, first=number), Team(agent.name, {body: agent}), game, **more)
 
 

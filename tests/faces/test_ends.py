@@ -91,7 +91,7 @@ def test_most_steps__that_are_not_reached_change_nothing(name: str, most: int) -
 def test_most_steps__from_each_world_s_own_first_decision() -> None:
     scenario = PAPER.replace(latency_s=[0, {"uniform": [0.1, 0.6]}, 0.7])
     env = eb.EthBrakeVectorEnv(5, scenario, reward=EVERY, max_episode_steps=4, autoreset_mode="SameStep")
-    state, drawn = env.reset(seed=7)[1]["time_s"], scenario.sample(5, 7, channel="training")
+    state, drawn = env.reset(seed=7)[1]["time_s"], scenario.sample(5, 7, purpose="training")
     driven = actions(3, 4, 5)
     for action in driven:
         _, rewards, _, truncated, infos = env.step(action)

@@ -46,7 +46,7 @@ def test_agents__are_given_what_their_own_vehicle_observes(agents: str) -> None:
             body = int(agent[-1])
             own = env.game.views[body].observe(env.episode, np.array([body]), 0.1)[0, 0]
             assert np.array_equal(seen[agent], own) and seen[agent] in env.observation_space(agent)
-        seen, *_ = env.step({f"vehicle_{body}": [-0.3] for body in env.game.rules.learners})
+        seen, *_ = env.step({f"vehicle_{body}": [-0.3] for body in env.game.settings.learners})
     names = list(env.scenario.vehicle_names)
     assert env.agents == (names if agents == "all" else [names[i - 1] for i in env.scenario.learners])
 

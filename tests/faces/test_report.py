@@ -34,7 +34,7 @@ def _registered() -> None:
 def played(env: Any, steps: int = 7) -> list[Any]:
     """Rewards and infos of an episode in PettingZoo's form."""
     values: list[Any] = [env.reset(seed=7)[1]]
-    learners = [f"vehicle_{body}" for body in env.game.rules.learners]
+    learners = [f"vehicle_{body}" for body in env.game.settings.learners]
     for action in actions(3, steps, len(learners)):
         _, rewards, *_, infos = env.step(dict(zip(learners, action, strict=True)))
         values.append((rewards, infos))

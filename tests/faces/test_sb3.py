@@ -36,7 +36,7 @@ def test_rows__are_the_learners_of_each_world_from_front_to_rear(appended: Any) 
     env = make_sb3_vec_env(line(3), 2, seed=5, appended=appended)
     seen = env.reset()
     for k in range(3):
-        own = env.game.observe_alike(env.episode, env.game.rules.learners).reshape(6, -1)
+        own = env.game.observe_alike(env.episode, env.game.settings.learners).reshape(6, -1)
         more = {"number": [[0], [1], [2]] * 2, "state": full_state(env.episode, 12.0, True).repeat(3, axis=0)}
         assert np.array_equal(seen, own if appended is None else np.hstack([own, np.array(more[appended])]))
         assert all(row in env.observation_space for row in seen)

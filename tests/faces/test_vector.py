@@ -89,7 +89,7 @@ def test_description__of_worlds_of_a_list_and_of_those_that_follow() -> None:
     assert env.describe_worlds()["friction"].tolist() == drawn.friction.tolist()
     while not over.any():
         over = np.logical_or(*env.step(np.full((3, 1), -1.0))[2:4])
-    worlds, first = env.describe_worlds(), env.scenario.draw(1, 2, channel="training")
+    worlds, first = env.describe_worlds(), env.scenario.draw(1, 2, purpose="training")
     assert worlds["world"].tolist() == np.where(over, np.cumsum(over) - 1, [3, 4, 5]).tolist() and not over.all()
     assert worlds["world_seed"].tolist() == np.where(over, 2, 7).tolist()
     assert worlds["friction"][over][0] == first.friction[0] and worlds["gap_1_m"][over][0] == first.worlds.gaps_m[0, 0]

@@ -38,13 +38,13 @@ def played(name: str, reward: Any = "harm") -> tuple[str, dict[str, np.ndarray]]
     state, rng, sha256 = game.reset(load_scenario(name).sample(N, 7)), np.random.default_rng(7), hashlib.sha256()
     sums = np.zeros((N, state.vehicles))
     while not state.ended.all():
-        actions = rng.integers(-8, 9, (N, len(game.rules.learners))) / 8.0
+        actions = rng.integers(-8, 9, (N, len(game.settings.learners))) / 8.0
         state, step = game.step(state, actions)
-        seen = game.observe(state, game.rules.learners)
+        seen = game.observe(state, game.settings.learners)
         for array in (state.line[:, :PUSHED], state.clock[:, :5], step.reward, *seen):
             sha256.update(np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes())
         sums += step.reward
-    observed = {f"observation_{i}": array for i, array in zip(game.rules.learners, seen, strict=True)}
+    observed = {f"observation_{i}": array for i, array in zip(game.settings.learners, seen, strict=True)}
     return sha256.hexdigest()[:16], {"line": np.minimum(state.line[:, :PUSHED], 1e9), "rewards": sums, **observed}
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.motion.drive import FAILED
+from ethbrake_marl.motion.interval import FAILED
 from ethbrake_marl.motion.layout import Floats
 from tests.motion.lines import driven, lines
 
@@ -59,7 +59,7 @@ def columns(N: int, n: int) -> tuple[Floats, ...]:
         line, met, _ = driven(line, car, draws.uniform(-8.0, 3.0, (n, N)), start, until)
         assert (met != FAILED).all()
         start = until
-    pairs = (line[:, row, 1:-1] for row in (at.FIRST, at.TOTAL, at.COUNT))
+    pairs = (line[:, row, 1:-1] for row in (at.FIRST, at.TOTAL, at.IMPACTS))
     return line[:, at.GAP, 1:-1], line[:, at.SPEED, 1:], *pairs
 
 

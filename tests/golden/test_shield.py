@@ -32,7 +32,7 @@ def test_shield__is_not_worse_than_recorded(
     name: str, count: str, way: str, harm: float, bound: float, replaced: int
 ) -> None:
     scenario, game = open_game(name)
-    learners, rng = game.rules.learners.tolist(), np.random.default_rng(0)
+    learners, rng = game.settings.learners.tolist(), np.random.default_rng(0)
     drivers: Any = dict.fromkeys(learners, LearnedAgent(load_shipped("ppo"))) if way == "ppo" else None
     game = game._replace(shield=StepShield(drivers, harm_count=count))
     state, shape = game.reset(scenario.sample(N, 7)), (N, len(learners))

@@ -33,7 +33,7 @@ def listed(name: str) -> str:
 
 
 def trained_on(name: str) -> list[str | int]:
-    drawn = load_scenario(name).draw(1000, 0, first=0, channel="training")
+    drawn = load_scenario(name).draw(1000, 0, first=0, purpose="training")
     return [digest(drawn.worlds)[:16], drawn.rejected]
 
 

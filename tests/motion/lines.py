@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.motion.drive import drive
+from ethbrake_marl.motion.interval import move_line
 from ethbrake_marl.motion.layout import Floats, scratch_for
 
 ROWS = {
@@ -44,13 +44,13 @@ def lines(
 
 
 def driven(line: Floats, car: Floats, command: Any, start: Any, until: Any) -> tuple[Floats, Floats, Floats]:
-    """Return the lines after an interval, what ``drive`` met, and its scratch memory [n, ROWS, N + 1]."""
+    """Return the lines after an interval, what ``move_line`` met, and its scratch memory [n, ROWS, N + 1]."""
     n, bodies = len(line), line.shape[2]
     wanted, after, met, scratch = np.zeros((n, bodies)), line.copy(), np.zeros(n, np.int64), scratch_for(bodies)
     wanted[:, 1:] = command
     rows = np.zeros((n, at.ROWS, bodies))
     times = np.broadcast_to(np.float64(start), n).tolist(), np.broadcast_to(np.float64(until), n).tolist()
     for k in range(n):
-        met[k] = drive(after[k], car[k], wanted[k], scratch, times[0][k], times[1][k])
+        met[k] = move_line(after[k], car[k], wanted[k], scratch, times[0][k], times[1][k])
         rows[k] = scratch
     return after, met, rows

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.motion.drive import FAILED
+from ethbrake_marl.motion.interval import FAILED
 from ethbrake_marl.motion.layout import Floats
 from tests.motion.lines import driven, lines
 from tests.reference import exact_simulator as exact
@@ -78,7 +78,7 @@ def stepped(runs: Runs, step_s: float) -> Floats:
         out[k, at.SPEED, 1:], out[k, at.FORCE, 1:] = end.speeds, end.forces
         out[k, at.GAP, 1:-1] = end.gaps[1:]
         out[k, at.GAP, 0] = min(end.gaps[0], at.FAR_M)
-        out[k, [at.HIT, at.FIRST, at.TOTAL, at.COUNT, at.PUSHED], :-1] = end.book[:5]
+        out[k, [at.HIT, at.FIRST, at.TOTAL, at.IMPACTS, at.PUSHED], :-1] = end.book[:5]
         if not end.finished:
             out[k] = np.nan
     return out
@@ -105,13 +105,16 @@ def pushes_off(runs: Runs, close: float) -> tuple[Floats, np.ndarray]:
     of the step: they are extrapolated from two lengths. Small steps miss the last of many impacts.
     """
     end, steps = played(runs), stepped(runs, 1e-4)
-    off, same = push_differences(end, steps), (end[:, at.COUNT] == steps[:, at.COUNT]).all(axis=1)
+    off, same = push_differences(end, steps), (end[:, at.IMPACTS] == steps[:, at.IMPACTS]).all(axis=1)
     for step_s in (1e-5, 1e-6):
         far = same & ~(off <= close)
         finer = stepped(runs.take(far), step_s)
         zero = steps[far]
         zero[:, at.PUSHED] = (10.0 * finer[:, at.PUSHED] - zero[:, at.PUSHED]) / 9.0
-        off[far], same[far] = push_differences(end[far], zero), (end[far, at.COUNT] == finer[:, at.COUNT]).all(axis=1)
+        off[far], same[far] = (
+            push_differences(end[far], zero),
+            (end[far, at.IMPACTS] == finer[:, at.IMPACTS]).all(axis=1),
+        )
         steps[far] = finer
     return off, same
 
@@ -143,7 +146,7 @@ def exactly(runs: Runs, k: int) -> Floats:
             line[at.FIRST, p] += 0.0 if line[at.HIT, p] else harm
             line[at.HIT, p] = 1.0
             line[at.TOTAL, p] += harm
-            line[at.COUNT, p] += 1.0
+            line[at.IMPACTS, p] += 1.0
     line[at.SPEED, 1:], line[at.GAP, 1:-1] = speeds, gaps
     line[at.GAP, 0] = at.FAR_M if obstacle is None else obstacle
     line[at.FORCE, 1:] = np.where(car[at.LATENCY, 1:] < runs.times[-1] - 1e-9, runs.commands[-1, k], 0.0)

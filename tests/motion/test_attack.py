@@ -38,7 +38,7 @@ def some(size: int, N: int, obstacle: bool, *, builds_up: bool) -> tuple[Runs, n
     end, order = played(runs), np.random.default_rng(0).permutation(25 * size)
     for rows in (order, *order[:20, np.newaxis]):
         assert played(runs.take(rows)).tobytes() == end[rows].tobytes()
-    return runs, end, end[:, at.COUNT, :-1].sum(axis=1)
+    return runs, end, end[:, at.IMPACTS, :-1].sum(axis=1)
 
 
 def test_motion__is_that_of_rational_numbers(size: int, N: int, obstacle: bool) -> None:
@@ -47,7 +47,7 @@ def test_motion__is_that_of_rational_numbers(size: int, N: int, obstacle: bool) 
     exact = np.stack([exactly(runs, k) for k in rows])
     off, pushes = differences(end[rows], exact).max(), push_differences(end[rows], exact).max()
     print(f"{len(rows)} of {len(end)} worlds: off by {off:.1e} at most, pushes by {pushes:.1e}")
-    assert max(off, pushes) <= CLOSE and (end[rows, at.COUNT] == exact[:, at.COUNT]).all()
+    assert max(off, pushes) <= CLOSE and (end[rows, at.IMPACTS] == exact[:, at.IMPACTS]).all()
 
 
 def test_motion__is_that_of_small_steps_where_brakes_build_up(size: int, N: int, obstacle: bool) -> None:
@@ -58,7 +58,7 @@ def test_motion__is_that_of_small_steps_where_brakes_build_up(size: int, N: int,
         step_s /= 10.0
         off[far] = differences(end[far], stepped(runs.take(far), step_s))
     ends = stepped(runs.take(far), step_s)
-    fewer = ends[:, at.COUNT, :-1].sum(axis=1) < end[far, at.COUNT, :-1].sum(axis=1)
+    fewer = ends[:, at.IMPACTS, :-1].sum(axis=1) < end[far, at.IMPACTS, :-1].sum(axis=1)
     ends[:, at.TOTAL] = end[far, at.TOTAL]  # small steps miss the last impacts of a series, and nothing else
     pushes, same = pushes_off(runs.take(np.arange(min(PUSHES, len(end)))), CLOSE_PUSHES)
     print(f"{len(end)} worlds: off by {off[~far].max():.1e} at most, {far.sum()} plastic series, {same.sum()} pushes")

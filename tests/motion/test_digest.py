@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.motion import digest
-from ethbrake_marl.motion.layout import COUNT, DROVE, FIRST, GAP, PASSED, PUSHED, SPEED, THROWN, TOTAL
+from ethbrake_marl.motion.layout import DROVE, FIRST, GAP, IMPACTS, PASSED, PUSHED, SPEED, THROWN, TOTAL
 
 FEW = "from ethbrake_marl.motion import digest; digest.WORLDS = 30; print(digest.physics_digest())"  # without numba
 
@@ -57,6 +57,6 @@ def test_worlds_of_the_digest__are_all_kinds() -> None:
     lines = [np.concatenate([line[:, :, :2] for line in digest.played(n)]) for n in range(2, 7)]
     every = np.concatenate(lines)
     assert np.isfinite(every[:, :, 1:]).all()
-    for row in (COUNT, FIRST, TOTAL, PUSHED, PASSED, DROVE, THROWN):
+    for row in (IMPACTS, FIRST, TOTAL, PUSHED, PASSED, DROVE, THROWN):
         assert (every[:, row] != 0.0).any(axis=0).all()
     assert (every[:, SPEED] < 0.0).any() and (every[:, GAP, 1] == 0.0).any() and (every[:, GAP, 0] == 0.0).any()

@@ -22,7 +22,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from ethbrake_marl.motion import contact as contacts, drive, forces, impact
+from ethbrake_marl.motion import contact as contacts, forces, impact, interval
 from ethbrake_marl.motion.layout import CAR_ROWS, CLOSING, LINE_ROWS, MASS, RESTITUTION, ROWS, SPEED
 
 z3 = pytest.importorskip("z3")
@@ -236,7 +236,7 @@ def stopping() -> int:
     """Check ``solo`` against the stopping distance."""
     speed, capacity, latency, limit, time = symbols("speed capacity latency limit time")
     known = [exact(speed) >= 0, exact(capacity) > 0, exact(latency) >= 0, exact(time) >= 0, exact(limit) >= 0]
-    found = list(_run(drive, lambda: drive.solo(speed, -capacity, latency, limit, time), known))
+    found = list(_run(interval, lambda: interval.solo(speed, -capacity, latency, limit, time), known))
     whole = exact(speed * latency + speed * speed / (2.0 * capacity))
     for end in found:
         after, way, _ = end.result
@@ -358,13 +358,13 @@ BUGS = {
         contacts, "contact", "if pressing > 0.0:", "if pressing > 0.0 and gap < 1.0:", contact
     ),
     "the way while nothing is in force is forgotten": Bug(
-        drive, "solo", "way, duration, steady = speed * onset,", "way, duration, steady = 0.0,", stopping
+        interval, "solo", "way, duration, steady = speed * onset,", "way, duration, steady = 0.0,", stopping
     ),
     "a vehicle that never moves": Bug(
-        drive, "solo", "    way, steady = 0.0, command", "    return speed, 0.0, math.nan", stopping
+        interval, "solo", "    way, steady = 0.0, command", "    return speed, 0.0, math.nan", stopping
     ),
     "half the time": Bug(
-        drive, "solo", "    way, steady = 0.0, command", "    way, steady, duration = 0.0, command, duration / 2.0",
+        interval, "solo", "    way, steady = 0.0, command", "    way, steady, duration = 0.0, command, duration / 2.0",
         stopping,
     ),
     "restitution of what moves, not of what is left over": Bug(

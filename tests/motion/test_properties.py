@@ -33,7 +33,7 @@ worlds = st.builds(
 
 
 def few(line: Floats) -> np.ndarray:
-    return np.asarray(line[:, at.COUNT, :-1].sum(axis=1) <= FEW)
+    return np.asarray(line[:, at.IMPACTS, :-1].sum(axis=1) <= FEW)
 
 
 def same_bits(one: Floats, other: Floats) -> None:
@@ -60,7 +60,7 @@ def test_motion__is_that_of_rational_numbers_where_brakes_act_at_once(N: int, ob
     rows = np.flatnonzero(few(end))
     exact = np.stack([exactly(runs, k) for k in rows])
     assert len(rows) > 5 and differences(end[rows], exact).max() <= 1e-9
-    assert end[rows, at.COUNT].tolist() == exact[:, at.COUNT].tolist()
+    assert end[rows, at.IMPACTS].tolist() == exact[:, at.IMPACTS].tolist()
     assert push_differences(end[rows], exact).max() <= 1e-12 and exact[:, at.PUSHED].any()
     assert passed_differences(end[rows], exact).max() <= 1e-9 and exact[:, at.PASSED].any() == (N > 2)
 
@@ -86,7 +86,7 @@ def test_scale__of_lengths_changes_harm_by_its_square(runs: Runs, power: int) ->
     end, scaled = played(plain), played(Runs(line, car, runs.times, scale * runs.commands))
     scaled[:, [at.SPEED, at.FORCE, at.GAP]] /= scale
     scaled[:, HARM] /= scale * scale
-    same = few(end) & (end[:, at.COUNT] == scaled[:, at.COUNT]).all(axis=1)  # a touch has no scale, either
+    same = few(end) & (end[:, at.IMPACTS] == scaled[:, at.IMPACTS]).all(axis=1)  # a touch has no scale, either
     assert same.sum() >= 0.8 * few(end).sum() and differences(end[same], scaled[same]).max(initial=0.0) < 1e-7
 
 
@@ -153,5 +153,5 @@ def test_lines__whose_vehicles_only_brake_lose_energy_and_stay_apart(runs: Runs)
         energy = (runs.car[:, at.MASS, 1:] * line[:, at.SPEED, 1:] ** 2).sum(axis=1)
         assert (energy <= before * (1.0 + 1e-12)).all() and (line[:, at.GAP] >= 0.0).all()
         assert (line[:, at.PUSHED] >= start[:, at.PUSHED]).all()
-        assert (line[:, at.FIRST] <= line[:, at.TOTAL]).all() and (line[:, at.HIT] == (line[:, at.COUNT] > 0)).all()
+        assert (line[:, at.FIRST] <= line[:, at.TOTAL]).all() and (line[:, at.HIT] == (line[:, at.IMPACTS] > 0)).all()
         before = energy

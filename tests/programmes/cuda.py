@@ -86,7 +86,7 @@ def code_of(name: str, capability: str) -> Told:
         return Told(None, "numba-cuda is not installed")
     major, minor = (int(part) for part in capability.split("."))
     worlds = Worlds(name, 2, 4, "cpu")
-    arguments = worlds.arguments(torch.zeros(2, len(worlds.game.rules.learners)), 0)
+    arguments = worlds.arguments(torch.zeros(2, len(worlds.game.settings.learners)), 0)
     code = ptx_of(worlds.kernel.name, worlds.kernel.thread, (*like(arguments), 0), (major, minor))
     fused = code.count("fma.rn.f64")
     return Told(not fused, f"{worlds.kernel.name} {len(code) >> 10:,} KiB, {fused} fused multiply-adds")
@@ -103,7 +103,7 @@ def speed(name: str, device: str) -> Told:
     for n in (1 << 14, 1 << 17, 1 << 20) if device != "cpu" else (1 << 12,):
         worlds = Worlds(name, n, 1 << 14, device)
         worlds.reset()
-        actions = torch.rand(10, n, len(worlds.game.rules.learners), device=worlds.device) * 2.0 - 1.0
+        actions = torch.rand(10, n, len(worlds.game.settings.learners), device=worlds.device) * 2.0 - 1.0
         seconds = []
         for _ in range(5):
             wait(device)

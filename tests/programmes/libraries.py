@@ -269,7 +269,7 @@ def evaluated_by_itself(model: Any, agent: Any) -> float:
     import ethbrake_marl as eb
 
     scenario = eb.load_scenario(SCENARIO)
-    sample = scenario.sample(OWN_EPISODES, SEED, channel="training")  # the worlds of ``env.reset(seed=SEED)``
+    sample = scenario.sample(OWN_EPISODES, SEED, purpose="training")  # the worlds of ``env.reset(seed=SEED)``
     ours = eb.evaluate(sample, {"theirs": agent}, scenario=scenario)["theirs"]["first_impact_harm"]
     worlds = make_vec_env("EthBrake-v2", seed=SEED, env_kwargs={"actions": getattr(model.action_space, "n", None)})
     returns, _ = evaluate_policy(model, worlds, OWN_EPISODES, deterministic=True, return_episode_rewards=True)

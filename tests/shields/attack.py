@@ -160,7 +160,7 @@ class Proposer:
 def driven(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -> Iterator[Episode]:
     """A team that proposes by itself, as in evaluations; its next rollout never proposes the same again."""
     loaded, game = open_game(scenario)
-    drivers = {body: Proposer(way, seed + body) for body in game.rules.learners.tolist()}
+    drivers = {body: Proposer(way, seed + body) for body in game.settings.learners.tolist()}
     team = Team("attack", drivers, StepShield(drivers, harm_count=count))
     for begin in range(0, worlds, 500):
         n, decisions, rises, bound = min(500, worlds - begin), 0, 0, None
@@ -174,7 +174,7 @@ def driven(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -> 
 def searched(scenario: Scenario, count: str, way: Way, seed: int, worlds: int) -> Iterator[Episode]:
     """The dearest accepted of eight proposals at every decision: a search against the shield itself."""
     loaded, game = open_game(scenario)
-    guard, rng, L = StepShield(harm_count=count), np.random.default_rng(seed), len(game.rules.learners)
+    guard, rng, L = StepShield(harm_count=count), np.random.default_rng(seed), len(game.settings.learners)
     game = game._replace(shield=guard)
     state, decisions = game.reset(loaded.sample(worlds, seed)), 0
     while not state.ended.all():

@@ -50,7 +50,7 @@ def test_a_better_policy_drives_as_if_alone() -> None:
 def test_h_star_is_that_of_e_v2x_bm() -> None:
     game, alert, team = hybrid(Held("coast"))
     memory = drive(game, alert, team).memories["shield"]
-    np.testing.assert_allclose(memory.bound_harm, coupled(alert, 2, "first", game.rules.horizon_s).harm, atol=1e-6)
+    np.testing.assert_allclose(memory.bound_harm, coupled(alert, 2, "first", game.settings.horizon_s).harm, atol=1e-6)
     game, alert, team = hybrid(Held("coast"), bound="pairwise")
     memory = drive(game, alert, team).memories["shield"]
     np.testing.assert_array_equal(memory.bound_harm, pairwise(alert, 2).harm)

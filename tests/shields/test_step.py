@@ -118,7 +118,7 @@ def test_at_the_alert_the_bound_is_the_cheapest_first_plan() -> None:
 )
 def test_harm_is_the_certified_harm(name: str, count: str, way: str, allowance: float, cap: Any, seed: int) -> None:
     game, state = opened(name, 8, seed, harm_count=count, allowance=allowance, cap=cap)
-    rng, L, k = np.random.default_rng(seed), len(game.rules.learners), 0
+    rng, L, k = np.random.default_rng(seed), len(game.settings.learners), 0
     first, caps, bound = state.memories["shield"].first, state.memories["shield"].caps, told(state, game)["bound_harm"]
     while not state.ended.all():
         state, _ = game.step(state, WAYS[way](rng, k, (8, L)), donate=bool(k % 2))
@@ -193,7 +193,7 @@ def test_one_bad_proposal_does_not_spoil_a_good_one() -> None:
 @pytest.mark.parametrize("name", ["pair", "all", "five"])
 def test_proposals_that_are_rejected_together_are_tried_one_by_one_to_the_last_learner(name: str) -> None:
     game, state = opened(name)
-    rng, learners = np.random.default_rng(4), len(game.rules.learners)
+    rng, learners = np.random.default_rng(4), len(game.settings.learners)
     rejected, accepted = np.zeros((2, learners), np.int64)
     for _ in range(12):
         proposed, before = rng.uniform(-1.0, 1.0, (20, learners)), state
@@ -215,7 +215,7 @@ def test_proposals_that_are_rejected_together_are_tried_one_by_one_to_the_last_l
 
 def shielded(agent: Any, name: str = "paper", n: int = 40, **options: Any) -> tuple[Any, Any, Team]:
     scenario, game = open_game(LINES[name]())
-    drivers = dict.fromkeys(game.rules.learners.tolist(), agent)
+    drivers = dict.fromkeys(game.settings.learners.tolist(), agent)
     return game, scenario.sample(n, 7), Team("mine", drivers, StepShield(drivers, **options))
 
 

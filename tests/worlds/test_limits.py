@@ -12,7 +12,7 @@ import pytest
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.worlds.explain import scenario_json_schema
 from ethbrake_marl.worlds.given import worlds_from_state
-from ethbrake_marl.worlds.rules import RULES
+from ethbrake_marl.worlds.quantities import QUANTITIES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.refused import refused
 
@@ -25,7 +25,7 @@ LEAST = math.nextafter(0.0, 1.0)  # above 0
 IN_TIME = math.nextafter(3600.0, 0.0)  # times until a vehicle may act are also below the horizon
 
 # key -> smallest and largest value, and what else is then declared instead of BASE
-QUANTITIES: dict[str, tuple[float, float, dict[str, Any]]] = {
+RANGES: dict[str, tuple[float, float, dict[str, Any]]] = {
     "gaps_m": (0.0, 1e4, {}),
     "speeds_mps": (0.0, 200.0, {"speed_limit_mps": 200}),
     "braking_capacity_mps2": (LEAST, 100.0, {}),
@@ -55,12 +55,12 @@ FORMS: dict[str, Callable[[float, float], Any]] = {  # of a value and of another
 
 def below(key: str) -> float:
     """Return the largest number that is too small."""
-    return math.nextafter(QUANTITIES[key][0], -math.inf)
+    return math.nextafter(RANGES[key][0], -math.inf)
 
 
 def above(key: str) -> float:
     """Return the smallest number that is too large."""
-    return math.nextafter(3600.0 if QUANTITIES[key][1] == IN_TIME else QUANTITIES[key][1], math.inf)
+    return math.nextafter(3600.0 if RANGES[key][1] == IN_TIME else RANGES[key][1], math.inf)
 
 
 def ends(key: str, value: float) -> dict[str, Any]:
@@ -74,21 +74,21 @@ def content(key: str, value: Any, more: dict[str, Any]) -> dict[str, Any]:
 
 
 def test_limits__are_those_of_all_quantities() -> None:
-    assert QUANTITIES.keys() == RULES.keys()
+    assert RANGES.keys() == QUANTITIES.keys()
 
 
 CASES = [  # each quantity as a number and in one other form, which some quantities have not
     (key, form)
-    for k, key in enumerate(QUANTITIES)
+    for k, key in enumerate(RANGES)
     for form in ("number", [*FORMS][1 + k % 3])
-    if (RULES[key].per, form) != ("world", "list")
+    if (QUANTITIES[key].per, form) != ("world", "list")
 ]
 
 
 @pytest.mark.parametrize(("key", "form"), CASES)
 def test_quantity__at_its_limit_is_accepted_and_beyond_it_is_refused(key: str, form: str) -> None:
-    low, high, more = QUANTITIES[key]
-    rule, vehicles = RULES[key], 3 if RULES[key].per == "pair" else 2
+    low, high, more = RANGES[key]
+    rule, vehicles = QUANTITIES[key], 3 if QUANTITIES[key].per == "pair" else 2
     if key == "harm_weight" and form != "list":
         low = 1e-6  # somebody has such a weight
     for value, beyond in ((low, below(key)), (high, above(key))):
@@ -175,9 +175,9 @@ def test_weight__at_its_limit_is_accepted_and_beyond_it_is_refused() -> None:
 
 @pytest.mark.parametrize("key", ["gaps_m", "speeds_mps", "latency_s", "mass_t", "restitution"])
 def test_given_world__at_a_limit_is_accepted_and_beyond_it_is_refused(key: str) -> None:
-    low, high, more = QUANTITIES[key]
+    low, high, more = RANGES[key]
     scenario = Scenario(**content(key, BASE.get(key, 0.5), more))
     for value, beyond in ((low, below(key)), (high, above(key))):
         worlds_from_state(scenario, {key: value})
-        with refused(f"must be {RULES[key].interval}"):
+        with refused(f"must be {QUANTITIES[key].interval}"):
             worlds_from_state(scenario, {key: beyond})

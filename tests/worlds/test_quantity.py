@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, strategies as st
 
 from ethbrake_marl.worlds.counters import numbers_of
+from ethbrake_marl.worlds.quantities import NEWS, QUANTITIES, TYPES
 from ethbrake_marl.worlds.quantity import Choice, LogNormal, LogUniform, Normal, Uniform, support, values
-from ethbrake_marl.worlds.rules import NEWS, RULES, TYPES
 from ethbrake_marl.worlds.vehicle_types import WithLoad
 
 near = pytest.approx
@@ -67,8 +67,8 @@ def test_random_numbers__are_those_of_numpys_own_generator() -> None:
 def test_random_numbers__differ_by_seed_channel_attempt_and_stream() -> None:
     index = np.arange(3)
     drawn = [
-        numbers_of(seed, channel, attempt, index)(8, stream).tobytes()
-        for seed, channel, attempt, stream in [
+        numbers_of(seed, purpose, attempt, index)(8, stream).tobytes()
+        for seed, purpose, attempt, stream in [
             (7, "list", 0, ()), (8, "list", 0, ()), (7, "training", 0, ()), (7, "list", 1, ()), (7, "list", 0, TYPES),
             (7, "list", 0, NEWS),
         ]
@@ -77,6 +77,6 @@ def test_random_numbers__differ_by_seed_channel_attempt_and_stream() -> None:
 
 
 def test_no_two_quantities_of_one_scenario__share_a_random_number() -> None:
-    together = [key for key in RULES if key not in ("gaps_m", "speeds_mps", "obstacle_gap_m")]
-    places = [RULES[key].place(i) for key in together for i in range(RULES[key].count(4))]
+    together = [key for key in QUANTITIES if key not in ("gaps_m", "speeds_mps", "obstacle_gap_m")]
+    places = [QUANTITIES[key].place(i) for key in together for i in range(QUANTITIES[key].count(4))]
     assert len(set(places)) == len(places)

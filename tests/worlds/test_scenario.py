@@ -20,7 +20,7 @@ from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, l
 from ethbrake_marl.worlds.counters import numbers_of
 from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
 from ethbrake_marl.worlds.game import Pool, views_of
-from ethbrake_marl.worlds.rules import RULES
+from ethbrake_marl.worlds.quantities import QUANTITIES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
 from tests.refused import refused
@@ -52,7 +52,7 @@ def test_world_k__is_the_same_alone_and_in_any_batch(name: str) -> None:
     assert batch.clock[:, NUMBER].tolist() == list(range(10**15, 10**15 + 40))
     for k in (0, 17, 39):
         assert bits(scenario.sample(np.int64(1), np.uint64(3), first=10**15 + k)) == bits(batch.take([k]))
-    others = [scenario.sample(40, 3, first=10**15, channel="training"), scenario.sample(40, 2**200, first=10**15)]
+    others = [scenario.sample(40, 3, first=10**15, purpose="training"), scenario.sample(40, 2**200, first=10**15)]
     assert bits(batch) not in [bits(other) for other in others]
 
 
@@ -252,7 +252,7 @@ def test_columns__are_all_that_was_drawn() -> None:
 def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
     pool = Pool(PAPER)
     for seed, first in ((0, 0), (0, 500), (1, 500), (1, 5000), (1, 10)):
-        assert bits(pool(3, seed, first)) == bits(PAPER.sample(3, seed, first=first, channel="training"))
+        assert bits(pool(3, seed, first)) == bits(PAPER.sample(3, seed, first=first, purpose="training"))
     assert not any(name.startswith("obstacle") for name in views_of(line())[0].names)
     assert any(name.startswith("obstacle") for name in views_of(line(obstacle_gap_m=42))[0].names)
 
@@ -309,7 +309,7 @@ def test_json_schema__accepts_what_the_reader_accepts() -> None:
     editor = jsonschema.Draft202012Validator(explain.scenario_json_schema())
     for entry in list_scenarios():
         assert not [*editor.iter_errors(read_yaml(entry.path).content)], entry.name
-    for key, rule in RULES.items():
+    for key, rule in QUANTITIES.items():
         inside, outside = rule.high, np.nextafter(rule.high, np.inf)
         for content in ({key: inside}, {key: {"uniform": [inside, inside]}}):
             assert editor.is_valid({"name": "x", **content}), key

@@ -66,7 +66,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([n]))
         loaded, game = open_game(scenario, reward=reward)
-        self.learners, self.horizon_is_end, self.actions = game.rules.learners, horizon_is_end, actions
+        self.learners, self.horizon_is_end, self.actions = game.settings.learners, horizon_is_end, actions
         self.of_state = loaded.horizon_s, loaded.has_obstacle
         views = {game.views[i] for i in self.learners}
         if len(views) != 1:

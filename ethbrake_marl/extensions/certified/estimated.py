@@ -36,16 +36,16 @@ from ethbrake_marl.extensions.messages.links import (
     present,
 )
 from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.drive import solo
+from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
-    COUNT,
     DRIVING,
     FIRST,
     FORCE,
     GAP,
     HIT,
+    IMPACTS,
     LATENCY,
     LIMIT,
     MASS,
@@ -72,7 +72,7 @@ TOLD = {  # rows of `State.car` -> the piece of a message that tells them
     OWN_LATENCY: P_LATENCY,
     MASS: P_MASS,
 }
-OF_IMPACTS = [HIT, FIRST, TOTAL, COUNT]
+OF_IMPACTS = [HIT, FIRST, TOTAL, IMPACTS]
 
 
 class MedianLine(NamedTuple):

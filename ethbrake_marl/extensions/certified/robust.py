@@ -15,11 +15,11 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import MODEL, Agent
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import END, State, mapped, take
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.motion.layout import BRAKING, COUNT, GAP, SPEED, Bools, Floats
+from ethbrake_marl.motion.layout import BRAKING, GAP, IMPACTS, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import held
 from ethbrake_marl.shields.named import NamedShield
@@ -67,10 +67,10 @@ class RobustShield(StepShield):
         Raises ``InvalidInput`` if the intervals do not fit the worlds.
         """
         states = opened(game, self.uncertainty.members(alert))
-        if (states.time_s >= game.rules.horizon_s).any():
+        if (states.time_s >= game.settings.horizon_s).any():
             raise InvalidInput(
                 f"uncertainty: {self.uncertainty}: the first decision may be as late as {states.time_s.max():g} s; must"
-                f" be before the horizon, {game.rules.horizon_s:g} s"
+                f" be before the horizon, {game.settings.horizon_s:g} s"
             )
         memory = self.first_memory(game, alert, state, states, self.agents_at(game, alert))
         return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
@@ -96,7 +96,7 @@ class RobustShield(StepShield):
 
         ``states``: the members, M rows for each world of ``state``.
         """
-        learners, n, plans = game.rules.learners, state.n, super().plans(game, alert, state, states)
+        learners, n, plans = game.settings.learners, state.n, super().plans(game, alert, state, states)
         if states.n == n:
             return plans
         actions = np.repeat(SHARES[:, np.newaxis], len(learners), axis=1)
@@ -136,7 +136,7 @@ def may_be_in(state: State, members: State) -> Bools:
     True after any impact. Before it, gaps and speeds are monotone in each quantity, so every world within the intervals
     lies in this range.
     """
-    struck = state.line[:, COUNT].any(axis=1) | members.line[:, :, COUNT].any(axis=(1, 2))
+    struck = state.line[:, IMPACTS].any(axis=1) | members.line[:, :, IMPACTS].any(axis=(1, 2))
     inside = np.ones(state.n, np.bool_)
     for row, columns in ((SPEED, slice(1, None)), (GAP, slice(1, -1))):
         now, ends = state.line[:, row, columns], members.line[:, :, row, columns]

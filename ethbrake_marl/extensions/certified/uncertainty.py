@@ -18,11 +18,11 @@ import numpy as np
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, GAP, LATENCY, LIMIT, OWN_LATENCY, SPEED, Floats
-from ethbrake_marl.worlds.rules import CAR_ROWS, RULES
+from ethbrake_marl.worlds.quantities import CAR_ROWS, QUANTITIES
 
 OF_LINE = {"speeds_mps": SPEED, "gaps_m": GAP}
-OF_CAR = {key: row for key, row in CAR_ROWS.items() if key not in ("speed_limit_mps", "harm_weight")}
-QUANTITIES = (*OF_CAR, *OF_LINE)
+OF_CAR = {key: row for key, row in CAR_ROWS.items() if key not in ("speed_limit_mps", "harm_weight", "restitution")}
+UNCERTAIN = (*OF_CAR, *OF_LINE)
 MOST_CORNERS = 1024  # of one world; each takes as much time as the world itself
 EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
 ENTRY = re.compile(
@@ -88,7 +88,7 @@ class Uncertainty(NamedTuple):
         """
         sides = []
         for interval in self.intervals:
-            key, rule, bodies = interval.quantity, RULES[interval.quantity], alert.vehicles
+            key, rule, bodies = interval.quantity, QUANTITIES[interval.quantity], alert.vehicles
             last = rule.count(bodies)
             if interval.number is not None and interval.number > last:
                 raise InvalidInput(
@@ -160,9 +160,9 @@ def parse_uncertainty(text: object) -> Uncertainty:
         if match is None or NUMBER.fullmatch(match["width"]) is None:
             raise InvalidInput(f"uncertainty: {entry!r}: {form}")
         name, width, share = match["name"], float(match["width"]), bool(match["share"])
-        if name not in QUANTITIES:
-            raise unknown_name("uncertain quantity", name, QUANTITIES)
-        if match["what"] not in (None, RULES[name].per):
+        if name not in UNCERTAIN:
+            raise unknown_name("uncertain quantity", name, UNCERTAIN)
+        if match["what"] not in (None, QUANTITIES[name].per):
             right = "only gaps_m may name a pair; other quantities may name a vehicle, as in mass_t.vehicle_2"
             raise InvalidInput(f"uncertainty: {entry!r}: {right}")
         if not width < (100.0 if share else math.inf):

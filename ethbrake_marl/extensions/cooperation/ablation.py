@@ -179,7 +179,7 @@ def minimised(declared: Declared, count: str, game: Game, alert: State, last: St
     A measure, once the first two arguments are given; ``alert`` is unused.
     """
     each = amounts(objectives_of(declared, last.vehicles), None, last, count)
-    return np.asarray(each[:, game.rules.learners - 1].mean(axis=1))
+    return np.asarray(each[:, game.settings.learners - 1].mean(axis=1))
 
 
 class Answer(NamedTuple):

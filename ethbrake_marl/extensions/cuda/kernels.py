@@ -51,7 +51,7 @@ class Ruling(NamedTuple):
     time_step_s: Any
     harm: Any
     terminal: Any
-    counting: Any  # [6]
+    weights: Any  # [6]
 
 
 class Looking(NamedTuple):
@@ -123,12 +123,12 @@ def save(t, stored, mine, is_new):
 
 
 @large
-def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
+def play(t, mine, stored, pool, following, actions, results, settings, view, mode):
     """Advance world t by one step, or begin or only observe its episode, as ``mode`` says; then observe it.
 
     ``mine`` is the memory of this thread. ``stored`` has the running episodes, ``pool`` the worlds from which they
     begin; ``following`` [n] is the world of the pool in which each next episode begins. ``actions`` [n, L] float32 are
-    clipped to [-1, 1]. If one of them is NaN, nothing moves and ``results.status`` says so. ``rules``: a ``Ruling``.
+    clipped to [-1, 1]. If one of them is NaN, nothing moves and ``results.status`` says so. ``settings``: a ``Ruling``.
     ``view``: a ``Looking``.
     """
     load(t, stored, mine)
@@ -140,7 +140,7 @@ def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
             mine.actions[0, j] = 1.0 if action > 1.0 else (-1.0 if action < -1.0 else action)
         refused, failed = step_worlds(
             mine.line, mine.car, mine.clock, mine.wanted, mine.actions, mine.scratch, mine.out, mine.reward,
-            rules.learners, rules.time_step_s, rules.harm, rules.terminal, rules.counting,
+            settings.learners, settings.time_step_s, settings.harm, settings.terminal, settings.weights,
         )  # fmt: skip
         for row in range(mine.out.shape[0]):
             results.out[row, t] = mine.out[row, 0] if refused < 0 else 0.0
@@ -156,8 +156,8 @@ def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
     if mode != LOOK:
         save(t, stored, mine, is_new)
     observe_worlds(
-        mine.line, mine.car, mine.clock, mine.know, rules.learners, view.offsets, view.role, view.obstacle, view.places,
-        view.scaling, mine.value, mine.seen,
+        mine.line, mine.car, mine.clock, mine.know, settings.learners, view.offsets, view.role, view.obstacle,
+        view.places, view.scaling, mine.value, mine.seen,
     )  # fmt: skip
     for j in range(mine.seen.shape[1]):
         for f in range(mine.seen.shape[2]):
@@ -165,6 +165,6 @@ def play(t, mine, stored, pool, following, actions, results, rules, view, mode):
 
 
 @large
-def play_each(mine, stored, pool, following, actions, results, rules, view, mode, n):
+def play_each(mine, stored, pool, following, actions, results, settings, view, mode, n):
     for t in range(n):
-        play(t, mine, stored, pool, following, actions, results, rules, view, mode)
+        play(t, mine, stored, pool, following, actions, results, settings, view, mode)

@@ -18,7 +18,7 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
     line, car, clock, know, wanted, proposed, scratch, out, rewards, value, seen = shapes
 
     def play_worlds(
-        stored: Any, pool: Any, following: Any, actions: Any, results: Any, rules: Any, view: Any, mode: Any, n: Any
+        stored: Any, pool: Any, following: Any, actions: Any, results: Any, settings: Any, view: Any, mode: Any, n: Any
     ) -> None:
         t = cuda.grid(1)
         if t < n:
@@ -35,6 +35,6 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
                 cuda.local.array(value, float64),
                 cuda.local.array(seen, float32),
             )
-            play(t, mine, stored, pool, following, actions, results, rules, view, mode)
+            play(t, mine, stored, pool, following, actions, results, settings, view, mode)
 
     return play_worlds

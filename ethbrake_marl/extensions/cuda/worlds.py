@@ -99,9 +99,9 @@ class Worlds:
             worlds = self.game.draw(pool, seed, 0)
         first = self.game.reset(worlds)
         self.longest = int(first.clock[:, LAST].max())  # decisions of the longest episode
-        self.view = self.game.views[int(self.game.rules.learners[0])]
-        self.rules, self.looking, self.kernel = kernel_of(self.game, first.vehicles + 1, self.device)
-        L, F = len(self.game.rules.learners), len(self.view.names)
+        self.view = self.game.views[int(self.game.settings.learners[0])]
+        self.settings, self.looking, self.kernel = kernel_of(self.game, first.vehicles + 1, self.device)
+        L, F = len(self.game.settings.learners), len(self.view.names)
         with enough_memory(f"n = {n} worlds, and a pool of {first.n}, on device {str(self.device)!r}"):
             self.pool = self.stored(first)
             self.now = Stored(*(self._zeros(*each.shape[:-1], n) for each in self.pool))
@@ -171,7 +171,7 @@ class Worlds:
         return self.observations
 
     def arguments(self, actions: Tensor, mode: int) -> tuple[Any, ...]:
-        return self.now, self.pool, self.following, actions, self.results, self.rules, self.looking, mode
+        return self.now, self.pool, self.following, actions, self.results, self.settings, self.looking, mode
 
     def _launch(self, actions: Tensor, mode: int) -> None:
         self.kernel.launch(self.device, self.n, *self.arguments(actions, mode))
@@ -194,7 +194,7 @@ class Worlds:
             raise InvalidInput(f"actions: an action of row {row} is no number; nothing has moved in this world")
         assert status[row] == PHYSICS_FAILED
         state = self.state()
-        raise failure(state, row, state.time_s[row], self.game.rules.horizon_s)
+        raise failure(state, row, state.time_s[row], self.game.settings.horizon_s)
 
 
 def check_runs(game: Game) -> None:
@@ -213,7 +213,7 @@ def check_runs(game: Game) -> None:
         )
     if game.shield is not None:
         raise InvalidInput(f"{what}: has a shield, which runs on a processor only; train without it, then shield")
-    if not len(game.rules.learners):
+    if not len(game.settings.learners):
         raise InvalidInput(f"{what}: has no learner; make a vehicle one: learners=['vehicle_2']")
     if not game.rewarding.is_compiled:
         parts = [WHOSE.get(name, name) for name, *_ in game.rewarding.terms]
@@ -222,7 +222,7 @@ def check_runs(game: Game) -> None:
             f"{what}: the reward has {', '.join(parts) or 'components'}; the terms harm (of the whole line, in any"
             " count) and terminal run there"
         )
-    views = {game.views[i] for i in game.rules.learners.tolist()}
+    views = {game.views[i] for i in game.settings.learners.tolist()}
     if len(views) > 1:
         raise InvalidInput(f"{what}: its learners observe different features; give all of them the same observation")
     (view,) = views
@@ -237,10 +237,14 @@ def check_runs(game: Game) -> None:
 def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Looking, Kernel]:
     """Return the kernel ``play`` and its constant arguments. ``bodies``: number of bodies, vehicles and obstacle."""
     on = partial(torch.tensor, device=device)
-    rules, plan = game.rules, game.views[int(game.rules.learners[0])].plan
+    settings, plan = game.settings, game.views[int(game.settings.learners[0])].plan
     ruling = Ruling(
-        on(rules.learners), float(rules.time_step_s), float(rules.harm), float(rules.terminal), on(rules.counting)
+        on(settings.learners),
+        float(settings.time_step_s),
+        float(settings.harm),
+        float(settings.terminal),
+        on(settings.weights),
     )
     looking = Looking(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
-    size = bodies, len(rules.learners), plan.scaling.shape[1], len(plan.offsets)
+    size = bodies, len(settings.learners), plan.scaling.shape[1], len(plan.offsets)
     return ruling, looking, Kernel(size, memory_of(*size))

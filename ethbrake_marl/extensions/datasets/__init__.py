@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team, play, to_action
+from ethbrake_marl.agents.drive import Team, play
+from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import NUMBER, State
@@ -70,7 +71,7 @@ def to_parquet(
         for name, team in teams.items():
             for first in range(0, episodes, AT_ONCE):
                 alert = loaded.sample(min(AT_ONCE, episodes - first), seed, first=first)
-                rows = list(decisions(game, alert, actions_of(team, game, alert)))
+                rows = list(decisions(game, alert, rounded_actions(team, game, alert)))
                 columns = {column: np.concatenate([each[column] for each in rows]) for column in rows[0]}
                 order = np.argsort(columns["world"], kind="stable")  # one episode after the other
                 table = {"agent": np.full(len(order), name)} | {key: values[order] for key, values in columns.items()}
@@ -84,11 +85,11 @@ def to_parquet(
                 writer.write_table(following)
 
 
-def actions_of(team: Team, game: Game, alert: State) -> list[Observations]:
+def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
     """Simulate a team in n worlds; return its L learners' commands as actions, one array [n, L] for each decision."""
-    learners = game.rules.learners.tolist()
+    learners = game.settings.learners
     return [
-        np.stack([to_action(state, body, state.wanted[:, body]) for body in learners], axis=1, dtype=np.float32)
+        actions_of(state, learners, state.wanted[:, learners]).astype(np.float32)
         for step, state in play(game, alert, team)
         if step is not None
     ]
@@ -99,9 +100,9 @@ def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator
 
     The learners take ``actions``; after the last of these they repeat it.
     """
-    state, learners = game.reset(alert), game.rules.learners.tolist()
+    state, learners = game.reset(alert), game.settings.learners.tolist()
     while not state.ended.all():
-        rows, seen = ~state.ended, game.observe(state, game.rules.learners)
+        rows, seen = ~state.ended, game.observe(state, game.settings.learners)
         t = int(state.steps.max())
         action = actions[min(t, len(actions) - 1)]
         after, step = game.step(state, action.astype(np.float64))

@@ -18,7 +18,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
-from ethbrake_marl.motion.layout import BRAKING, DRIVING, FAR_M, FORCE, GAP, SPEED, Bools, Floats
+from ethbrake_marl.motion.layout import FAR_M, FORCE, GAP, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 
 TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap
@@ -231,7 +231,7 @@ class Controller:
         self.name, self.law, self.parameters, self.step_s = name, law, Parameters(**parameters), step_s
 
     def check(self, game: Game, body: int) -> None:
-        step_s = game.rules.time_step_s
+        step_s = game.settings.time_step_s
         if not math.isclose(step_s, self.step_s):
             raise InvalidInput(
                 f"agent {self.name!r} was made for decisions every {self.step_s:g} s, but scenario {game.name!r} has"
@@ -252,7 +252,8 @@ class Controller:
             elapsed, perceiving = state.time_s - memory + SAME_S, getattr(p, "perception", 0.0)
             waiting = np.where(elapsed < perceiving, 0.0, np.minimum(seen.own_mps2, -getattr(p, "release", 0.0)))
             command = np.where(elapsed < perceiving + p.reaction, waiting, command)
-        return np.clip(command, -state.car[:, BRAKING, body], state.car[:, DRIVING, body]), memory
+        braking, driving = state.braking_capacity_mps2, state.driving_capacity_mps2
+        return np.clip(command, -braking[:, body - 1], driving[:, body - 1]), memory
 
 
 def make_controller(argument: str | None, settings: Any) -> Controller:

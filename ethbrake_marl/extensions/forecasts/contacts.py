@@ -13,16 +13,17 @@ import math
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import command_of
 from ethbrake_marl.episode.features import Feature
 from ethbrake_marl.episode.state import TIME, State, check_exact
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import FAILED, MET, drive
+from ethbrake_marl.motion.forces import capacity
+from ethbrake_marl.motion.interval import FAILED, MET, move_line
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
     CAR_ROWS,
-    DRIVING,
     FAR_M,
     FORCE,
     GAP,
@@ -44,7 +45,9 @@ from ethbrake_marl.registry import Part
 FORECAST_S = 10.0
 COMMANDS = {"brake": "full braking", "coast": "coasting", "drive": "full driving"}
 SIDES = {"front": "the vehicle ahead", "rear": "the vehicle behind"}
-PER_COMMAND = 10  # features of `contact` for each command
+# places of the features of `contact` for one command: those of an impact, for each side, then the harm
+IMPACT_TIME, IMPACT_CLOSING, IMPACT_FRACTION, IMPACT_STEPS, PER_SIDE = range(5)
+FIRST_HARM, TOTAL_HARM, PER_COMMAND = 2 * PER_SIDE, 2 * PER_SIDE + 1, 2 * PER_SIDE + 2
 FAR_PER_COMMAND = 4  # features of `contact_far`
 
 
@@ -102,9 +105,9 @@ def known_line(line, car, know, time, i, known, parameters, commands):
         parameters[LATENCY, j], commands[j] = 0.0, force if inside else 0.0
         if j == i or force == 0.0:
             parameters[LATENCY, j] = max(car[OWN_LATENCY, j] - time, 0.0)
-            commands[j] = -car[BRAKING, j] if inside else 0.0
+            commands[j] = -capacity(car, BRAKING, j, time) if inside else 0.0
         elif inside and force < 0.0 and car[BRAKE_RATE, j] < math.inf:
-            commands[j] = -car[BRAKING, j]
+            commands[j] = -capacity(car, BRAKING, j, time)
     if first == 1 and line[GAP, 0] < FAR_M:
         known[GAP, 0], first = line[GAP, 0], 0
     return first, last
@@ -127,15 +130,16 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 for row in range(LINE_ROWS):
                     for j in range(here.shape[1]):
                         here[row, j] = known[row, j]
-                commands[i] = -car[k, BRAKING, i] if c == 0 else car[k, DRIVING, i] if c == 2 else 0.0
-                met = drive(here, parameters, commands, scratch, 0.0, FORECAST_S)
+                commands[i] = command_of(car[k], i, c - 1.0, clock[k, TIME])
+                met = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
                 if met == FAILED:
                     failed = k
                 value = out[k, o, c * PER_COMMAND : (c + 1) * PER_COMMAND]
                 write_features(scratch, met == MET, i, first, last, time_step_s, value)
                 far = near + c * FAR_PER_COMMAND
-                out[k, o, far], out[k, o, far + 1] = value[0], value[4]
-                out[k, o, far + 2], out[k, o, far + 3] = math.sqrt(value[8]), math.sqrt(value[9])
+                out[k, o, far], out[k, o, far + 1] = value[IMPACT_TIME], value[PER_SIDE + IMPACT_TIME]
+                out[k, o, far + 2] = math.sqrt(value[FIRST_HARM])
+                out[k, o, far + 3] = math.sqrt(value[TOTAL_HARM])
     return failed
 
 
@@ -147,22 +151,21 @@ def write_features(scratch, met, i, first, last, time_step_s, value):
     impact exactly at the end of a time step belongs to this step, as in the episode.
     """
     for side in range(2):
-        p, at = i - 1 + side, 4 * side
-        for f in range(4):
-            value[at + f] = 0.0
+        p, impact = i - 1 + side, value[side * PER_SIDE : (side + 1) * PER_SIDE]
+        impact[:] = 0.0
         if first <= p < last:
             time = scratch[NEXT_TIME, p] if met else math.inf
             hit = time < math.inf
             steps = (time if hit else FORECAST_S) / time_step_s
             whole = max(math.ceil(steps) - 1.0, 0.0)
-            value[at] = time if hit else FORECAST_S
-            value[at + 1] = scratch[NEXT_CLOSING, p] if hit else 0.0
-            value[at + 2] = steps - whole if hit else 0.0
-            value[at + 3] = whole
-    value[8] = value[9] = 0.0
+            impact[IMPACT_TIME] = time if hit else FORECAST_S
+            impact[IMPACT_CLOSING] = scratch[NEXT_CLOSING, p] if hit else 0.0
+            impact[IMPACT_FRACTION] = steps - whole if hit else 0.0
+            impact[IMPACT_STEPS] = whole
+    value[FIRST_HARM] = value[TOTAL_HARM] = 0.0
     for p in range(first, last if met else first):
-        value[8] += scratch[NEW_FIRST, p]
-        value[9] += scratch[NEW_TOTAL, p]
+        value[FIRST_HARM] += scratch[NEW_FIRST, p]
+        value[TOTAL_HARM] += scratch[NEW_TOTAL, p]
 
 
 def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:

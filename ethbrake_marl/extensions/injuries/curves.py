@@ -9,9 +9,9 @@ import numpy as np
 
 from ethbrake_marl.episode.objectives import Harm
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import driven_again
+from ethbrake_marl.evaluation.resimulation import simulate_again
 from ethbrake_marl.motion.elementary import exp_each, log_each, logistic
-from ethbrake_marl.motion.layout import COUNT, FRONT_CHANGE, MASS, REAR_CHANGE, RESTITUTION, Floats
+from ethbrake_marl.motion.layout import FRONT_CHANGE, IMPACTS, MASS, REAR_CHANGE, RESTITUTION, Floats
 from ethbrake_marl.registry import Part
 
 
@@ -79,8 +79,8 @@ def speed_changes(before: State, after: State) -> Floats:
     There must be no decision between the states. Pushing in contact is not an impact.
     """
     out = np.zeros((after.n, 2, after.vehicles))
-    struck = np.asarray((after.line[:, COUNT] > before.line[:, COUNT]).any(axis=1))
-    for k, scratch in driven_again(before, after, struck):
+    struck = np.asarray((after.line[:, IMPACTS] > before.line[:, IMPACTS]).any(axis=1))
+    for k, scratch in simulate_again(before, after, struck):
         out[k] = scratch[[FRONT_CHANGE, REAR_CHANGE], 1:]
     return out
 

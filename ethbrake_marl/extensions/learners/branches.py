@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.counts import beside_harm
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations
 from ethbrake_marl.episode.state import TIME, State
-from ethbrake_marl.episode.step import beside_harm
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import FORCE, GAP, HIT, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
@@ -47,7 +47,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
     ``decide``: returns the learners' actions at a ``Moment``. ``gamma``: discount per step. If harm is the reward's
     only term, an episode also ends, after ``at_least`` steps, when no vehicle will ever move again.
     """
-    learners, only_harm = game.rules.learners, set(game.rewarding.counted) <= {"harm"}
+    learners, only_harm = game.settings.learners, set(game.rewarding.counted) <= {"harm"}
     gained, over = np.zeros((state.n, len(learners))), state.ended
     rows, ended, last = np.flatnonzero(~over), [np.flatnonzero(over)], [state.take(over)]
     now, discount, number = state.take(rows), 1.0, 0
@@ -56,7 +56,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
         gained[rows] += discount * step.reward[:, learners - 1]
         over = after.ended
         if only_harm and number >= at_least:
-            over |= stands_for_good(now, after, game.rules.counting)
+            over |= stands_for_good(now, after, game.settings.weights)
         if over.any():
             ended.append(rows[over])
             last.append(after.take(over))
@@ -65,27 +65,27 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
     return gained, State.join(last).take(np.argsort(np.concatenate(ended)))
 
 
-def stands_for_good(before: State, after: State, count: Floats) -> Bools:
+def stands_for_good(before: State, after: State, weights: Floats) -> Bools:
     """Return in which worlds all vehicles stand and will never move again, if actions depend only on observations, [n].
 
-    There nothing has changed in this step, and no vehicle waits for its latency or for news. ``count`` [6] are the
-    weights of what counts as harm: a vehicle that presses against a standing one can still push it. Always False if
+    There nothing has changed in this step, and no vehicle waits for its latency or for news. ``weights`` [6] are
+    those of what counts as harm: a vehicle that presses against a standing one can still push it. Always False if
     scripts, messages or a shield have a memory.
     """
     out = np.zeros(after.n, np.bool_)
     if not after.memories:
-        find_standing(before.line, after.line, after.car, after.know, before.clock, count, out)
+        find_standing(before.line, after.line, after.car, after.know, before.clock, weights, out)
     return out
 
 
 @large
 def find_standing(
-    before: Floats, line: Floats, car: Floats, know: Floats, clock: Floats, count: Floats, out: Bools
+    before: Floats, line: Floats, car: Floats, know: Floats, clock: Floats, weights: Floats, out: Bools
 ) -> None:
     bodies = line.shape[2]
     for k in range(len(out)):
         time = clock[k, TIME]
-        grown = beside_harm(line[k], count) - beside_harm(before[k], count)
+        grown = beside_harm(line[k], weights) - beside_harm(before[k], weights)
         stands = grown == 0.0
         for i in range(bodies):
             stands = stands and before[k, SPEED, i] == 0.0 and line[k, SPEED, i] == 0.0

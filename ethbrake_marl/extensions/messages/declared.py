@@ -25,7 +25,7 @@ from ethbrake_marl.files.model import UNSHOWN, require, suggestion
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.worlds.channel import PER_LINK, V2X
 from ethbrake_marl.worlds.counters import Numbers
-from ethbrake_marl.worlds.rules import NEWS, OF_WORLD
+from ethbrake_marl.worlds.quantities import NEWS, OF_WORLD
 from ethbrake_marl.worlds.scenario import Scenario
 
 LATER_LOSSES = (5,)  # stream of the numbers that decide which messages after the first are lost

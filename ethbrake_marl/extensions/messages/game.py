@@ -59,7 +59,7 @@ class GameWithMessages(Game):
         state = super().first_decision(alert)
         if not state.memories[NAME].is_periodic:
             return state
-        return _remembering(state, begin(alert, state.time_s, self.rules.time_step_s))
+        return _remembering(state, begin(alert, state.time_s, self.settings.time_step_s))
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         after, step = super().follow(state, actions)

@@ -16,8 +16,8 @@ import numpy as np
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import solo
 from ethbrake_marl.motion.forces import ROUNDING_S
+from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     FAR_M,

@@ -35,9 +35,9 @@ from ethbrake_marl.extensions.proofs.line import (
 from ethbrake_marl.extensions.proofs.plans import braking, time_to_limit, walk
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.motion.drive import solo
 from ethbrake_marl.motion.forces import stopping_distances
 from ethbrake_marl.motion.impact import TOUCH_MPS
+from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, LATENCY, RELEASE_RATE, Bools, Floats, Ints
 
 ROUNDING_M = 1e-12  # a smaller overlap is a rounding error at gap 0, not an impact

@@ -13,8 +13,9 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.compiling import kernel
-from ethbrake_marl.motion.drive import solo
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.impact import TOUCH_MPS
+from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, FAR_M, GAP, LATENCY, LIMIT, MASS, SPEED, Floats
 
 GAP_L, V_L, A_L, ONSET_L = range(4)  # gap to the front vehicle (m); ONSET: time from which a vehicle may act (s)
@@ -63,13 +64,14 @@ def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
     line, car, at = state.line, state.car, np.zeros((state.n, COLUMNS))
     onset = np.maximum(car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0)
     at[:, [GAP_L, GAP_R]] = FAR_M
-    at[:, [V_F, A_F, U_F]] = np.stack([line[:, SPEED, body], car[:, BRAKING, body], car[:, DRIVING, body]], axis=1)
+    braking, driving = (capacities(car, row, state.time_s) for row in (BRAKING, DRIVING))
+    at[:, [V_F, A_F, U_F]] = np.stack([line[:, SPEED, body], braking[:, body], driving[:, body]], axis=1)
     at[:, LIMIT_F], at[:, ONSET_F] = car[:, LIMIT, body], onset[:, body]
     at[:, BOUNCE], at[:, TIME_STEP] = state.restitution, time_step_s
     sides = [(body - 1, body - 1, GAP_L, FRONT_SHARE), (body + 1, body, GAP_R, REAR_SHARE)]
     for other, pair, first, share in sides:
         if 1 <= other <= state.vehicles:
-            columns = line[:, GAP, pair], line[:, SPEED, other], car[:, BRAKING, other], onset[:, other]
+            columns = line[:, GAP, pair], line[:, SPEED, other], braking[:, other], onset[:, other]
             at[:, first : first + 4] = np.stack(columns, axis=1)
             at[:, share] = car[:, MASS, other] / (car[:, MASS, other] + car[:, MASS, body])
     return at

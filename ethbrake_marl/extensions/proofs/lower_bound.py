@@ -55,7 +55,7 @@ from ethbrake_marl.extensions.proofs.meetings import (
 )
 from ethbrake_marl.extensions.proofs.plans import braking, walk
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import solo
+from ethbrake_marl.motion.interval import solo
 from ethbrake_marl.motion.layout import LIMIT, Bools, Floats
 
 LEAST_TIME_STEP_S = 1e-3  # shorter steps between decisions would take too long

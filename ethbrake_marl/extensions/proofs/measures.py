@@ -10,6 +10,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import LowerBound, lower_bound
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.registry import Part
 
@@ -32,10 +33,11 @@ def proven_harm(game: Game, alert: State, last: State) -> Given:
 
     ``impact``: whether the bound is above 0. The result is the same for every agent.
     """
-    body, rules = _controlled(game, alert), game.rules
-    asked = np.array([body, rules.horizon_s, rules.time_step_s]).tobytes() + alert.line.tobytes() + alert.car.tobytes()
+    body, settings = _controlled(game, alert), game.settings
+    ends = np.array([body, settings.horizon_s, settings.time_step_s])
+    asked = ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
     if asked not in _known:
-        bound = lower_bound(alert, body, horizon_s=rules.horizon_s, time_step_s=rules.time_step_s)
+        bound = lower_bound(alert, body, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s)
         _known.clear()
         _known[asked] = bound
     return {"": _known[asked].harm, "impact": _known[asked].impact_proven}
@@ -43,9 +45,9 @@ def proven_harm(game: Game, alert: State, last: State) -> Given:
 
 def _controlled(game: Game, alert: State, *, together: bool = False) -> int:
     """Return the controlled vehicle, or 2 for Vehicles 2 and 3 together. Raises ``InvalidInput`` for other learners."""
-    learners = game.rules.learners.tolist()
+    learners = game.settings.learners.tolist()
     others = [body for body in range(1, alert.vehicles + 1) if body not in learners]
-    if game.scripts or (alert.wanted[:, others] != -alert.car[:, BRAKING, others]).any():
+    if game.scripts or (alert.wanted[:, others] != -capacities(alert.car, BRAKING, alert.time_s)[:, others]).any():
         raise InvalidInput(
             "avoidable, proven_harm: a vehicle that does not learn does not brake fully; all others must"
         )

@@ -21,7 +21,7 @@ from ethbrake_marl.files.yaml import flow_text
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.explain import check_file_name
-from ethbrake_marl.worlds.rules import RECORDING, RULES
+from ethbrake_marl.worlds.quantities import QUANTITIES, RECORDING
 from ethbrake_marl.worlds.scenario import Scenario
 
 with naming_extras():
@@ -104,7 +104,7 @@ def scenario_from_data(
             f"based_on = {based_on!r}: the scenario must not be a mixture, and must not draw worlds from a table"
         )
     rows = read_rows(folder, entry, every_s, base.vehicles, progress)
-    rules = RULES["gaps_m"], RULES["speeds_mps"]
+    rules = QUANTITIES["gaps_m"], QUANTITIES["speeds_mps"]
     headings = [rule.column_of(i) for rule in rules for i in range(rule.count(base.vehicles))] + [RECORDING]
     table = [[*row, ": ".join(of)] for row, of in zip(rows.numbers.tolist(), rows.of, strict=True)]
     found = rows.found(base.vehicles, every_s)

@@ -12,11 +12,11 @@ from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.extensions.recorded.formats import HIGHD_META, Format
 from ethbrake_marl.extensions.recorded.reading import Cells, read_cells
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.worlds.rules import RULES
+from ethbrake_marl.worlds.quantities import QUANTITIES
 
 FASTEST_MPS, LONGEST_M = 75.0, 40.0  # largest speed (270 km/h) and length of a road vehicle
 
-FARTHEST_M = RULES["gaps_m"].high  # longest gap that a scenario may have
+FARTHEST_M = QUANTITIES["gaps_m"].high  # longest gap that a scenario may have
 
 # Range of the lengths of cars and vans (m), and the least share of such vehicles. Lengths in feet violate it.
 CAR_M, LEAST_CARS = (2.5, 8.0), 1 / 3

@@ -7,16 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ethbrake_marl.episode.commands import action_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.episode.step import advance_worlds
+from ethbrake_marl.evaluation.resimulation import advance_worlds
 from ethbrake_marl.motion.layout import (
-    BRAKING,
-    COUNT,
-    DRIVING,
     FAR_M,
     FIRST,
     GAP,
+    IMPACTS,
     LATENCY,
     NEXT_CLOSING,
     NEXT_TIME,
@@ -88,8 +87,7 @@ class Scene(NamedTuple):
 
     def share(self, body: int) -> float:
         """Return the command as a share of the capacity, -1 (brakes fully) to 1 (drives fully)."""
-        command = self.command(body)
-        return command / float(self.car[BRAKING if command < 0.0 else DRIVING, body]) if command else 0.0
+        return float(action_of(self.car, body, self.command(body), self.time_s))
 
     def said_of(self, body: int) -> str:
         """Return what a vehicle does, in words such as "brakes 3.0 m/s2"."""
@@ -149,13 +147,13 @@ class Motion:
         """Return line, place of Vehicle 1 and recent impacts at a time of this motion (s after the alert)."""
         line = self.line.copy()
         line[GAP, 0] = ahead_m = min(line[GAP, 0], POST_M)
-        counts, scratch = line[COUNT].copy(), scratch_for(len(self.wanted))
+        counts, scratch = line[IMPACTS].copy(), scratch_for(len(self.wanted))
         times = np.array([self.start_s]), np.array([time_s])
         if time_s > self.start_s:
             advance_worlds(line[np.newaxis], self.car[np.newaxis], *times, self.wanted[np.newaxis], scratch)
         new = [
             Impact(int(p), float(scratch[NEXT_CLOSING, p]), self.start_s + float(scratch[NEXT_TIME, p]))
-            for p in np.flatnonzero(line[COUNT] > counts)
+            for p in np.flatnonzero(line[IMPACTS] > counts)
         ]
         recent = tuple(impact for impact in (*self.impacts, *new) if impact.time_s > time_s - FLASH_S)
         front_m = self.front_m + float(ahead_m - line[GAP, 0])
@@ -165,7 +163,7 @@ class Motion:
 
     def scene(self, time_s: float) -> Scene:
         line, front_m, impacts = self.at(time_s)
-        learners, ended = tuple(map(int, self.game.rules.learners)), self.ended and time_s == self.until_s
+        learners, ended = tuple(map(int, self.game.settings.learners)), self.ended and time_s == self.until_s
         return Scene(
             self.game.name, learners, ended, time_s, line, self.car, self.wanted, front_m, impacts, self.road_m
         )

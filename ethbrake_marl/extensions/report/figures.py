@@ -14,7 +14,7 @@ from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, PercentF
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise, predicted_harm
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
-from ethbrake_marl.episode.play import hold
+from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.evaluation.captions import caption, ranges_of
@@ -41,11 +41,12 @@ from ethbrake_marl.extensions.report.style import (
     write_picture,
 )
 from ethbrake_marl.files.sheet import Estimate
+from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING, LATENCY, Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.describe import quantities_of
 from ethbrake_marl.worlds.game import AnyScenario
-from ethbrake_marl.worlds.rules import RULES, Rule
+from ethbrake_marl.worlds.quantities import QUANTITIES, Rule
 from ethbrake_marl.worlds.sampling import Drawn
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -200,7 +201,7 @@ def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float)
 
     Rows: first-impact harm predicted by the paper's closed form, and simulated first-impact and total harm.
     """
-    braking, wait = np.ascontiguousarray(world.car[0, BRAKING]), world.car[0, LATENCY].copy()
+    braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING, world.time_s)[0]), world.car[0, LATENCY].copy()
     priced: Any = predicted_harm
     predicted = [priced(world.line[0], braking, wait, body, float(a)) for a in at]
     return np.stack([predicted, *hold(world, world.wanted, [body], -at[None, :, None], horizon_s, "first")[:, 0]])
@@ -225,7 +226,7 @@ def deceleration_figure(
         )
     (body,), horizon_s = loaded.learners, loaded.horizon_s
     chosen = float(pairwise(world, body).deceleration_mps2[0])
-    at = np.union1d(np.linspace(0.0, world.car[0, BRAKING, body], DECELERATION_POINTS), [chosen])
+    at = np.union1d(np.linspace(0.0, world.braking_capacity_mps2[0, body - 1], DECELERATION_POINTS), [chosen])
     predicted, first, total = harm_of_decelerations(world, body, at, horizon_s)
     place = int(np.searchsorted(at, chosen))
     figure, (axes,) = new_panels((8.0, 4.9))
@@ -383,7 +384,7 @@ def worlds_figure(scenario: Scenario, drawn: Drawn, *, seed: int) -> Figure:
 
 def _varying(drawn: Drawn) -> dict[Rule, dict[int, Floats]]:
     columns, varying = quantities_of(drawn.worlds, drawn.friction), dict[Rule, dict[int, Floats]]()
-    for rule in (rule for rule in RULES.values() if rule.column):
+    for rule in (rule for rule in QUANTITIES.values() if rule.column):
         for i in range(rule.count(drawn.worlds.vehicles)):
             values = columns.get(rule.column_of(i))
             if values is not None and np.nanmin(values) < np.nanmax(values):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import RULES
+from ethbrake_marl.episode.counts import SHORT_NAMES
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import curves_figure, over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
@@ -93,7 +93,7 @@ def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
     scenario, recipe = eb.load_scenario(plan.scenario), eb.load_recipe(plan.recipe)
     if plan.mapped:
         scenario = scenario.replace(physics="paper-map")
-    reward = {**recipe.reward.model_dump(mode="json"), "harm_count": RULES["paper"]}
+    reward = {**recipe.reward.model_dump(mode="json"), "harm_count": SHORT_NAMES["paper"]}
     recipe = recipe.replace(reward=reward)
     result = eb.train(recipe, scenario, run, seed=seed, steps=plan.decisions, on_progress=settings.tell)
     return result.status == "finished"

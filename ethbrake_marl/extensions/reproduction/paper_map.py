@@ -33,20 +33,22 @@ from functools import partial
 import numpy as np
 
 from ethbrake_marl.episode import step as one_step
+from ethbrake_marl.episode.commands import check_actions, commands_of, proposal_array
+from ethbrake_marl.episode.counts import OF_FIRST, OF_PASSED, OF_TOTAL
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, PHYSICS, STEPS, TIME, State
-from ethbrake_marl.episode.step import COUNTED, HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
+from ethbrake_marl.episode.step import COST, HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
 from ethbrake_marl.episode.terms import pair_energies
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import UNSHOWN, require
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.layout import (
-    COUNT,
     FIRST,
     FORCE,
     GAP,
     HIT,
+    IMPACTS,
     LATENCY,
     LIMIT,
     MASS,
@@ -79,7 +81,7 @@ def exchange(line: Floats, car: Floats) -> None:
         harm = np.where(impact, closing * closing, 0.0)
         line[:, FIRST, p] += np.where(line[:, HIT, p] == 0.0, harm, 0.0)
         line[:, TOTAL, p] += harm
-        line[:, COUNT, p] += impact
+        line[:, IMPACTS, p] += impact
         line[:, HIT, p] = np.maximum(line[:, HIT, p], impact)
 
 
@@ -128,8 +130,7 @@ class MappedGame(Game):
                 f"scenario {self.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
                 " a scenario that has physics: paper-map"
             )
-        rules = self.rules
-        state = one_step.first_decision(alert, self.deciders, rules.time_step_s, rules.horizon_s, rules.most_steps)
+        state = one_step.first_decision(alert, self.deciders, self.settings)
         if state.collided.any():
             raise InvalidInput(
                 f"scenario {self.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
@@ -138,8 +139,8 @@ class MappedGame(Game):
         return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        before, rules = one_step.decided(self.rules, self.scripts, state, actions), self.rules
-        after, over = sample(before, rules.time_step_s), state.ended
+        before, settings = decided(self, state, actions), self.settings
+        after, over = sample(before, settings.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
         np.copyto(after.clock, before.clock, where=over[:, np.newaxis])
         last = after.clock[:, STEPS] >= after.clock[:, LAST]
@@ -150,10 +151,22 @@ class MappedGame(Game):
         ends = after.ended & ~over
         out[TERMINATED], out[TRUNCATED] = ends & after.at_rest, ends & ~after.at_rest
         out[SAFE_END] = ends & ~after.collided
-        out[COUNTED] = rules.counting[0] * out[HARM] + rules.counting[1] * out[TOTAL_HARM]
-        shared = rules.terminal * out[SAFE_END] - rules.harm * out[COUNTED]
+        out[COST] = settings.weights[OF_FIRST] * out[HARM] + settings.weights[OF_TOTAL] * out[TOTAL_HARM]
+        shared = settings.terminal * out[SAFE_END] - settings.harm * out[COST]
         reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)
-        return after, Step(reward, out, rules.time_step_s)
+        return after, Step(reward, out, settings.time_step_s)
+
+
+def decided(game: Game, state: State, actions: Floats | None) -> State:
+    """State with the commands of scripts and learners, as at the beginning of a step of a game."""
+    learners = game.settings.learners
+    given = proposal_array(learners, actions, state.n)
+    if np.isnan(given).any():
+        check_actions(learners, given[np.isnan(given).any(axis=1).argmax()])
+    state = one_step.scripted(game.scripts, state)
+    commands = commands_of(state, learners, given)
+    state.wanted[:, learners] = np.where(state.ended[:, np.newaxis], state.wanted[:, learners], commands)
+    return state
 
 
 class PaperMap:
@@ -166,7 +179,7 @@ class PaperMap:
     def game(self, game: Game) -> Game:
         """Return the game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
-        if game.rules.counting[2:].any() or counted:
+        if game.settings.weights[OF_PASSED:].any() or counted:
             what = f"the term {counted[0]}" if counted else "harm_count honest"
             raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
         terms = tuple(

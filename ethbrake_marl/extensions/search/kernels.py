@@ -17,8 +17,8 @@ from ethbrake_marl.episode.state import END, FIRST_DECISION, LAST
 from ethbrake_marl.episode.step import note_motion, stands
 from ethbrake_marl.extensions.search.pricing import UInt64s, worth
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import FAILED, drive
 from ethbrake_marl.motion.elementary import exp
+from ethbrake_marl.motion.interval import FAILED, move_line
 from ethbrake_marl.motion.layout import Floats, Ints
 
 OTHER_WEIGHT = 1e-8  # weight of the other count of harm in what is minimised: it decides ties
@@ -80,7 +80,7 @@ def value_of(world, line):
 
 
 @kernel
-def move_line(line, into):
+def copy_line(line, into):
     for row in range(line.shape[0]):
         for i in range(line.shape[1]):
             into[row, i] = line[row, i]
@@ -99,7 +99,7 @@ def follow(world, lines, ends, commands, phase, most):
     value = value_of(world, lines[phase])
     for p in range(phase, ends.shape[0]):
         step, at_rest, line = ends[p - 1] if p > 0 else 0, False, lines[p + 1]
-        move_line(lines[p], line)
+        copy_line(lines[p], line)
         if ends[p] > step:
             for b in range(world.bodies.shape[0]):
                 world.wanted[world.bodies[b]] = commands[p, b]
@@ -108,7 +108,7 @@ def follow(world, lines, ends, commands, phase, most):
                 step = step + 1 if numbers[STEPWISE] == 1.0 else ends[p]
                 until = clock[FIRST_DECISION] + step * numbers[TIME_STEP]
                 until = clock[END] if step >= clock[LAST] else until
-                if drive(line, world.car, world.wanted, world.scratch, start, until) == FAILED:
+                if move_line(line, world.car, world.wanted, world.scratch, start, until) == FAILED:
                     return value, -1
                 at_rest = stands(line, world.wanted)
                 if step >= clock[LAST]:
@@ -325,7 +325,7 @@ def improve(world, room, ends, commands, budget, drawing, least):
             if not apply_change(change, world.bounds, new_ends, new_commands):
                 spent += 1 if drawing[KIND] == PLAN else 0
                 continue
-        move_line(lines[phase], tried[phase])
+        copy_line(lines[phase], tried[phase])
         spent += 1
         new, reached = follow(world, tried, new_ends, new_commands, phase, value)
         if reached < 0 or not new < value:
@@ -335,7 +335,7 @@ def improve(world, room, ends, commands, budget, drawing, least):
         value, active = new, reached
         copy_profile(new_ends, new_commands, ends, commands)
         for p in range(phase + 1, reached + 1):
-            move_line(tried[p], lines[p])
+            copy_line(tried[p], lines[p])
         change[AMOUNT] *= 2.0
         again = spent > 0 and change[WHAT] != SET
     return value, active

@@ -14,14 +14,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, own_amount, pair_amount, weights_of
+from ethbrake_marl.episode.counts import COUNTS, amount_so_far, check_count, pair_amount, unshared_amount, weights_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, objectives_of
 from ethbrake_marl.episode.state import END, ENDED, FIRST_DECISION, LAST, STEPS, State, check_exact
 from ethbrake_marl.episode.step import advance, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.drive import FAILED
+from ethbrake_marl.motion.forces import capacities
+from ethbrake_marl.motion.interval import FAILED
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
@@ -144,8 +145,8 @@ class Problem(NamedTuple):
     @property
     def bounds(self) -> Floats:
         """Smallest and largest command of each controlled vehicle, [n, B, 2] m/s2."""
-        car = self.state.car[:, :, self.bodies]
-        return np.ascontiguousarray(np.stack([-car[:, BRAKING], car[:, DRIVING]], axis=2))
+        braking, driving = self.state.braking_capacity_mps2, self.state.driving_capacity_mps2
+        return np.ascontiguousarray(np.stack([-braking, driving], axis=2)[:, self.bodies - 1])
 
     def take(self, rows: Any) -> Problem:
         return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
@@ -259,7 +260,7 @@ def problem_of(
     """
     check_exact(alert, "a search for the best braking")
     check_count("count", count)
-    chosen = np.array(game.rules.learners if bodies is None else bodies, np.int64)
+    chosen = np.array(game.settings.learners if bodies is None else bodies, np.int64)
     if not len(chosen) or len(np.intersect1d(chosen, range(1, alert.vehicles + 1))) < len(chosen):
         raise InvalidInput(f"vehicles {chosen.tolist()}: must be one or more of 1 to {alert.vehicles}, each once")
     for body, script in game.scripts.items():
@@ -268,11 +269,11 @@ def problem_of(
                 f"scenario {game.name!r}: vehicle_{body} is driven by {getattr(script, 'name', script)!r}, whose"
                 " commands are not known at the alert; a search needs scripts that hold one command"
             )
-    wanted = with_braking(alert, game.rules.learners).wanted
+    wanted = with_braking(alert, game.settings.learners).wanted
     wanted[:, chosen] = 0.0
-    dt, horizon_s, most_steps = game.rules.time_step_s, game.rules.horizon_s, game.rules.most_steps
+    dt = game.settings.time_step_s
     decide = chosen if deciders is None else np.array(deciders, np.int64)
-    state = first_decision(alert._replace(wanted=wanted, memories={}), decide, dt, horizon_s, most_steps)
+    state = first_decision(alert._replace(wanted=wanted, memories={}), decide, game.settings)
     shares = np.zeros((alert.n, 3, wanted.shape[1]))
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST, END]]]
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack(times))
@@ -282,7 +283,7 @@ def problem_of(
 def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
     """Return worlds at the alert in which some vehicles brake fully, whatever their roles say."""
     wanted = alert.wanted.copy()
-    wanted[:, bodies] = -alert.car[:, BRAKING][:, bodies]
+    wanted[:, bodies] = -capacities(alert.car, BRAKING, alert.time_s)[:, bodies]
     return alert._replace(wanted=wanted)
 
 
@@ -360,10 +361,10 @@ def worth(line, shares, weights, aim):
     for i in range(line.shape[1]):
         borne = from_ahead
         if i < line.shape[1] - 1:
-            own = own_amount(line, i, weights)
-            shared = pair_amount(line, i, weights) - own
+            unshared = unshared_amount(line, i, weights)
+            shared = pair_amount(line, i, weights) - unshared
             borne += shares[0, i] * shared
-            from_ahead = shares[1, i] * shared + shares[2, i] * own
+            from_ahead = shares[1, i] * shared + shares[2, i] * unshared
         value = max(value, borne) if aim == LARGEST else value + borne
     return value
 

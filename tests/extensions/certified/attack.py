@@ -67,7 +67,7 @@ def attacked(game: Game, truth: State, shield: Any, count: str, way: str, seed: 
         if state.ended.all():
             break
         decisions += int((~state.ended).sum())
-        state, _ = game.step(state, propose((state.n, len(game.rules.learners))), donate=True)
+        state, _ = game.step(state, propose((state.n, len(game.settings.learners))), donate=True)
         memory = state.memories["shield"]
         rises, bound = rises + int((memory.price > bound)[memory.members.trusted].sum()), memory.price.copy()
     memory = state.memories["shield"]

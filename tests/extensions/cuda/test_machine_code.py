@@ -65,7 +65,7 @@ def test_code_that_has_been_made__needs_no_compiler(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize("name, capability", [("paper-random", (9, 0)), ("cooperation-4-five", (7, 5))])
 def test_machine_code__rounds_every_operation_as_a_processor_does(name: str, capability: tuple[int, int]) -> None:
     worlds = Worlds(name, 2, 4, "cpu")
-    given = device.like(worlds.arguments(torch.zeros(2, len(worlds.game.rules.learners)), 0))
+    given = device.like(worlds.arguments(torch.zeros(2, len(worlds.game.settings.learners)), 0))
     code = made(worlds.kernel.thread(), (*given, 0), capability)
     operations = set(re.findall(r"\b((?:fma|mul|add|sub|div|sqrt|rsqrt|rcp|ex2|lg2|sin|cos)\.[a-z.]*f\d\d)\b", code))
     allowed = {f"{name}.rn.{kind}" for name in ("mul", "add", "sub", "div", "sqrt") for kind in ("f32", "f64")}
@@ -74,7 +74,7 @@ def test_machine_code__rounds_every_operation_as_a_processor_does(name: str, cap
     entry = re.search(r"\.entry kernel\((.*?)\)", code, re.DOTALL)
     assert entry is not None
     kinds = [KINDS[kind] for kind in re.findall(r"\.param \.(\w+) ", entry[1])]
-    cells = device.cells_of((*worlds.arguments(torch.zeros(2, len(worlds.game.rules.learners)), 0), worlds.n))
+    cells = device.cells_of((*worlds.arguments(torch.zeros(2, len(worlds.game.settings.learners)), 0), worlds.n))
     assert kinds == [type(cell) for cell in cells]
 
 

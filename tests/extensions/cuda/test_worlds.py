@@ -45,16 +45,16 @@ def whole_episodes(name: str, n: int, device: str = "cpu") -> int:
     scenario, game = eb.open_game(name)
     alert = scenario.sample(n, seed=11)
     worlds, state, random = Worlds(name, n, alert, device), game.reset(alert), np.random.default_rng(3)
-    assert same(worlds.reset().cpu().numpy(), game.observe_alike(state, game.rules.learners))
+    assert same(worlds.reset().cpu().numpy(), game.observe_alike(state, game.settings.learners))
     decisions = 0
     while not state.ended.all():
         decisions += int((~state.ended).sum())
-        actions = random.random((n, len(game.rules.learners)), np.float32) * 2.0 - 1.0
+        actions = random.random((n, len(game.settings.learners)), np.float32) * 2.0 - 1.0
         state, step = game.step(state, actions.astype(np.float64))
         stepped = worlds.step(torch.from_numpy(actions).to(worlds.device), renew=False)
         assert same(worlds.results.out.cpu().numpy(), step.out)
         assert same(stepped.reward.cpu().numpy(), step.reward[:, 0])
-        assert same(stepped.observations.cpu().numpy(), game.observe_alike(state, game.rules.learners))
+        assert same(stepped.observations.cpu().numpy(), game.observe_alike(state, game.settings.learners))
         assert same_state(worlds.state(), state)
     worlds.check()
     return decisions
@@ -83,7 +83,7 @@ def test_an_episode_that_ends__is_replaced_by_the_next_world_of_the_pool() -> No
             where[row], following[row] = following[row], (following[row] + 2) % 5
             state = state.put([row], first.take([where[row]]))
         assert same_state(worlds.state(), state)
-        assert same(stepped.observations.numpy(), game.observe_alike(state, game.rules.learners))
+        assert same(stepped.observations.numpy(), game.observe_alike(state, game.settings.learners))
     assert where != [0, 1] and worlds.reset() is worlds.results.observations
     assert same_state(worlds.state(), first.take([0, 1]))
 

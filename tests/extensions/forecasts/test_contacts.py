@@ -12,7 +12,7 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.forecasts.contacts import FORECAST_S
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.motion.drive import MET
+from ethbrake_marl.motion.interval import MET
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.episode.lines import later, state_of
 from tests.motion.lines import driven

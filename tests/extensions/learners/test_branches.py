@@ -32,7 +32,7 @@ def test_play_on__is_the_episode_and_its_discounted_reward() -> None:
     game, state = begun(6, TEAM, reward={"harm": 1.0, "jerk": 0.01})
     kept, rewards, now = state.take(np.arange(6)), [], state
     while not now.ended.all():
-        seen = game.observe_alike(now, game.rules.learners)
+        seen = game.observe_alike(now, game.settings.learners)
         now, step = game.step(now, act(seen.reshape(12, -1)).astype(np.float64).reshape(6, 2))
         rewards.append(step.reward[:, 1:])
     gained, last = play_on(game, state, lambda at: at.ask(act), 0.9)

@@ -46,7 +46,7 @@ def test_measured_gradients__are_those_of_the_return_up_to_their_limit(limit: fl
     for offset in (1e-4, -1e-4):
         now, total = states.take([place // 2]), 0.0
         for number in range(200):
-            rows = game.observe_alike(now, game.rules.learners)[0]
+            rows = game.observe_alike(now, game.settings.learners)[0]
             actions = model.policy.act(rows).astype(np.float64)
             actions[place % 2] += offset if number < 2 else 0.0
             now, step = game.step(now, actions[np.newaxis])

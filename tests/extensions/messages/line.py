@@ -25,4 +25,4 @@ def seen_by(game: Game, state: State, body: int) -> dict[str, float]:
 
 
 def stepped(game: Game, state: State, action: float) -> State:
-    return game.step(state, np.full((state.n, len(game.rules.learners)), action))[0]
+    return game.step(state, np.full((state.n, len(game.settings.learners)), action))[0]

@@ -39,5 +39,5 @@ def test_observations__keep_their_bits(base: str, channel: str) -> None:
     digest = hashlib.sha256()
     for _ in range(15):
         digest.update(game.observe_alike(state, [1, 2, 3]).tobytes())
-        state, _ = game.step(state, rng.uniform(-1.0, 0.5, (60, len(game.rules.learners))))
+        state, _ = game.step(state, rng.uniform(-1.0, 0.5, (60, len(game.settings.learners))))
     assert digest.hexdigest()[:16] == DIGESTS[base, channel]

@@ -5,11 +5,11 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import advance_worlds
+from ethbrake_marl.evaluation.resimulation import advance_worlds
 from ethbrake_marl.extensions.proofs.avoidability import PROVEN_FOR, avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.motion.digest import physics_digest
-from ethbrake_marl.motion.layout import BRAKE_RATE, COUNT, GAP, LATENCY, RELEASE_RATE, SPEED, scratch_for
+from ethbrake_marl.motion.layout import BRAKE_RATE, GAP, IMPACTS, LATENCY, RELEASE_RATE, SPEED, scratch_for
 from tests.extensions.proofs.worlds import opening, paper_line, play, random_commands, wide_worlds, worlds
 from tests.reference.avoidability_lp import avoidable_by_lp
 from tests.refused import refused
@@ -118,7 +118,7 @@ def test_verdicts__of_shipped_lists(name):
 def impacts_of_witnesses(state, verdict, body=2):
     """Return how many impacts the witnesses of the avoidable worlds have in the physics."""
     good = verdict.avoidable
-    return play(state.take(good), body, verdict.switch_s[good], verdict.command_mps2[good]).line[:, COUNT].sum()
+    return play(state.take(good), body, verdict.switch_s[good], verdict.command_mps2[good]).line[:, IMPACTS].sum()
 
 
 @pytest.mark.parametrize(("vehicles", "body"), LINES)
@@ -143,7 +143,7 @@ def test_early__is_what_happens_in_the_physics_before_the_latency(vehicles, body
     line = state.line.copy()
     advance_worlds(line, state.car, state.time_s.copy(), until, wanted, scratch_for(vehicles + 1))
     early = avoidability(state, body).reason == 1
-    assert 0.01 < early.mean() < 0.5 and np.array_equal(early, line[:, COUNT].any(axis=1))
+    assert 0.01 < early.mean() < 0.5 and np.array_equal(early, line[:, IMPACTS].any(axis=1))
 
 
 def test_unavoidable__no_random_commands_avoid_an_impact():

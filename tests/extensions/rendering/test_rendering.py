@@ -80,7 +80,7 @@ def test_pictures__have_the_same_pixels_as_ever(scenario: str, pixels: str) -> N
     environment.reset(seed=3)
     digest = sha256(environment.render())
     while environment.agents:
-        environment.step({f"vehicle_{body}": [-0.4] for body in environment.game.rules.learners})
+        environment.step({f"vehicle_{body}": [-0.4] for body in environment.game.settings.learners})
         digest.update(environment.render())
     assert digest.hexdigest()[:12] == pixels
 

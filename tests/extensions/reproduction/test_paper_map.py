@@ -6,7 +6,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.extensions.reproduction.paper_map import collision, sample
-from ethbrake_marl.motion.layout import COUNT, GAP, HIT, LATENCY, SPEED
+from ethbrake_marl.motion.layout import GAP, HIT, IMPACTS, LATENCY, SPEED
 from ethbrake_marl.training.experiment import run_experiment
 from tests.refused import refused
 
@@ -29,7 +29,7 @@ def test_impact__by_hand() -> None:
     assert after.harm("first")[0] == after.harm("total")[0] == 100.0
     assert after.gaps_m[0].tolist() == pytest.approx([-0.5 + 0.1 * (16.05 - 15.05), 50.0 + 0.1 * (15.05 - 15.0)])
     again = sample(at_a_sample([-0.5, 50.0], [10.0, 9.0, 9.0]), 0.1)  # overlapping, but separating
-    assert not again.line[0, COUNT].any() and again.harm("total")[0] == 0.0
+    assert not again.line[0, IMPACTS].any() and again.harm("total")[0] == 0.0
 
 
 def test_impact__second_of_a_pair_is_total_harm_only_and_vehicles_stop_at_0() -> None:

@@ -108,7 +108,7 @@ def test_identity__is_of_everything_that_decides_the_harm_and_of_one_world_alone
         other[part][0, row, body] = 0.75 * before if 0.0 < before < 1e200 else 12.0
         seen.add(int(problem_of(game, other).identity[0]))
     seen |= {int(problem_of(game, alert, bodies).identity[0]) for bodies in ([3], [2, 3])}
-    seen.add(int(problem_of(game._replace(rules=game.rules._replace(horizon_s=7.0)), alert).identity[0]))
+    seen.add(int(problem_of(game._replace(settings=game.settings._replace(horizon_s=7.0)), alert).identity[0]))
     assert len(seen) == 10 and problem_of(game, alert.take([1])).identity == whole[1]
 
 

@@ -6,7 +6,17 @@ from typing import Any, NamedTuple
 
 from ethbrake_marl.files.model import UNITS, UNSHOWN, require
 from ethbrake_marl.files.yaml import YamlPath
-from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, DRIVING, LATENCY, LIMIT, MASS, RELEASE_RATE, WEIGHT
+from ethbrake_marl.motion.layout import (
+    BRAKE_RATE,
+    BRAKING,
+    DRIVING,
+    LATENCY,
+    LIMIT,
+    MASS,
+    RELEASE_RATE,
+    RESTITUTION,
+    WEIGHT,
+)
 from ethbrake_marl.worlds.quantity import DISTRIBUTIONS, support
 
 # A stream is an independent sequence of uniform random numbers, named by a tuple.
@@ -176,7 +186,7 @@ _OPTIONAL = (
     ),
 )  # fmt: skip
 
-RULES = {rule.key: rule for rule in (*_USUAL, *_OTHERWISE, *_OPTIONAL)}
+QUANTITIES = {rule.key: rule for rule in (*_USUAL, *_OTHERWISE, *_OPTIONAL)}
 USUAL = tuple(rule.key for rule in _USUAL)  # quantities that every world has
 OPTIONAL = tuple(rule.key for rule in _OPTIONAL)  # quantities that a world may lack
 ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstacle_gap_m": "obstacle_margin_m"}
@@ -192,6 +202,7 @@ CAR_ROWS = {
     "brake_rate_mps3": BRAKE_RATE,
     "release_rate_mps3": RELEASE_RATE,
     "harm_weight": WEIGHT,
+    "restitution": RESTITUTION,
 }  # rows of `State.car`
 
 
@@ -208,4 +219,4 @@ def check_count(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
 
 def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, Entry]:
     """Columns of a table with these quantities, such as ``{"gap_1_m": ("gaps_m", 0)}``."""
-    return {RULES[key].column_of(i): (key, i) for key in keys for i in range(RULES[key].count(vehicles))}
+    return {QUANTITIES[key].column_of(i): (key, i) for key in keys for i in range(QUANTITIES[key].count(vehicles))}

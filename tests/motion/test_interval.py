@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.motion.drive import FAILED, MET
 from ethbrake_marl.motion.forces import stopping_distances
+from ethbrake_marl.motion.interval import FAILED, MET
 from ethbrake_marl.motion.layout import Floats
 from tests.motion.lines import driven, lines
 
@@ -217,7 +217,7 @@ def run(line: Floats, car: Floats, command: Any, ends: list[float]) -> tuple[Flo
 
 @pytest.mark.parametrize("cut", [False, True])
 @pytest.mark.parametrize("name", CASES)
-def test_drive__by_hand(name: str, cut: bool) -> None:
+def test_interval__by_hand(name: str, cut: bool) -> None:
     (line, car), command, end, expected, shown = CASES[name]
     after, events = run(line, car, command, [*(np.arange(0.25, end, 0.25).tolist() if cut else []), end])
     assert {name: SHOWN[name](after) for name in shown} == shown
@@ -225,7 +225,7 @@ def test_drive__by_hand(name: str, cut: bool) -> None:
     of_pair = {p: [(time, closing) for time, q, closing in expected if q == p - 1] for p in pairs}
     first = {p: hits[:1] for p, hits in of_pair.items() if hits}
     assert {p: [(t, w) for t, q, w in events if q == p - 1][:1] for p in first} == first
-    assert after[at.COUNT, :-1].tolist() == [len(of_pair[p]) for p in pairs]
+    assert after[at.IMPACTS, :-1].tolist() == [len(of_pair[p]) for p in pairs]
     assert after[at.TOTAL, :-1].tolist() == [sum(w * w for _, w in of_pair[p]) for p in pairs]
     assert after[at.FIRST, :-1].tolist() == [of_pair[p][0][1] ** 2 if of_pair[p] else 0.0 for p in pairs]
 
@@ -252,7 +252,7 @@ def test_overlap__at_an_event_is_rounding_up_to_1e_9_m(gap: float, sound: bool) 
     # vehicle 1 leaves vehicle 2 with 1e-9 m/s; vehicle 3 meets them after 1 s, when 1e-9 m of the overlap are gone
     after, met, _ = driven(*lines([gap, 8.0], [1e-9, 0.0, 8.0]), 0.0, 0.0, 1.0)
     assert (met[0] == MET) == sound and (met[0] == FAILED) != sound
-    assert not sound or (after[0, at.COUNT, 1:3].tolist() == [0.0, 1.0] and (after[0, at.GAP, 1:3] == 0.0).all())
+    assert not sound or (after[0, at.IMPACTS, 1:3].tolist() == [0.0, 1.0] and (after[0, at.GAP, 1:3] == 0.0).all())
 
 
 @pytest.mark.parametrize(
@@ -268,7 +268,7 @@ def test_overlap__at_an_event_is_rounding_up_to_1e_9_m(gap: float, sound: bool) 
 )
 def test_pair__touches_up_to_1e_5_and_joins_below_5_cm_per_s(closing: float, count: int, apart: float) -> None:
     after, _ = run(*lines([0.0], [0.0, closing], restitution=0.5), 0.0, [0.0])
-    assert (after[at.COUNT, 1], after[at.TOTAL, 1], after[at.HIT, 1]) == (count, count * closing**2, count)
+    assert (after[at.IMPACTS, 1], after[at.TOTAL, 1], after[at.HIT, 1]) == (count, count * closing**2, count)
     front, rear = after[at.SPEED, 1:]
     assert front - rear == pytest.approx(apart, rel=1e-15) and front + rear == pytest.approx(closing, rel=1e-15)
 
@@ -281,11 +281,11 @@ def test_bounces__end_after_the_sum_of_their_flights(e: float) -> None:
         closing.append(closing[-1] * e)
     line, car = lines([0.0], [0.0, 8.0], mass_t=[2.0**50, 1.0], restitution=e)
     after, _ = run(line, car, [-16.0, 4.0], [60.0])
-    assert after[at.COUNT, 1] == len(closing)
+    assert after[at.IMPACTS, 1] == len(closing)
     assert after[at.TOTAL, 1] == pytest.approx(sum(w * w for w in closing), rel=1e-10)
     assert after[at.GAP, 1] == 0.0 and after[at.SPEED, 2] == pytest.approx(0.0, abs=1e-12)
     flights = sum(2.0 * w / 4.0 for w in closing[1:])  # just before their end it still flies
-    assert run(line, car, [-16.0, 4.0], [flights - 1e-3])[0][at.COUNT, 1] == len(closing) - 1
+    assert run(line, car, [-16.0, 4.0], [flights - 1e-3])[0][at.IMPACTS, 1] == len(closing) - 1
 
 
 @pytest.mark.parametrize(
@@ -313,7 +313,7 @@ def test_rattling__between_two_heavy_ones_conserves_momentum() -> None:
         line, _, _ = driven(line, car, commands, start, start + 0.01)
         momentum += 0.01 * np.array(mass) @ np.array(commands)
         assert np.array(mass) @ line[0, at.SPEED, 1:] == pytest.approx(momentum, rel=1e-12)
-    assert line[0, at.COUNT, 1:3].sum() == 363.0
+    assert line[0, at.IMPACTS, 1:3].sum() == 363.0
 
 
 def test_changes_of_speed__are_the_largest_of_one_impact_at_each_side() -> None:
@@ -349,7 +349,7 @@ def test_vehicles__that_brake_alike_keep_their_gap(rate: float) -> None:
     line, car = lines([0.0, 3.0], [20.0] * 3, **settings)
     for start, command in ((0.0, -7.0), (0.4, 2.0), (1.7, -9.0)):
         line, _, _ = driven(line, car, command, start, start + 1.3)
-    assert line[0, at.GAP, 1:3].tolist() == [0.0, 3.0] and not line[0, at.COUNT].any()
+    assert line[0, at.GAP, 1:3].tolist() == [0.0, 3.0] and not line[0, at.IMPACTS].any()
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,6 @@ from ethbrake_marl.motion.layout import (
     COMMAND,
     CONTACT_SPEED,
     CONTACT_TIME,
-    COUNT,
     DROVE,
     FAR_M,
     FIRST,
@@ -33,6 +32,7 @@ from ethbrake_marl.motion.layout import (
     GAP,
     HIGH,
     HIGH_JERK,
+    IMPACTS,
     JERK,
     JOINED,
     LAST_TIME,
@@ -41,8 +41,8 @@ from ethbrake_marl.motion.layout import (
     LOW,
     LOW_JERK,
     MASS,
-    NEW_COUNT,
     NEW_FIRST,
+    NEW_IMPACTS,
     NEW_TOTAL,
     NEXT_CLOSING,
     NEXT_TIME,
@@ -57,7 +57,7 @@ from ethbrake_marl.motion.layout import (
 )
 from ethbrake_marl.motion.push import push
 
-# what `drive` returns
+# what `move_line` returns
 APART = 0  # no two bodies could touch
 MET = 1  # went from event to event; if nothing touched, what contacts changed is 0
 FAILED = 2  # a check of the physics failed: never the user's fault
@@ -285,7 +285,7 @@ def move_apart(line, car, scratch, duration, ahead, builds):
 
 @kernel
 def through_interval(line, car, scratch, start, until, ahead, builds):
-    """The body of ``drive``: at once if no two bodies touch, otherwise from event to event.
+    """The body of ``move_line``: at once if no two bodies touch, otherwise from event to event.
 
     ``builds`` must be a constant.
     """
@@ -301,7 +301,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
             scratch[ONSET, i] = max(scratch[ONSET, i], duration)
     if not move_apart(line, car, scratch, duration, ahead, builds):
         for i in range(ahead, bodies):
-            scratch[CONTACT_SPEED, i] = scratch[NEW_FIRST, i] = scratch[NEW_TOTAL, i] = scratch[NEW_COUNT, i] = 0.0
+            scratch[CONTACT_SPEED, i] = scratch[NEW_FIRST, i] = scratch[NEW_TOTAL, i] = scratch[NEW_IMPACTS, i] = 0.0
             scratch[NEXT_TIME, i], scratch[NEXT_CLOSING, i], scratch[LAST_TIME, i] = math.inf, 0.0, math.inf
             scratch[FRONT_CHANGE, i] = scratch[REAR_CHANGE, i] = 0.0
         met = FAILED
@@ -323,7 +323,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
         for p in range(ahead, bodies - 1):
             line[FIRST, p] += scratch[NEW_FIRST, p]
             line[TOTAL, p] += scratch[NEW_TOTAL, p]
-            line[COUNT, p] += scratch[NEW_COUNT, p]
+            line[IMPACTS, p] += scratch[NEW_IMPACTS, p]
     for i in range(ahead, bodies):
         wanted = scratch[COMMAND, i] if acts(car[LATENCY, i], until) else 0.0
         line[FORCE, i] = (
@@ -353,7 +353,7 @@ def note_driving(line, car, wanted, start, until):
 
 
 @kernel
-def drive(line, car, wanted, scratch, start, until):
+def move_line(line, car, wanted, scratch, start, until):
     """Move one line from ``start`` to ``until`` (s after the alert) under the commands ``wanted`` [N + 1] (m/s2).
 
     A command has no effect before the body's latency has elapsed. Changes ``line``; returns ``APART``, ``MET`` or
@@ -364,7 +364,7 @@ def drive(line, car, wanted, scratch, start, until):
     for i in range(line.shape[1]):
         scratch[COMMAND, i] = wanted[i]
         builds = builds or min(car[BRAKE_RATE, i], car[RELEASE_RATE, i]) < math.inf
-    scratch[NEW_FIRST, 0] = scratch[NEW_TOTAL, 0] = scratch[NEW_COUNT, 0] = 0.0
+    scratch[NEW_FIRST, 0] = scratch[NEW_TOTAL, 0] = scratch[NEW_IMPACTS, 0] = 0.0
     note_driving(line, car, wanted, start, until)
     if builds:
         return through_interval_building(line, car, scratch, start, until, ahead)
@@ -372,13 +372,13 @@ def drive(line, car, wanted, scratch, start, until):
 
 
 @large
-def drive_worlds(line, car, time, until, wanted, scratch):
-    """``drive`` for n worlds from ``time`` to ``until`` [n] (s), in place; return a failed row, or -1.
+def move_lines(line, car, time, until, wanted, scratch):
+    """``move_line`` for n worlds from ``time`` to ``until`` [n] (s), in place; return a failed row, or -1.
 
     ``line``, ``car`` and ``wanted`` have one more axis in front, [n, ...].
     """
     failed = -1
     for k in range(len(until)):
-        if drive(line[k], car[k], wanted[k], scratch, time[k], until[k]) == FAILED:
+        if move_line(line[k], car[k], wanted[k], scratch, time[k], until[k]) == FAILED:
             failed = k
     return failed
