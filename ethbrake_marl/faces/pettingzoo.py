@@ -25,14 +25,30 @@ Infos = dict[str, dict[str, Any]]
 
 
 class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: ignore[misc]  # PettingZoo has no types
-    """The vehicles of a line as agents, ``vehicle_1`` (front) to ``vehicle_N``.
+    """Emergency braking: N vehicles drive in one lane, Vehicle 1 brakes, and those behind it try to do little harm.
 
-    - Action of a learner, [1] in [-1, 1]: -1 brakes with full capacity, 0 coasts, +1 drives with full capacity. Actions
-      of scripted vehicles are ignored.
-    - End: all episodes end together, *terminated* when every vehicle is at rest and no command would move it,
-      *truncated* at the horizon.
-    - ``state()`` returns the full state of the line as a vector; ``episode`` is the ``State`` object. Infos:
-      ``episode.infos``.
+    The vehicles are the agents, ``vehicle_1`` (front) to ``vehicle_N``. Learners act; the others follow scripts.
+
+    **Action space.** ``Box(-1, 1, (1,), float32)`` for every agent: -1 brakes with full capacity, 0 coasts, +1 drives
+    with full capacity, once the vehicle's latency since the alert has elapsed. Every learner needs an action, unless
+    the environment has a shield; actions of scripted vehicles are ignored. With ``actions=K`` a learner's space is
+    ``Discrete(K)``.
+
+    **Observation space.** A float32 box of the features that the vehicle observes, each with its bounds; the attribute
+    ``features`` of the box has their names (``episode.features``). ``state()`` is the full state of the line as a
+    vector; ``episode`` is the ``State`` object.
+
+    **Rewards.** Minus the harm of the step: the sum of the squared closing speeds of its impacts (m2/s2), the same for
+    all vehicles. Other counts of harm, objectives of single vehicles and other terms: ``reward``.
+
+    **Start.** A world is drawn from the scenario at the alert, when Vehicle 1 begins to brake. The first observation
+    comes when the first learner's latency has elapsed. ``reset(seed=...)`` begins with the first world of the seed,
+    ``reset()`` goes on to the next one; the options of ``reset`` choose a world.
+
+    **End.** All agents end together: *terminated* when every vehicle is at rest and no command would move it,
+    *truncated* at the scenario's horizon. A step lasts ``time_step_s`` of the scenario, usually 0.1 s.
+
+    **Infos.** Time, commands, harm so far, seed and number of the world, and values of the shield (``episode.infos``).
 
     Args:
         scenario: a shipped name, the path or content of a YAML file, or a ``Scenario``.
