@@ -95,7 +95,7 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "t
 
 
 def _usable() -> list[str]:
-    """Return the public names that can be imported; the others need a package that is not installed."""
+    """Public names that can be imported; the others need a package that is not installed."""
     missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
     return [name for name in _HOMES if name not in missing]
 

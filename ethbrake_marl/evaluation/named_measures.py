@@ -108,7 +108,7 @@ def split_names(names: str) -> list[str]:
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
-    """Return the measures, summed terms and objectives with these names, each once. ``FILE.py:NAME`` runs the file.
+    """Measures, summed terms and objectives with these names, each once. ``FILE.py:NAME`` runs the file.
 
     A measure from a file is called ``NAME``, or ``FILE.py:NAME`` if another one is called ``NAME``. Raises
     ``UnknownName``, and ``InvalidInput`` for a file without such a measure.

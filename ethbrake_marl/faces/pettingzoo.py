@@ -121,7 +121,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return self.action_spaces[agent]
 
     def reward_space(self, agent: str) -> Any:
-        """Return an agent's space of vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
+        """Space of an agent's vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
         if not self.game.rewarding.components:
             raise InvalidInput("reward_space: rewards are numbers here; make the environment with reward_vector")
         return self.reward_spaces[agent]
@@ -156,12 +156,12 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return answer
 
     def state(self) -> Observations:
-        """Return the full state of the line, [S] float32."""
+        """Full state of the line, [S] float32."""
         whole: Observations = full_state(self._begun("state"), *self._of_state)[0]
         return whole
 
     def _columns(self, actions: Mapping[str, Any]) -> Floats:
-        """Return the learners' actions, [1, L]. With a shield an action may be missing: NaN."""
+        """Actions of the learners, [1, L]. With a shield an action may be missing: NaN."""
         if not isinstance(actions, Mapping):
             raise InvalidInput(
                 f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
@@ -191,7 +191,7 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
-    """Return the environment in PettingZoo's AEC form (agents act in turns, front to rear), made by ``parallel_env``.
+    """Environment in PettingZoo's AEC form (agents act in turns, front to rear), made by ``parallel_env``.
 
     A bad action is refused at the turn of the last agent.
 

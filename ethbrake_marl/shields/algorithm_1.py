@@ -66,7 +66,7 @@ class EpisodeShield:
             )
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision ``state``: which driver gets each episode."""
+        """Memory at the first decision ``state``: which driver gets each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
         remembered = begin(game.agents({body: agent})[body], alert, body)

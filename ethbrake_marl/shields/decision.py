@@ -58,7 +58,7 @@ def check_harm_count(count: str) -> None:
 
 
 def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
-    """Return values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
+    """Values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
     wide = np.full((state.n, state.vehicles), other, columns.dtype)
     wide[:, game.rules.learners - 1] = columns
     return wide

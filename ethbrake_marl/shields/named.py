@@ -18,7 +18,7 @@ class NamedShield(NamedTuple):
     argument: str | None = None  # the option that is the text after the colon
 
     def __call__(self, team: Team, text: str | None, settings: Any) -> Team:
-        """Return the team with the shield. Raises ``InvalidInput`` for bad options, and for a team that has a shield.
+        """Team with the shield. Raises ``InvalidInput`` for bad options, and for a team that has a shield.
 
         ``text`` follows the colon of the shield's name; ``settings`` are ``names.AgentSettings``.
         """

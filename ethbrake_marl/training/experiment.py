@@ -144,7 +144,7 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 def compared_teams(
     trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
-    """Return the teams to compare: baselines, then the trained policies, without and with a shield.
+    """Teams to compare: baselines, then the trained policies, without and with a shield.
 
     With several learners there is also a team for each learner in which this learner brakes fully.
     """

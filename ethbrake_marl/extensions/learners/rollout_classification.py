@@ -43,7 +43,7 @@ class Chooser(Averaged):
         return self.actions[self.best(observations)]
 
     def loss(self, some: Tensor, guide: float) -> Tensor:
-        """Return the loss at ``some`` stored decisions: the expected extra cost, plus ``guide`` times a convex term.
+        """Loss at ``some`` stored decisions: the expected extra cost, plus ``guide`` times a convex term.
 
         A choice has the probability softmax of the scores. Where a probability is close to 0 or 1, the gradient of the
         expected cost nearly vanishes, but the convex term's does not: it lowers the score of every tried choice but the
@@ -62,7 +62,7 @@ class RolloutClassificationModel(BranchingModel):
     recipe: RolloutClassificationRecipe
 
     def new_policy(self) -> nn.Module:
-        """Return a network that takes choice 0 at first, full braking."""
+        """Network that takes choice 0 at first, full braking."""
         return Chooser(len(self.features), self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -88,7 +88,7 @@ class RolloutClassificationModel(BranchingModel):
         self.logger.record("train/loss", float(np.mean(losses)))
 
     def choices_at(self, seen: Float32s) -> Ints:
-        """Return the choices to try for observations ``seen`` [B, F], [B, C]; the network's own one first."""
+        """Choices to try for observations ``seen`` [B, F], [B, C]; the network's own one first."""
         recipe, last, count = self.recipe, self.recipe.network.choices - 1, len(seen)
         own = self.policy.best(seen)
         tried = [own]

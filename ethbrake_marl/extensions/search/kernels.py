@@ -71,7 +71,7 @@ class Field(NamedTuple):
 
 @kernel
 def value_of(world, line):
-    """Return what the search minimises (m2/s2), plus a little of the other count of harm, which decides ties.
+    """What the search minimises (m2/s2), plus a little of the other count of harm, which decides ties.
 
     ``world``: a ``World``. ``line`` [LINE_ROWS, N + 1]: the present state of its bodies.
     """
@@ -121,7 +121,7 @@ def follow(world, lines, ends, commands, phase, most):
 
 @large
 def draw(random):
-    """Return the next random number in [0, 1) of a splitmix64 generator, whose state is ``random`` [1]."""
+    """Next random number in [0, 1) of a splitmix64 generator, whose state is ``random`` [1]."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -142,13 +142,13 @@ def draw_sign(random):
 
 @kernel
 def allowed(command, low, high):
-    """Return a command limited to ``low`` ... ``high``, rounded toward 0 to a multiple of 1 / RESOLUTION (m/s2)."""
+    """Command limited to ``low`` ... ``high``, rounded toward 0 to a multiple of 1 / RESOLUTION (m/s2)."""
     return int(min(max(command, low), high) * RESOLUTION) / RESOLUTION
 
 
 @large
 def draw_command(world, b):
-    """Return a random command (m/s2) of the controlled vehicle number ``b`` of a ``World``.
+    """Random command (m/s2) of the controlled vehicle number ``b`` of a ``World``.
 
     Likely are full braking, full driving, 0, and the command of the vehicle ahead.
     """
