@@ -92,18 +92,22 @@ def rear_after(at, early):
 def pushed_by_leader(at, early, late, closing, end, lack):
     """Lower bound (m/s) on the rear pair's closing speed after a first contact with the leader.
 
-    It follows from the motion of the centre of mass of leader and controlled vehicle; 0: none proven. If the leader is
-    at rest at ``early``, a later first contact leads to the same motion at a later time, so ``late``, ``end`` and
-    ``lack`` do not matter. Arguments: see ``proofs``.
+    1. The *block*, leader and controlled vehicle together, moves like its centre of mass: at first with ``speed`` and
+       the acceleration ``push``, until the leader stands at ``stand``.
+    2. The rear vehicle has reached the block by the time ``until``. 0 is returned if it need not.
+    3. The bound is the speed at which the rear vehicle closes in on the block, minus the largest amount by which the
+       controlled vehicle may then be faster than the block.
+
+    Arguments: see ``proofs``.
     """
     share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
     behind, v_r, onset = rear_after(at, early)
+    if v_l <= 0.0:  # a later contact with a leader at rest leads to the same motion, only later
+        late, end, lack = early, early, 0.0
+    late, end, lost = late - early, end - early, lack * (end - late)
     speed, push = v_l + rest * closing, rest * at[U_F] - share * at[A_L]
     stand = (speed + rest * bounce * closing) / at[A_L]
-    late, end, lost = late - early, end - early, lack * (end - late)
-    if v_l <= 0.0:
-        late, end, lack, lost = 0.0, 0.0, 0.0, 0.0
     block = with_window(push, late, end, -rest * lack, stand, share * at[A_L])
     until = walk(behind, speed, block, v_r, braking(onset, at[A_R]), onset + v_r / at[A_R])[1]
     if until == math.inf:

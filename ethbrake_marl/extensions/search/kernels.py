@@ -312,32 +312,33 @@ def improve(world, room, ends, commands, budget, drawing, least):
     except in plans.
     """
     change, lines, tried = room.change, room.lines, room.tried
-    value, active, spent, phase, again = math.inf, 0, -1, 0, False
     new_ends, new_commands = room.ends[: ends.shape[0]], room.commands[: ends.shape[0]]
-    for _ in range(4 * budget + 1):
+    begin = min(0, ends.shape[0])  # no literal, as in `gather`
+    value, active = follow(world, lines, ends, commands, begin, math.inf)
+    if active < 0 or not value < math.inf:
+        return math.inf, 0
+    spent, again = 0, False
+    for _ in range(4 * budget):
         if spent >= budget or value <= least:
             break
+        if not again:
+            draw_change(world, active, drawing, change)
+        phase, again = int(change[PHASE]), False
         copy_profile(ends, commands, new_ends, new_commands)
-        if spent >= 0:  # the first profile that is tried is the given one
-            if not again:
-                draw_change(world, active, drawing, change)
-            phase, again = int(change[PHASE]), False
-            if not apply_change(change, world.bounds, new_ends, new_commands):
-                spent += 1 if drawing[KIND] == PLAN else 0
-                continue
-        move_line(lines[phase], tried[phase])
+        if not apply_change(change, world.bounds, new_ends, new_commands):
+            spent += 1 if drawing[KIND] == PLAN else 0
+            continue
         spent += 1
+        move_line(lines[phase], tried[phase])
         new, reached = follow(world, tried, new_ends, new_commands, phase, value)
         if reached < 0 or not new < value:
-            if active == 0:
-                return math.inf, 0
             continue
         value, active = new, reached
         copy_profile(new_ends, new_commands, ends, commands)
         for p in range(phase + 1, reached + 1):
             move_line(tried[p], lines[p])
         change[AMOUNT] *= 2.0
-        again = spent > 0 and change[WHAT] != SET
+        again = change[WHAT] != SET
     return value, active
 
 
