@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.faces.gymnasium import EthBrakeEnv as EthBrakeEnv
     from ethbrake_marl.faces.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
     from ethbrake_marl.faces.shield import shield as shield
-    from ethbrake_marl.shields.decision import ShieldReason as ShieldReason
+    from ethbrake_marl.shields.shield import ShieldReason as ShieldReason
 
     # Scenarios, and the worlds drawn from them
     from ethbrake_marl.worlds.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario

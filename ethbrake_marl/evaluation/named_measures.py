@@ -176,7 +176,7 @@ def _summed(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """Term intervention (``shields.decision``), but 0 without a shield, so that a table can compare both."""
+    """Term intervention (``shields.shield``), but 0 without a shield, so that a table can compare both."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)

@@ -45,9 +45,15 @@ from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.decision import ShieldReason, check_harm_count, check_learners, checked_drivers, spread
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
-from ethbrake_marl.shields.named import NamedShield
+from ethbrake_marl.shields.shield import (
+    NamedShield,
+    ShieldReason,
+    check_harm_count,
+    check_learners,
+    checked_drivers,
+    spread,
+)
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
 

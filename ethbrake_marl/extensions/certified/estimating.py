@@ -23,7 +23,7 @@ from ethbrake_marl.extensions.certified.robust import opened
 from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield, Memory as EpisodeMemory
-from ethbrake_marl.shields.named import NamedShield
+from ethbrake_marl.shields.shield import NamedShield
 from ethbrake_marl.shields.step import Memory, StepShield
 from ethbrake_marl.worlds.scenario import Scenario
 

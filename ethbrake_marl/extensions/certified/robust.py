@@ -22,7 +22,7 @@ from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.motion.layout import BRAKING, COUNT, GAP, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import held
-from ethbrake_marl.shields.named import NamedShield
+from ethbrake_marl.shields.shield import NamedShield
 from ethbrake_marl.shields.step import Memory, StepShield
 
 SHARES = np.linspace(0.0, -1.0, 101)  # constant actions that are tried at the alert for the worst member
