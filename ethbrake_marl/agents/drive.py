@@ -68,7 +68,7 @@ class Team(NamedTuple):
 
     @staticmethod
     def of(drivers: Mapping[str, Agent], name: str, shield: Shield | None = None) -> Team:
-        """Return the team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for a bad vehicle name or agent."""
+        """Team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for a bad vehicle name or agent."""
         bodies = {}
         for vehicle, agent in drivers.items():
             if not isinstance(vehicle, str) or re.fullmatch("vehicle_[1-9][0-9]?", vehicle) is None:
@@ -78,7 +78,7 @@ class Team(NamedTuple):
         return Team(name, dict(sorted(bodies.items())), shield)
 
     def game(self, game: Game) -> Game:
-        """Return ``game`` with this team's shield.
+        """``game`` with this team's shield.
 
         Raises ``InvalidInput`` unless the team drives exactly the learners, for a shield without learners, and if the
         game already has another shield.
@@ -147,7 +147,7 @@ def drive(game: Game, alert: State, team: Team) -> State:
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Return the agents' actions, [n, L] in the order of ``drivers``, and body -> new memory.
+    """Actions of the agents, [n, L] in the order of ``drivers``, and body -> new memory.
 
     ``drivers`` is body -> agent, ``memories`` body -> memory.
     """
@@ -159,12 +159,12 @@ def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, A
 
 
 def to_command(state: State, body: int, actions: Floats) -> Floats:
-    """Return commands, [n] m/s2, for actions [n] from -1 (full braking) to 1 (full driving)."""
+    """Commands, [n] m/s2, for actions [n] from -1 (full braking) to 1 (full driving)."""
     return np.where(actions < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body]) * actions
 
 
 def to_action(state: State, body: int, commands: Floats) -> Floats:
-    """Return actions in [-1, 1] for commands [n] (m/s2), clipped to the vehicle's capacities."""
+    """Actions in [-1, 1] for commands [n] (m/s2), clipped to the vehicle's capacities."""
     capacity = np.where(commands < 0.0, state.car[:, BRAKING, body], state.car[:, DRIVING, body])
     share = np.divide(commands, capacity, out=np.zeros_like(capacity), where=capacity > 0.0)
     return np.clip(share, -1.0, 1.0)

@@ -85,7 +85,7 @@ class MedianLine(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario, body: int) -> MedianLine:
-        """Return the line of a scenario in which every quantity has its median.
+        """Line of a scenario in which every quantity has its median.
 
         Raises ``InvalidInput`` for a mixture of scenarios, and for other vehicles with unknown commands.
         """
@@ -98,7 +98,7 @@ class MedianLine(NamedTuple):
         return cls(body, alert, news, tuple(scenario.roles.values()))
 
     def commands(self, car: Floats, wanted: Floats) -> Floats:
-        """Return the commands of all bodies, [n, N + 1] m/s2 (body 0: the obstacle).
+        """Commands of all bodies, [n, N + 1] m/s2 (body 0: the obstacle).
 
         Scripts follow their rules, other learners brake fully, and the vehicle itself keeps ``wanted`` [n, N + 1].
         ``car``: as in ``State``.
@@ -110,7 +110,7 @@ class MedianLine(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the median lines at the alert.
+        """Median lines at the alert.
 
         They use what ``state`` shows at the first decision. Vehicles of which everything is known by then start as in
         the true worlds ``alert``, and so does the gap between two of them.
@@ -128,7 +128,7 @@ class MedianLine(NamedTuple):
         return alert._replace(line=line, car=car, wanted=self.commands(car, alert.wanted))
 
     def received(self, state: State) -> tuple[Bools, Floats]:
-        """Return which quantities of each body the vehicle has received, [n, N + 1, PIECES], and the newest values.
+        """Which quantities of each body the vehicle has received, [n, N + 1, PIECES], and the newest values.
 
         The values are [n, SAMPLE_ROWS, N + 1] (``messages.links``, as are PIECES). Body 0 is the obstacle, whose place
         is known to all who know the place of Vehicle 1.
@@ -144,7 +144,7 @@ class MedianLine(NamedTuple):
         return pieces, news
 
     def heard(self, state: State, median: State) -> tuple[State, Bools]:
-        """Return the median lines after news, and in which worlds they had foretold it, [n].
+        """Median lines after news, and whether they had foretold it, [n].
 
         ``state``: the truth now. ``median``: the lines now; they are corrected where they are contradicted.
         """
@@ -155,7 +155,7 @@ class MedianLine(NamedTuple):
         return median, foretold
 
     def agrees(self, state: State, median: State) -> Bools:
-        """Return in which worlds the vehicle would have received and measured the same in the ``median`` line, [n].
+        """Whether the vehicle would have received and measured the same in the ``median`` line, [n].
 
         ``state``: the truth now.
         """
@@ -166,7 +166,7 @@ class MedianLine(NamedTuple):
         return np.asarray(~((far & pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
 
     def told(self, state: State, news: Floats) -> Floats:
-        """Return what a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
+        """What a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
 
         ``news``: as ``received`` returns it. A place is the distance (m) from this vehicle.
         """
@@ -177,7 +177,7 @@ class MedianLine(NamedTuple):
         return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, median: State) -> State:
-        """Return median lines with received values in place of assumed ones; ``state`` is the truth now.
+        """Median lines with received values in place of assumed ones; ``state`` is the truth now.
 
         A received place and speed are moved on to the present by the sender's script, without contact. A sender that
         was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to
@@ -287,7 +287,7 @@ def check_predictable(scenario: Scenario, body: int) -> None:
 
 
 def without_channel(game: Game, median: State) -> tuple[Game, State]:
-    """Return the game and median lines in which every vehicle knows everything, for agents that drive there.
+    """Game and median lines in which every vehicle knows everything, for agents that drive there.
 
     A median line does not say when the truth would be received, so each vehicle's own latency ends when it reacts.
     """
@@ -298,7 +298,7 @@ def without_channel(game: Game, median: State) -> tuple[Game, State]:
 
 
 def in_order(place: Floats, known: Bools) -> Floats:
-    """Return places (m), [n, vehicles], raised where they would decrease from one vehicle to the next.
+    """Places (m), [n, vehicles], raised where they would decrease from one vehicle to the next.
 
     An unknown place is first lowered to the next ``known`` one, if it is beyond it.
     """
