@@ -55,7 +55,7 @@ class Report(Protocol):
     measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Return the tables to print, and a text that says where the report is; ``tell`` is called with progress."""
+        """Write the report; return the tables to print, and a text that says where it is. ``tell`` reports progress."""
 
 
 class Tables:

@@ -75,6 +75,38 @@ TOLD = {  # rows of `State.car` -> the piece of a message that tells them
 OF_IMPACTS = [HIT, FIRST, TOTAL, COUNT]
 
 
+class News(NamedTuple):
+    """What a vehicle has received of each body. A body is *located* if its place and speed have been received.
+
+    Body 0 is the obstacle, whose place is known to all who know the place of Vehicle 1.
+    """
+
+    pieces: Bools  # [n, N + 1, PIECES] what has been received (``messages.links``)
+    sample: Floats  # [n, SAMPLE_ROWS, N + 1] the newest values
+    located: Bools  # [n, N + 1]; never the obstacle, body 0
+    at_s: Floats  # [n, N + 1] time of the newest sample; 0 for a body that is not located
+
+    @property
+    def with_force(self) -> Bools:
+        """Whether a body is located and its acceleration has been received, [n, N + 1]."""
+        return self.located & self.pieces[:, :, P_ACCELERATION]
+
+    def fresh(self, state: State) -> Bools:
+        """Whether a body is located by a sample of the present, [n, N + 1]."""
+        return self.located & (self.at_s >= state.time_s[:, np.newaxis])
+
+    def speeds_and_ways(
+        self, speed: Floats, wanted: Floats, onset: Floats, limit: Floats, time_s: Floats
+    ) -> tuple[Floats, Floats]:
+        """Speeds (m/s) at ``time_s`` [n, 1], and ways (m) driven since the samples, without contact, [n, N + 1] each.
+
+        Bodies that are not located keep their ``speed``. Others, arguments of ``move_on``.
+        """
+        speed, way = np.where(self.located, self.sample[:, SAMPLE_SPEED], speed), np.zeros(speed.shape)
+        move_on(speed, way, wanted, onset - self.at_s, limit, np.where(self.located, time_s - self.at_s, 0.0))
+        return speed, way
+
+
 class MedianLine(NamedTuple):
     """The line that the vehicle ``body`` assumes before it has received anything."""
 
@@ -115,10 +147,10 @@ class MedianLine(NamedTuple):
         They use what ``state`` shows at the first decision. Vehicles of which everything is known by then start as in
         the true worlds ``alert``, and so does the gap between two of them.
         """
-        pieces, news = self.received(state)
-        known = np.asarray(pieces[:, :, :P_INTENT].all(axis=2))
+        news = self.received(state)
+        known = np.asarray(news.pieces[:, :, :P_INTENT].all(axis=2))
         known[:, 0] = known[:, 1]
-        acts = known & (news[:, SAMPLE_FORCE] != 0.0)
+        acts = known & (news.sample[:, SAMPLE_FORCE] != 0.0)
         acts[:, self.body] = True
         line, car = (np.where(known[:, np.newaxis], *each) for each in zip(alert[:2], self.alert[:2], strict=True))
         both = known[:, :-1] & known[:, 1:]
@@ -127,21 +159,18 @@ class MedianLine(NamedTuple):
         car[:, LATENCY] = np.where(acts, alert.car[:, LATENCY], np.maximum(car[:, OWN_LATENCY], self.news_s))
         return alert._replace(line=line, car=car, wanted=self.commands(car, alert.wanted))
 
-    def received(self, state: State) -> tuple[Bools, Floats]:
-        """Which quantities of each body the vehicle has received, [n, N + 1, PIECES], and the newest values.
-
-        The values are [n, SAMPLE_ROWS, N + 1] (``messages.links``, as are PIECES). Body 0 is the obstacle, whose place
-        is known to all who know the place of Vehicle 1.
-        """
+    def received(self, state: State) -> News:
         if NAME in state.memories:
-            pieces, news = known_pieces(state, self.body), newest(state, self.body)
+            pieces, sample = known_pieces(state, self.body), newest(state, self.body)
         else:
             known = state.know[:, self.body] <= state.time_s[:, np.newaxis]
             known[:, [0, self.body]] = True
-            pieces, news = known[:, :, np.newaxis].repeat(len(PIECES), axis=2), present(state)
+            pieces, sample = known[:, :, np.newaxis].repeat(len(PIECES), axis=2), present(state)
         pieces[:, 0] = False
         pieces[:, 0, P_PLACE] = pieces[:, 1, P_PLACE]
-        return pieces, news
+        located = np.asarray(pieces[:, :, [P_PLACE, P_SPEED]].all(axis=2))
+        located[:, 0] = False
+        return News(pieces, sample, located, np.where(located, sample[:, AT], 0.0))
 
     def heard(self, state: State, median: State) -> tuple[State, Bools]:
         """Median lines after news, and whether they had foretold it, [n].
@@ -159,22 +188,22 @@ class MedianLine(NamedTuple):
 
         ``state``: the truth now.
         """
-        pieces, news = self.received(state)
-        far = np.abs(self.told(median, self.received(median)[1]) - self.told(state, news)) > SURPRISE
+        news = self.received(state)
+        far = np.abs(self.told(median, self.received(median).sample) - self.told(state, news.sample)) > SURPRISE
         impacts = slice(self.body - 1, self.body + 1)
         struck = median.line[:, HIT, impacts] != state.line[:, HIT, impacts]
-        return np.asarray(~((far & pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
+        return np.asarray(~((far & news.pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
 
-    def told(self, state: State, news: Floats) -> Floats:
+    def told(self, state: State, sample: Floats) -> Floats:
         """What a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
 
-        ``news``: as ``received`` returns it. A place is the distance (m) from this vehicle.
+        ``sample``: as in ``News``. A place is the distance (m) from this vehicle.
         """
         car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
         car[:, :, 0] = 0.0
-        own = news[:, PLACE, self.body, np.newaxis]
-        sample = np.stack([news[:, PLACE] - own, news[:, SAMPLE_SPEED], news[:, SAMPLE_FORCE]], axis=1)
-        return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
+        own = sample[:, PLACE, self.body, np.newaxis]
+        motion = np.stack([sample[:, PLACE] - own, sample[:, SAMPLE_SPEED], sample[:, SAMPLE_FORCE]], axis=1)
+        return np.concatenate([motion, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, median: State) -> State:
         """Median lines with received values in place of assumed ones; ``state`` is the truth now.
@@ -183,7 +212,7 @@ class MedianLine(NamedTuple):
         was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to
         this vehicle, within the order of the line. This vehicle measures its own motion and its own impacts.
         """
-        body, news = self.body, News.of(*self.received(state))
+        body, news = self.body, self.received(state)
         line, car = median.line.copy(), median.car.copy()
         for row, piece in TOLD.items():
             car[:, row, 1:] = np.where(news.pieces[:, 1:, piece], state.car[:, row, 1:], car[:, row, 1:])
@@ -238,41 +267,6 @@ class MedianLine(NamedTuple):
         force = np.where(news.fresh(state) & news.with_force, news.sample[:, SAMPLE_FORCE], force)
         force[:, self.body] = state.line[:, FORCE, self.body]
         return force
-
-
-class News(NamedTuple):
-    """What the vehicle has received of each body. A body is *located* if its place and speed have been received."""
-
-    pieces: Bools  # [n, N + 1, PIECES] what has been received
-    sample: Floats  # [n, SAMPLE_ROWS, N + 1] the newest values
-    located: Bools  # [n, N + 1]; never the obstacle, body 0
-    at_s: Floats  # [n, N + 1] time of the newest sample; 0 for a body that is not located
-
-    @classmethod
-    def of(cls, pieces: Bools, sample: Floats) -> News:
-        located = np.asarray(pieces[:, :, [P_PLACE, P_SPEED]].all(axis=2))
-        located[:, 0] = False
-        return cls(pieces, sample, located, np.where(located, sample[:, AT], 0.0))
-
-    @property
-    def with_force(self) -> Bools:
-        """Whether a body is located and its acceleration has been received, [n, N + 1]."""
-        return self.located & self.pieces[:, :, P_ACCELERATION]
-
-    def fresh(self, state: State) -> Bools:
-        """Whether a body is located by a sample of the present, [n, N + 1]."""
-        return self.located & (self.at_s >= state.time_s[:, np.newaxis])
-
-    def speeds_and_ways(
-        self, speed: Floats, wanted: Floats, onset: Floats, limit: Floats, time_s: Floats
-    ) -> tuple[Floats, Floats]:
-        """Speeds (m/s) at ``time_s`` [n, 1], and ways (m) driven since the samples, without contact, [n, N + 1] each.
-
-        Bodies that are not located keep their ``speed``. Others, arguments of ``move_on``.
-        """
-        speed, way = np.where(self.located, self.sample[:, SAMPLE_SPEED], speed), np.zeros(speed.shape)
-        move_on(speed, way, wanted, onset - self.at_s, limit, np.where(self.located, time_s - self.at_s, 0.0))
-        return speed, way
 
 
 def check_predictable(scenario: Scenario, body: int) -> None:
