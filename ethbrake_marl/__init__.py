@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.faces.gymnasium import EthBrakeEnv as EthBrakeEnv
     from ethbrake_marl.faces.vector import EthBrakeVectorEnv as EthBrakeVectorEnv
     from ethbrake_marl.faces.shield import shield as shield
-    from ethbrake_marl.shields.decision import ShieldReason as ShieldReason
+    from ethbrake_marl.shields.shield import ShieldReason as ShieldReason
 
     # Scenarios, and the worlds drawn from them
     from ethbrake_marl.worlds.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario
@@ -97,7 +97,7 @@ _NEED_TRAIN = ("EthBrakeVecEnv", "TrainResult", "make_sb3_vec_env", "resume", "t
 
 
 def _usable() -> list[str]:
-    """Return the public names that can be imported; the others need a package that is not installed."""
+    """Public names that can be imported; the others need a package that is not installed."""
     missing = _NEED_TRAIN if find_spec("stable_baselines3") is None else ()
     return [name for name in _HOMES if name not in missing]
 

@@ -17,7 +17,7 @@ from typing import Any
 
 @cache
 def names_behind(file: str) -> dict[str, str]:
-    """Return name -> module of the imports in the ``if TYPE_CHECKING`` block of an ``__init__.py``."""
+    """Name -> module of the imports in the ``if TYPE_CHECKING`` block of an ``__init__.py``."""
     statements = ast.parse(Path(file).read_text("utf-8")).body
     block = next(statement for statement in statements if isinstance(statement, ast.If)).body
     imports = [statement for statement in block if isinstance(statement, ast.ImportFrom)]

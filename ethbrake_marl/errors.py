@@ -21,7 +21,7 @@ _KEPT_BEGINNING, _KEPT_END = 1_000, 400
 
 
 def plain_text(text: str, keep: str = "") -> str:
-    """Return ``text`` with unprintable characters as Python escapes, except those in ``keep``.
+    """``text`` with unprintable characters as Python escapes, except those in ``keep``.
 
     So a name or path from a file cannot move the cursor or print backwards.
     """
@@ -31,7 +31,7 @@ def plain_text(text: str, keep: str = "") -> str:
 
 
 def one_line(text: str) -> str:
-    """Return ``plain_text`` on one line; if it is longer than ``LINE_LIMIT``, its middle is left out."""
+    """``plain_text`` on one line; if it is longer than ``LINE_LIMIT``, its middle is left out."""
     blanks = text if len(text) <= 2 * LINE_LIMIT else text[:LINE_LIMIT] + text[-LINE_LIMIT:]
     line = plain_text(blanks)
     if len(text) == len(blanks) and len(line) <= LINE_LIMIT:
@@ -40,7 +40,7 @@ def one_line(text: str) -> str:
 
 
 def count_of(n: int, thing: str) -> str:
-    """Return a number with its noun, such as ``1 world`` or ``10,000 worlds``. ``thing`` is the singular."""
+    """Number with its noun, such as ``1 world`` or ``10,000 worlds``. ``thing`` is the singular."""
     return f"{n:,} {thing}{'' if n == 1 else 's'}"
 
 
@@ -202,7 +202,7 @@ class FreeImpacts(UserWarning):
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: bool = False) -> UnknownName:
-    """Return the error for an unknown name. Its message shows the new name, a similar one, or all ``known`` names.
+    """Error for an unknown name. Its message shows the new name, a similar one, or all ``known`` names.
 
     ``kind`` is a noun such as ``scenario``. ``may_be_own``: the message adds that own names must be registered first.
     """

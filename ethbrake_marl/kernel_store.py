@@ -26,7 +26,7 @@ _warned: list[str] = []
 
 
 def cache_folder() -> Path | None:
-    """Return this package's folder in ``$NUMBA_CACHE_DIR`` or the user's cache; None without a home folder."""
+    """Folder of this package in ``$NUMBA_CACHE_DIR`` or the user's cache; None without a home folder."""
     try:
         home = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
@@ -35,7 +35,7 @@ def cache_folder() -> Path | None:
 
 
 def load(name: str, read: Callable[[bytes], Any]) -> Any:
-    """Return ``read(data)`` of the data that are stored under a name; None if there are none.
+    """``read(data)`` of the data that are stored under a name; None if there are none.
 
     If they are damaged, or ``read`` raises an error, warns, deletes them and returns None.
     """
@@ -61,7 +61,7 @@ def save(name: str, data: bytes) -> None:
 
 
 def obstacle() -> str:
-    """Return why compiled code cannot be stored; empty if it can."""
+    """Why compiled code cannot be stored; empty if it can."""
     try:
         with TemporaryFile(dir=_trusted_folder()) as file:
             file.write(bytes(100_000))  # a disk that is full may still have names
@@ -95,7 +95,7 @@ def _stored_files() -> list[Path]:
 
 
 def _trusted_folder() -> Path:
-    """Return the folder, which is created if it is missing. Raises ``OSError`` if there is none to use.
+    """Folder, which is created if it is missing. Raises ``OSError`` if there is none to use.
 
     It must belong to this user or root, since machine code from it will be run.
     """
@@ -109,7 +109,7 @@ def _trusted_folder() -> Path:
 
 
 def _read(path: Path, read: Callable[[bytes], Any]) -> Any:
-    """Return ``read(data)`` of the data in a file; None if it is damaged."""
+    """``read(data)`` of the data in a file; None if it is damaged."""
     try:
         content = path.read_bytes() if path.is_file() else b""
         data = content[_DIGEST_BYTES:]

@@ -58,7 +58,7 @@ class AgentSettings:
     options: Mapping[str, Any] = field(default_factory=dict)  # of ``eb.shield``; a name has none
 
     def needed_scenario(self) -> Scenario:
-        """Return the scenario. Raises ``InvalidInput`` if it is unknown."""
+        """Scenario. Raises ``InvalidInput`` if it is unknown."""
         if self.scenario is None:
             raise InvalidInput(
                 f"agent {self.spec!r}: needs a scenario, for instance make_agent({self.spec!r},"
@@ -129,7 +129,7 @@ WRAPPERS: Registry[Entry] = Registry("shield or search", "shields", register_shi
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
-    """Return the agent or team with a name, such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: module docstring).
+    """Agent or team with a name, such as ``"constant:3.5"`` or ``"ppo+step"`` (syntax: module docstring).
 
     Teams, wrappers and agents that look ahead need ``scenario``. ``harm_count``: what optimising agents minimise
     (``episode.counts``). A Python file in the name runs with all your rights.
@@ -155,21 +155,21 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
 
 
 def wrapped(team: Team, wrapper: str, settings: AgentSettings) -> Team:
-    """Return a team inside the shield or search ``wrapper``, such as ``episode:pairwise``."""
+    """Team inside the shield or search ``wrapper``, such as ``episode:pairwise``."""
     entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
     around: Team = _called(settings.spec, entry.make, team, argument, settings)
     return around._replace(name=settings.spec)
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
-    """Return a team for all learners of a scenario. A single agent drives each learner, with separate memories."""
+    """Team for all learners of a scenario. A single agent drives each learner, with separate memories."""
     if isinstance(driver, Team):
         return driver
     return Team(driver.name, dict.fromkeys(scenario.learners, driver))
 
 
 def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Return spec -> team. A text may list several specs, separated by commas; groups are expanded.
+    """Spec -> team. A text may list several specs, separated by commas; groups are expanded.
 
     Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated spec.
     """
@@ -183,7 +183,7 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
 
 
 def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> dict[str, Team]:
-    """Return name -> team for any description of agents.
+    """Name -> team for any description of agents.
 
     ``agents`` is a text or list as in ``make_teams``; or a mapping from names to specs, agents, teams, or mappings from
     vehicles to specs and agents: ``{"mine": {"vehicle_2": agent, "vehicle_3": "coast"}}``. Raises ``InvalidInput`` for
@@ -217,7 +217,7 @@ def _driver(given: Any, scenario: Scenario, harm_count: str) -> Any:
 
 
 def group(name: str) -> list[str]:
-    """Return the specs of a group: those of the entry ``NAME``, then of all ``NAME.MORE``; [] for any other name."""
+    """Specs of a group: those of the entry ``NAME``, then of all ``NAME.MORE``; [] for any other name."""
     if name not in AGENTS or callable(AGENTS[name].make):
         return []
     listed: list[Any] = [AGENTS[each].make for each in AGENTS if each == name or each.startswith(f"{name}.")]
@@ -317,7 +317,7 @@ def open_game(
     reward_vector: Any = None,
     report: Sequence[str] = (),
 ) -> tuple[Scenario, Game]:
-    """Return a scenario and its game. Vehicles whose role names an agent are driven by this agent.
+    """Scenario and its game. Vehicles whose role names an agent are driven by this agent.
 
     Arguments as in ``EthBrakeParallelEnv``.
     """
@@ -337,7 +337,7 @@ def check_learners(scenario: Scenario) -> None:
 
 
 def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
-    """Return body -> agent, for the scripts that look at the state."""
+    """Body -> agent, for the scripts that look at the state."""
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
         if role.partition(":")[0] not in (LEARNER, *HELD):
@@ -358,12 +358,12 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
 
 
 def listed_agents() -> list[Entry]:
-    """Return the entries of all agents and wrappers that can be loaded, without groups. A wrapper's form has its +."""
+    """Entries of all agents and wrappers that can be loaded, without groups. A wrapper's form has its +."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]
 
 
 def why_not_listed() -> list[str]:
-    """Return the error message of each agent or wrapper that cannot be loaded."""
+    """Error message of each agent or wrapper that cannot be loaded."""
     reasons = (table.why_not(name) for table in (AGENTS, WRAPPERS) for name in table)
     return [reason for reason in reasons if reason is not None]

@@ -21,7 +21,7 @@ PARTS = {
         "ladder": "agents.scripts:LADDER",
     },
     "shields": {"step": "shields.step:STEP", "episode": "shields.algorithm_1:EPISODE"},
-    "terms": {"intervention": "shields.decision:intervention"},
+    "terms": {"intervention": "shields.shield:intervention"},
     "measures": {
         "pushed_mps": "evaluation.pushing:PUSHED_MPS",
         "pushed_m": "evaluation.pushing:PUSHED_M",

@@ -46,7 +46,7 @@ class Progress:
 
     @staticmethod
     def listener(told: Told) -> OnProgress | None:
-        """Return the function to call with each ``Progress``, or None.
+        """Function to call with each ``Progress``, or None.
 
         ``told`` is a function; or ``"show"``: print progress on stderr (if there is one); or None.
         """

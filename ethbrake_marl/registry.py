@@ -56,7 +56,7 @@ class Part:
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
-    """Return name -> entry points of a group such as ``agents``, this package's first; several may have one name."""
+    """Name -> entry points of a group such as ``agents``, this package's first; several may have one name."""
     by_name: dict[str, list[EntryPoint]] = {}
     others = [point for point in entry_points(group=f"ethbrake_marl.{group}") if giver(point) != OURS]
     for point in (*sorted(own_points(group), key=by_its_name), *sorted(others, key=by_its_name)):
@@ -65,7 +65,7 @@ def points(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def own_points(group: str) -> list[EntryPoint]:
-    """Return the parts of a group in the tables ``parts.py`` of this package."""
+    """Parts of a group in the tables ``parts.py`` of this package."""
     package = __name__.rpartition(".")[0]
     folder = files(package) / "extensions"
     extensions = [each.name for each in folder.iterdir() if (each / "parts.py").is_file()] if folder.is_dir() else []
@@ -81,12 +81,12 @@ def by_its_name(point: EntryPoint) -> str:
 
 
 def giver(point: EntryPoint) -> str:
-    """Return the name of the package that defines an entry point."""
+    """Name of the package that defines an entry point."""
     return OURS if point.dist is None else point.dist.name
 
 
 def versions_used() -> dict[str, str]:
-    """Return name -> version of other packages whose entry points this process has loaded."""
+    """Name -> version of other packages whose entry points this process has loaded."""
     return dict(sorted(_VERSIONS.items()))
 
 
@@ -116,7 +116,7 @@ class Registry(Mapping[str, T]):
         return name in self.loaded or name in points(self.group)
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names: first built-in objects, then entry points, then objects registered by this process."""
+        """Names: first built-in objects, then entry points, then objects registered by this process."""
         built_in = (name for name in self.loaded if name in self._built_in)
         return iter(dict.fromkeys([*built_in, *points(self.group), *self.loaded]))
 
@@ -203,5 +203,5 @@ class Registry(Mapping[str, T]):
         return None
 
     def unknown(self, name: object, known: Iterable[str] | None = None) -> UnknownName:
-        """Return the error for an unknown name. ``known``: names to suggest or list; None: all."""
+        """Error for an unknown name. ``known``: names to suggest or list; None: all."""
         return unknown_name(self.kind, name, self if known is None else known, may_be_own=True)

@@ -1,4 +1,4 @@
-"""Names of version 1.0 that 2.0 has changed. There are no aliases: an old name is refused, and the error says the new one.
+"""Names of version 1.0 that 2.0 has changed. There are no aliases: the error for an old name says the new one.
 
 The changelog shows the same table.
 """

@@ -69,7 +69,7 @@ class Team(NamedTuple):
 
     @staticmethod
     def of(drivers: Mapping[str, Agent], name: str, shield: Shield | None = None) -> Team:
-        """Return the team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for a bad vehicle name or agent."""
+        """Team ``{"vehicle_2": agent, ...}``. Raises ``InvalidInput`` for a bad vehicle name or agent."""
         bodies = {}
         for vehicle, agent in drivers.items():
             if not isinstance(vehicle, str) or re.fullmatch("vehicle_[1-9][0-9]?", vehicle) is None:
@@ -79,7 +79,7 @@ class Team(NamedTuple):
         return Team(name, dict(sorted(bodies.items())), shield)
 
     def game(self, game: Game) -> Game:
-        """Return ``game`` with this team's shield.
+        """``game`` with this team's shield.
 
         Raises ``InvalidInput`` unless the team drives exactly the learners, for a shield without learners, and if the
         game already has another shield.
@@ -148,7 +148,7 @@ def drive(game: Game, alert: State, team: Team) -> State:
 
 
 def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, Any]) -> tuple[Floats, dict[int, Any]]:
-    """Return the agents' actions, [n, L] in the order of ``drivers``, and body -> new memory.
+    """Actions of the agents, [n, L] in the order of ``drivers``, and body -> new memory.
 
     ``drivers`` is body -> agent, ``memories`` body -> memory.
     """

@@ -32,7 +32,7 @@ TIE = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
 def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Floats = 8.0) -> Choice:
-    """Return the constant deceleration of vehicle ``body`` with the least simulated harm in every world, and this harm.
+    """Constant deceleration of vehicle ``body`` with the least simulated harm in every world, and this harm.
 
     All other vehicles hold ``alert.wanted``. ``count`` is the harm to minimise (``episode.counts``). If the closed
     form's choice does no harm, it is the result. Ties: the least harm in the other count decides, then the middle
@@ -54,7 +54,7 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
 
 
 def harms(alert: State, body: int, tried: Floats, count: str, until_s: Floats) -> Floats:
-    """Return the harm if vehicle ``body`` holds each of the decelerations ``tried`` [n, C] (m/s2), [2, n, C].
+    """Harm if vehicle ``body`` holds each of the decelerations ``tried`` [n, C] (m/s2), [2, n, C].
 
     The first row is the harm in ``count``, the second in the count that breaks ties.
     """
@@ -62,7 +62,7 @@ def harms(alert: State, body: int, tried: Floats, count: str, until_s: Floats) -
 
 
 def search(alert: State, body: int, count: str, until_s: Floats) -> Floats:
-    """Return the best deceleration of each world and its harm, in ``count`` and in the count that breaks ties: [n, 3].
+    """Best deceleration of each world and its harm, in ``count`` and in the count that breaks ties: [n, 3].
 
     It divides all decelerations into ``FIRST_PARTS`` equal cells, and then repeatedly those cells that may contain a
     better one. A result is not within rounding of a jump, unless a jump is within rounding of one of the first cells'
@@ -131,7 +131,7 @@ def take_middle(at, harm, known):
 
 @kernel
 def compare(harm, known):
-    """Return -1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more (``known`` as in ``take_middle``)."""
+    """-1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more (``known`` as in ``take_middle``)."""
     for count in range(2):  # the other count decides ties
         if abs(harm[count] - known[count + 1]) > TIE:
             return -1 if harm[count] < known[count + 1] else 1

@@ -36,7 +36,7 @@ INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes
 
 
 def ask_of(policy: Any, who: str) -> Ask:
-    """Return the function ``(policy, observations) -> actions`` for this kind of policy, one without a memory.
+    """Function ``(policy, observations) -> actions`` for this kind of policy, one without a memory.
 
     Raises ``InvalidInput``, beginning with ``who``, for an unknown kind of policy, and for a model whose actions would
     be random or depend on the rest of the batch.
@@ -63,7 +63,7 @@ def ask_function(function: Any, seen: Observations) -> Any:
 
 
 def ask_model(model: Any, seen: Observations) -> Any:
-    """Return the deterministic actions of an object with ``predict``; a ``VecNormalize`` of its training is applied.
+    """Deterministic actions of an object with ``predict``; a ``VecNormalize`` of its training is applied.
 
     Raises ``InvalidInput`` if the model also returns a state.
     """
@@ -90,7 +90,7 @@ def ask_torch(module: Any, seen: Observations) -> Any:
 
 
 def ask_onnx(session: Any, seen: Observations) -> Any:
-    """Return the output ``action`` of an ONNX model, or its first output."""
+    """Output ``action`` of an ONNX model, or its first output."""
     session = session_of(session)
     names = [output.name for output in session.get_outputs()]
     return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: seen})[0]
@@ -107,7 +107,7 @@ def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
 
 
 def session_of(given: Any) -> Any:
-    """Return the ONNX session for the bytes of a file; a session is returned unchanged."""
+    """ONNX session for the bytes of a file; a session is returned unchanged."""
     return _opened(given) if isinstance(given, bytes) else given
 
 
@@ -134,7 +134,7 @@ def _refuse_training_mode(module: Any, who: str) -> None:
 
 
 def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
-    """Return the names of the features that a model was trained on, or None if it does not record them."""
+    """Names of the features that a model was trained on, or None if it does not record them."""
     if ask is ask_onnx:
         listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
         return tuple(listed.split(",")) if listed else None
@@ -142,7 +142,7 @@ def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
 
 
 def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
-    """Return the number of discrete actions of a policy; None if it returns numbers in [-1, 1].
+    """Number of discrete actions of a policy; None if it returns numbers in [-1, 1].
 
     ``given`` is the number that the user states, or None. Raises ``InvalidInput``, beginning with ``who``, if the
     policy's action space does not fit: ``given`` actions, or without it a box from -1 to 1.
@@ -165,7 +165,7 @@ def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
 
 
 def statistics_of(model: Any) -> Any:
-    """Return the ``VecNormalize`` of a Stable-Baselines3 model, or None."""
+    """``VecNormalize`` of a Stable-Baselines3 model, or None."""
     return getattr(model, "get_vec_normalize_env", lambda: None)()
 
 
@@ -202,7 +202,7 @@ def layers_of(env: Any) -> Iterator[Any]:
 
 
 def _was_normalised(model: Any) -> bool:
-    """Return whether a model was trained on normalised observations.
+    """Whether a model was trained on normalised observations.
 
     Its last observation is then outside its space, or the original one is stored too (off-policy algorithms always do
     so).

@@ -38,7 +38,7 @@ class Choice(NamedTuple):
 
 @kernel
 def braking_now(speed, braking, onset, now):
-    """Return the acceleration of a vehicle at time ``now`` (m/s2), and how long it lasts (s).
+    """Acceleration of a vehicle at time ``now`` (m/s2), and how long it lasts (s).
 
     The vehicle coasts until its ``onset`` (s), then brakes from ``speed`` (m/s) to rest with ``braking`` (m/s2).
     """
@@ -80,7 +80,7 @@ def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset,
 
 @large
 def predicted_harm(line, braking, wait, body, a):
-    """Return H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2).
+    """H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2).
 
     Other arguments as in ``choose``, without the axis of worlds.
     """
@@ -151,7 +151,7 @@ def choose(line, braking, wait, body, at, harm, best, least):
 
 
 def closed_form(alert: State, braking: Floats, body: int) -> Choice:
-    """Return the best deceleration of vehicle ``body``, and H, if the others brake to rest as ``braking`` says.
+    """Best deceleration of vehicle ``body``, and H, if the others brake to rest as ``braking`` says.
 
     ``braking`` is [n, N + 1] m/s2.
     """
@@ -162,7 +162,7 @@ def closed_form(alert: State, braking: Floats, body: int) -> Choice:
 
 
 def pairwise(alert: State, body: int) -> Choice:
-    """Return the deceleration of vehicle ``body`` (1: Vehicle 1) that minimises H, and H, in every world.
+    """Deceleration of vehicle ``body`` (1: Vehicle 1) that minimises H, and H, in every world.
 
     Ties, such as all decelerations that avoid both impacts, give the middle one. The result depends on gaps, speeds,
     capacities and latencies of the vehicle and its neighbours, and ignores an obstacle.

@@ -79,7 +79,7 @@ class LearnedAgent:
             )
 
     def begin(self, alert: State, body: int) -> None:
-        """Return None: there is no memory."""
+        """No memory."""
 
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
         policy = self.policy
@@ -116,7 +116,7 @@ class PolicyAgent:
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Return commands, [n] m/s2, and the policy's new memory.
+        """Commands, [n] m/s2, and the policy's new memory.
 
         Raises ``AgentFailed`` for actions of a wrong shape or outside their range.
         """
@@ -180,7 +180,7 @@ def policy_agent(
     actions: int | None = None,
     ignore_wrappers: bool = False,
 ) -> PolicyAgent:
-    """Return an agent that drives with a policy of any library.
+    """Agent that drives with a policy of any library.
 
     The policy maps observations, [n, F] float32, to actions, [n, 1] or [n]: numbers in [-1, 1], or indices. A policy
     with a memory is a function ``(observations, state) -> (actions, state)``.
@@ -235,7 +235,7 @@ def policy_agent(
 
 
 def _view(given: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
-    """Return the features that a policy observes: ``given``, its own, or those of its training scenario's learners."""
+    """Features that a policy observes: ``given``, its own, or those of its training scenario's learners."""
     if given is not None:
         view = given if isinstance(given, View) else View(given)
         if trained_on not in (None, view.names):

@@ -15,7 +15,7 @@ ANY = ("policy", "team")  # names that stand for whatever algorithm has trained 
 
 
 def make_trained(argument: str | None, settings: Any) -> Agent | Team:
-    """Return the agent or team of a run or bundle, or of a shipped policy if the name has no path.
+    """Agent or team of a run or bundle, or of a shipped policy if the name has no path.
 
     ``argument``, or else the name before the ``@``, is the algorithm that must have trained it; ``policy`` and ``team``
     allow any. ``settings`` are ``names.AgentSettings``. A run in which each learner has its own policy gives a team, or

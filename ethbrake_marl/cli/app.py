@@ -114,7 +114,7 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def _status_of(arguments: Sequence[str]) -> int:
-    """Return the status with which a command ends. SystemExit: of typer, or of a command from another package."""
+    """Status with which a command ends. SystemExit: of typer, or of a command from another package."""
     try:
         with naming_extras():
             command = whole_command()
@@ -132,7 +132,7 @@ def _status_of(arguments: Sequence[str]) -> int:
 
 
 def _shell_asks(environment: Mapping[str, str]) -> bool:
-    """Return whether a shell has started this program to complete a command line (see ``--show-completion``).
+    """Whether a shell has started this program to complete a command line (see ``--show-completion``).
 
     False if only one of the shell's variables for completion is set: it may be left over from an earlier command.
     """
@@ -239,7 +239,7 @@ class Installed(TyperCommand):
         return self.command().make_context(*arguments, **settings)
 
     def get_short_help_str(self, limit: int = 45) -> str:
-        """Return the command's line in ``ethbrake --help``. Another package is only named there, not imported."""
+        """Line of the command in ``ethbrake --help``. Another package is only named there, not imported."""
         return str(self.command().get_short_help_str(limit) if self.is_ours else super().get_short_help_str(limit))
 
 
@@ -254,12 +254,12 @@ def with_installed(group: Any, name: str) -> Any:
 
 @cache
 def _built(*registered: object) -> Any:
-    """Return the commands of ``app``, built once (100 ms) while the same are registered. They must not be changed."""
+    """Commands of ``app``, built once (100 ms) while the same are registered. They must not be changed."""
     return get_command(app)
 
 
 def _apart(command: Any) -> Any:
-    """Return a copy of a command whose groups can get other commands."""
+    """Copy of a command whose groups can get other commands."""
     copied = copy(command)
     if hasattr(command, "commands"):
         copied.commands = {name: _apart(each) for name, each in command.commands.items()}
@@ -267,7 +267,7 @@ def _apart(command: Any) -> Any:
 
 
 def whole_command() -> Any:
-    """Return the program with all commands: the core's, those of installed packages, and those of ``add_command``.
+    """Program with all commands: the core's, those of installed packages, and those of ``add_command``.
 
     Raises ``AlreadyExists`` if two commands have the same name.
     """

@@ -56,7 +56,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the results on s
 
 
 def schema_option(module: str, function: str, kind: str) -> Any:
-    """Return the type of an option ``--schema``, which prints the JSON Schema of a ``kind`` of file and exits.
+    """Type of an option ``--schema``, which prints the JSON Schema of a ``kind`` of file and exits.
 
     ``function`` in ``module`` returns the schema. The module is imported only when the option is used.
     """
@@ -71,7 +71,7 @@ def schema_option(module: str, function: str, kind: str) -> Any:
 
 
 def example(*lines: str) -> str:
-    """Return the examples for the end of a help page. ``lines`` are commands without the word ``ethbrake``."""
+    """Examples for the end of a help page. ``lines`` are commands without the word ``ethbrake``."""
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 

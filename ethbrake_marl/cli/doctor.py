@@ -60,7 +60,7 @@ class Check:
 
 
 def diagnose(*, compile_all: bool = False) -> list[Check]:
-    """Return the results of all checks, in the order in which the user should solve problems.
+    """Results of all checks, in the order in which the user should solve problems.
 
     With ``compile_all``, also compile the numba kernels (``compile_ahead``).
     """

@@ -29,7 +29,7 @@ PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
 def page_of(shows: str, option: str) -> Callable[..., None]:
-    """Return the function registered for a page; without one, raise ``InvalidInput``, which begins with ``option``."""
+    """Function registered for a page. Raises ``InvalidInput`` without one; its message begins with ``option``."""
     if shows not in PAGES:
         raise InvalidInput(f"{option}: the extension that draws this page ({shows}) is not installed")
     return PAGES[shows]

@@ -72,7 +72,7 @@ def read_settings(
 
 
 def _counted(rules: Override, given: Sequence[Override], owner: str) -> Override:
-    """Return the setting for which ``rules=NAME`` is short: ``reward.harm_count`` of a recipe, else ``harm_count``.
+    """Setting for which ``rules=NAME`` is short: ``reward.harm_count`` of a recipe, else ``harm_count``.
 
     ``owner`` is ``recipe`` or another owner of settings. Raises ``InvalidInput`` for an unknown NAME, and if one of the
     settings ``given`` sets the same.

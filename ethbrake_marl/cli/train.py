@@ -121,7 +121,7 @@ def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Pat
 
 
 def changed(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
-    """Return the recipe with the command line's settings.
+    """Recipe with the command line's settings.
 
     Print a note if they make the discount ``gamma`` and the discount of reward shaping differ.
     """

@@ -93,6 +93,17 @@ class Game(NamedTuple):
     def step(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """State after one step of all worlds, and what happened in the step.
 
+        Environments, evaluation and simulations make a step in this order::
+
+            state, step = game.step(state, actions)  # a shield may replace actions; then the vehicles move
+            observations = game.observe(state, bodies)
+            rewards = step.reward[:, bodies - 1]
+            terminated, truncated = step.terminated, step.truncated
+            infos = dictionaries(game, state, step, seed, bodies)  # of ``episode.infos``
+
+        Within ``step``: the shield decides, scripts choose commands, learners' actions become commands, the physics
+        moves every line to the next decision, and harm, end and reward follow from the motion.
+
         ``actions`` [n, L] of the learners are in [-1, 1]. With a shield they are proposals: NaN for none, and None lets
         the shield's own agents propose. ``donate``: the arrays of ``state`` may be overwritten. Raises ``InvalidInput``
         for bad actions; after any error ``state`` is unchanged.

@@ -21,7 +21,7 @@ STAY = "\u00a0"  # a space at which no line ends
 
 
 def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
-    """Return each quantity's value, or its range ``[smallest, largest]``, from columns of worlds, name -> [n].
+    """Each quantity's value, or its range ``[smallest, largest]``, from columns of worlds, name -> [n].
 
     A list has one entry per vehicle or pair: ``{"gaps_m": [7.0, [5.0, 9.0]], "restitution": 0.1}``. Rates that no
     vehicle has are left out.
@@ -38,7 +38,7 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def caption(parameters: Mapping[str, Any]) -> str:
-    """Return one line with scenario, number of worlds, seed, recordings and quantities of a table's ``parameters``."""
+    """One line with scenario, number of worlds, seed, recordings and quantities of a table's ``parameters``."""
     parts = []
     for key, (symbol, unit) in SYMBOLS.items():
         if key in parameters:
@@ -53,7 +53,7 @@ def caption(parameters: Mapping[str, Any]) -> str:
 
 
 def by_recording(recordings: int) -> str:
-    """Return a clause for captions: from how many recordings the intervals come; "" for 0."""
+    """Clause for captions: from how many recordings the intervals come; "" for 0."""
     if recordings == 1:
         return "; no 95 % intervals: all worlds come from one recording"
     return f"; 95 % intervals by {recordings:,} recordings" if recordings else ""

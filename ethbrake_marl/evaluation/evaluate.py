@@ -73,7 +73,7 @@ class Result:
         return team in self.columns
 
     def take(self, rows: Any) -> Result:
-        """Return the result restricted to some worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
+        """Result restricted to some worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
         columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
         worlds = {name: each[rows] for name, each in self.worlds.items()}
         if not len(worlds["world"]):
@@ -83,7 +83,7 @@ class Result:
         return replace(self, columns=columns, worlds=worlds, about=about)
 
     def arrays(self) -> Columns:
-        """Return a table with one row per team and world: column name -> values. Missing numbers are NaN."""
+        """Table with one row per team and world: column name -> values. Missing numbers are NaN."""
         names = list(dict.fromkeys(name for own in self.columns.values() for name in own))
         table: Columns = {"agent": np.repeat([*self.columns], self.n)}
         table |= {name: np.tile(each, len(self.columns)) for name, each in self.worlds.items()}
@@ -94,7 +94,7 @@ class Result:
         return table | {"knows": np.repeat([self.knows[team] for team in self.columns], self.n)}
 
     def to_pandas(self) -> Any:
-        """Return the table of ``arrays`` as a ``DataFrame``. Raises ``MissingExtra`` without pandas."""
+        """Table of ``arrays`` as a ``DataFrame``. Raises ``MissingExtra`` without pandas."""
         with naming_extras():
             from pandas import DataFrame
 
@@ -220,7 +220,7 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 
 def hidden_from(alert: State, game: Game) -> Bools:
-    """Return whether the V2X channel hides something from a learner at its first decision, [n].
+    """Whether the V2X channel hides something from a learner at its first decision, [n].
 
     That is: the learner does not know everything about another vehicle, or a vehicle reacts later than its messages
     say, because it waits for messages itself.
@@ -232,7 +232,7 @@ def hidden_from(alert: State, game: Game) -> Bools:
 
 
 def known_by(team: Team) -> str:
-    """Return what a team needs to know, as one text such as ``messages + true model``."""
+    """What a team needs to know, as one text such as ``messages + true model``."""
     return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _known(team).values())
 
 

@@ -21,7 +21,7 @@ WORDS = ("name", "title", "description", "source")  # keys of a scenario that do
 
 
 def worlds_sha256(worlds: State) -> str:
-    """Return the SHA-256 of worlds at the alert, from all arrays, little-endian; of ``line`` the rows before PUSHED."""
+    """SHA-256 of worlds at the alert, from all arrays, little-endian; of ``line`` the rows before PUSHED."""
     digest = hashlib.sha256()
     for array in (worlds.line[:, :PUSHED], worlds.car, worlds.know, worlds.wanted):
         digest.update(f"{array.shape}".encode())
@@ -30,7 +30,7 @@ def worlds_sha256(worlds: State) -> str:
 
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
-    """Return the entries about a scenario, and the seed of its worlds, for ``evaluate(about=...)``."""
+    """Entries about a scenario, and the seed of its worlds, for ``evaluate(about=...)``."""
     content = json.dumps(scenario.content(without=WORDS), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
     about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
@@ -38,7 +38,7 @@ def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Return name -> version of Python and of every package that affects a result, including extensions.
+    """Name -> version of Python and of every package that affects a result, including extensions.
 
     It also has the SHA-256 of each Python file of the user that this process ran.
     """
@@ -47,6 +47,6 @@ def versions() -> dict[str, str]:
 
 
 def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
-    """Return vehicle -> SHA-256 of its policy's manifest, for policies of this package; ``drivers``: body -> agent."""
+    """Vehicle -> SHA-256 of its policy's manifest, for policies of this package; ``drivers``: body -> agent."""
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
     return {f"vehicle_{body}": each.manifest_sha256 for body, each in manifests.items() if each is not None}

@@ -58,7 +58,7 @@ class Watch(Protocol):
         """Process one step. ``step`` is None from the alert to the first decision."""
 
     def result(self, last: State) -> Given:
-        """Return the value, in the form that a measure returns."""
+        """Value, in the form that a measure returns."""
 
 
 class Statistic(NamedTuple):
@@ -85,7 +85,7 @@ class Measure(NamedTuple):
 
 
 def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
-    """Return the columns of a measure, name -> [n], from its value ``given``.
+    """Columns of a measure, name -> [n], from its value ``given``.
 
     Raises ``InvalidInput`` for a wrong shape or type.
     """
@@ -118,7 +118,7 @@ def collided(game: Game, alert: State, last: State) -> Given:
 
 
 def harm(count: str, game: Game, alert: State, last: State) -> Given:
-    """Return the harm of the line (ending ``""``) and of each vehicle (``1`` to ``N``), [n] each, in a count of harm.
+    """Harm of the line (ending ``""``) and of each vehicle (``1`` to ``N``), [n] each, in a count of harm.
 
     None for the honest cost if impacts are not exact.
     """

@@ -107,7 +107,7 @@ def split_names(names: str) -> list[str]:
 
 
 def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
-    """Return the measures, summed terms and objectives with these names, each once. ``FILE.py:NAME`` runs the file.
+    """Measures, summed terms and objectives with these names, each once. ``FILE.py:NAME`` runs the file.
 
     A measure from a file is called ``NAME``, or ``FILE.py:NAME`` if another one is called ``NAME``. Raises
     ``UnknownName``, and ``InvalidInput`` for a file without such a measure.
@@ -175,7 +175,7 @@ def _summed(name: str, term: TermFunction, unit: str) -> Measure:
 
 
 def _intervention(before: State, step: Step, after: State) -> Floats:
-    """Term intervention (``shields.decision``), but 0 without a shield, so that a table can compare both."""
+    """Term intervention (``shields.shield``), but 0 without a shield, so that a table can compare both."""
     if "shield" not in after.memories:
         return np.zeros(after.speeds_mps.shape)
     return TERMS["intervention"].value(before, step, after)

@@ -18,7 +18,7 @@ HARD_MPS2 = 1.0  # a command above this is hard driving
 
 
 def own_way_m(alert: State, body: int, until_s: float) -> Floats:
-    """Return the distance that a vehicle travels until ``until_s`` if nobody touches it, [n] m."""
+    """Distance that a vehicle travels until ``until_s`` if nobody touches it, [n] m."""
     check_exact(alert, "pushed_m")
     line, wanted = alert.line[:, :, [0, body]], alert.wanted[:, [0, body]]
     line[:, GAP, 0], line[:, GAP, 1] = POST_M, np.inf
@@ -28,7 +28,7 @@ def own_way_m(alert: State, body: int, until_s: float) -> Floats:
 
 
 def with_post(state: State) -> Floats:
-    """Return a copy of ``state.line`` in which Vehicle 1 has something ahead: without an obstacle, a far post.
+    """Copy of ``state.line`` in which Vehicle 1 has something ahead: without an obstacle, a far post.
 
     Its gap to Vehicle 1 shows how far Vehicle 1 moves.
     """
@@ -56,7 +56,7 @@ class PushedAway:
         self.way_m += from_m - line[:, GAP, 0]
 
     def result(self, last: State) -> Given:
-        """Return the distance of each vehicle (m), and whether that of Vehicle 1 is above ``PUSHED_FAR_M``."""
+        """Distance of each vehicle (m), and whether that of Vehicle 1 is above ``PUSHED_FAR_M``."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
             f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - own

@@ -136,7 +136,7 @@ def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> E
 
 
 def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
-    """Return k pieces of the motion between two decisions of one world, each at most ``sample_s`` long.
+    """Pieces of the motion between two decisions of one world, each at most ``sample_s`` long.
 
     They are times [k, 2], lines [k, 2, ...] at both ends, and commands [k, N + 1]. Without an obstacle, a post far
     ahead shows how far Vehicle 1 has moved.
@@ -153,7 +153,7 @@ def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floa
 
 
 def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
-    """Return the impacts in pieces of the motion (``_between``).
+    """Impacts in pieces of the motion (``_between``).
 
     Pieces with impacts are simulated again, for the time of the first one.
     """

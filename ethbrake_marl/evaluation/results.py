@@ -82,7 +82,7 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
 
 
 def read_result(path: str | Path) -> dict[str, dict[str, Any]]:
-    """Return team -> its object in ``results.json``.
+    """Team -> its object in ``results.json``.
 
     Raises ``InvalidInput`` for any other file, and for one that was edited or damaged.
     """

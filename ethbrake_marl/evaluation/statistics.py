@@ -42,7 +42,7 @@ Clusters = NDArray[Any] | None
 
 
 def mean(values: Floats, clusters: Clusters = None) -> Estimate:
-    """Return the mean with its t interval, ``mean -+ t s / sqrt(n)``.
+    """Mean with its t interval, ``mean -+ t s / sqrt(n)``.
 
     If no value is negative, the interval does not go below 0. If all values are 0, there is no interval: zeros do not
     show how large other values can be.
@@ -55,12 +55,12 @@ def mean(values: Floats, clusters: Clusters = None) -> Estimate:
 
 
 def difference(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate:
-    """Return the mean of ``values - baseline`` with its t interval."""
+    """Mean of ``values - baseline`` with its t interval."""
     return _mean(values - baseline, clusters)
 
 
 def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Estimate | None:
-    """Return ``1 - r`` for ``r = mean(values) / mean(baseline)``, by the delta method; None if the baseline is 0.
+    """``1 - r`` for ``r = mean(values) / mean(baseline)``, by the delta method; None if the baseline is 0.
 
     The standard error of r is ``std(values - r baseline) / (sqrt(n) abs(mean(baseline)))``.
     """
@@ -74,7 +74,7 @@ def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Est
 
 
 def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
-    """Return the share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
+    """Share p of worlds that are true, with Wilson's score interval, which lies within [0, 1].
 
     The interval has the centre ``(p + z^2 / (2 n)) / (1 + z^2 / n)`` and the half-width ``z sqrt(p (1 - p) / n + z^2 /
     (4 n^2)) / (1 + z^2 / n)``. With clusters, n is the number of independent worlds with the same standard error, ``1 +
@@ -97,7 +97,7 @@ def rate(truths: Bools, clusters: Clusters = None) -> Estimate:
 
 
 def wilson(share: float, count: float) -> tuple[float, float]:
-    """Return Wilson's interval for a share of ``count`` independent draws (``count`` may be a fraction)."""
+    """Wilson's interval for a share of ``count`` independent draws (``count`` may be a fraction)."""
     shrink = 1.0 + Z * Z / count
     centre = (share + Z * Z / (2.0 * count)) / shrink
     half = Z / shrink * sqrt(share * (1.0 - share) / count + Z * Z / (4.0 * count * count))
@@ -105,7 +105,7 @@ def wilson(share: float, count: float) -> tuple[float, float]:
 
 
 def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
-    """Return the difference of two means over different worlds, with Welch's interval.
+    """Difference of two means over different worlds, with Welch's interval.
 
     Its squared error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. If a standard error
     is unknown, there is no interval.
@@ -129,7 +129,7 @@ def _mean(values: Floats, clusters: Clusters) -> Estimate:
 
 
 def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters) -> Estimate:
-    """Return the ratio ``sum x / sum y`` with its interval, from ``residuals`` x - ratio y and ``weights`` y, [n]."""
+    """Ratio ``sum x / sum y`` with its interval, from ``residuals`` x - ratio y and ``weights`` y, [n]."""
     n, whole = len(residuals), fsum(weights)
     if clusters is None:
         if n < 2:
@@ -146,13 +146,13 @@ def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters
 
 
 def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> tuple[Floats, Floats]:
-    """Return the sums of ``residuals`` and of ``weights`` over each cluster, [G] each."""
+    """Sums of ``residuals`` and of ``weights`` over each cluster, [G] each."""
     which = np.unique(clusters, return_inverse=True)[1]
     return np.bincount(which, residuals).astype(np.float64), np.bincount(which, weights).astype(np.float64)
 
 
 def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, float, float] | tuple[None, None, None]:
-    """Return standard error, degrees of freedom and skewness of a ratio, from each recording's sums [G].
+    """Standard error, degrees of freedom and skewness of a ratio, from each recording's sums [G].
 
     ``whole`` is the sum of all weights. None: one recording has nearly all of it.
     """
@@ -167,7 +167,7 @@ def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, fl
 
 
 def _freedom(share: Floats, scale: Floats) -> float:
-    """Return Satterthwaite's ``tr(K)^2 / tr(K^2)``, with ``K_gk = scale_g^.5 C_gk scale_k^.5`` and, for the shares h,
+    """Satterthwaite's ``tr(K)^2 / tr(K^2)``, with ``K_gk = scale_g^.5 C_gk scale_k^.5`` and, for the shares h,
 
     ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)``: the covariance of the deviations from the common ratio if
     each recording's own deviation has the variance h_g^2.

@@ -60,7 +60,7 @@ class SummaryTable(list[SummaryRow]):
         return terminal_text(*self.tables())
 
     def sheet(self) -> Sheet:
-        """Return the table with all columns that have a heading."""
+        """Table with all columns that have a heading."""
         columns = [
             Column(each.heading, key, short=each.short, **_FORMATS.get(each.kind, {}))
             for key, (_, each) in self.shown.items()
@@ -73,7 +73,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", ["Agent", "Knows", *columns], rows)
 
     def terminal(self) -> Sheet:
-        """Return the table for a terminal, with intervals only in the first columns, below their values."""
+        """Table for a terminal, with intervals only in the first columns, below their values."""
         sheet, agent = self.sheet(), Column("Agent,\nwhat it knows", text=True)
         columns = [
             replace(each, interval="below" if each.name in FIRST_COLUMNS else "hidden")
@@ -85,7 +85,7 @@ class SummaryTable(list[SummaryRow]):
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
-        """Return the table of measures without a column of their own, or None."""
+        """Table of measures without a column of their own, or None."""
         asked = {
             key: f"{key} ({measure.unit})" if measure.unit and each.kind != "decrease" else key
             for key, (measure, each) in self.shown.items()
@@ -98,7 +98,7 @@ class SummaryTable(list[SummaryRow]):
         return [self.terminal(), *filter(None, [self.measures()])]
 
     def notes(self) -> list[str]:
-        """Return warnings for a reader: rejected worlds, exploits, hidden values."""
+        """Warnings for a reader: rejected worlds, exploits, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
             drawn = rejected + self.parameters["count"]
@@ -121,7 +121,7 @@ class SummaryTable(list[SummaryRow]):
         return notes
 
     def meanings(self) -> dict[str, str]:
-        """Return heading -> meaning of the column; for measures without a column, name -> meaning."""
+        """Heading -> meaning of the column; for measures without a column, name -> meaning."""
         told = {each.heading: each.meaning or measure.meaning for measure, each in self.shown.values() if each.heading}
         for measure, each in self.shown.values():
             if not each.heading and measure not in DEFAULT:
@@ -129,13 +129,13 @@ class SummaryTable(list[SummaryRow]):
         return HEAD | {name: text.replace("``", "") for name, text in told.items() if not name.startswith("Decrease")}
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return one object per team, with the result's digests, versions and ``parameters``."""
+        """One object per team, with the result's digests, versions and ``parameters``."""
         identity = {key: self.parameters[key] for key in IDENTITY if key in self.parameters}
         parameters = {key: value for key, value in self.parameters.items() if key not in IDENTITY}
         return [{"kind": "evaluate", **row.to_json(), **identity, "parameters": parameters} for row in self]
 
     def to_pandas(self) -> Any:
-        """Return a ``DataFrame`` with one row per team. ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
+        """``DataFrame`` with one row per team. ``x_low`` and ``x_high`` are the ends of the interval of ``x``.
 
         Missing numbers are NaN. Raises ``MissingExtra`` without pandas.
         """
@@ -157,7 +157,7 @@ class SummaryTable(list[SummaryRow]):
 
 
 def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
-    """Return the table of a result, one row per team.
+    """Table of a result, one row per team.
 
     ``baseline`` is the team with which the others are compared, paired by world. If the default, full braking, is not
     in the result, there are no comparisons; another missing team raises ``UnknownName``.
@@ -189,7 +189,7 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
 
 
 def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
-    """Return key of an estimate -> its column, measure and statistic, with comparisons and predictions last."""
+    """Key of an estimate -> its column, measure and statistic, with comparisons and predictions last."""
     shown: dict[str, tuple[str, Measure, Statistic]] = {}
     kinds = {name: column.dtype.kind for own in result.columns.values() for name, column in own.items()}
     minimised = result.about.get("agent_settings", {}).get("harm_count")
@@ -224,7 +224,7 @@ def _estimate(
 
 
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
-    """Return one table for each group of worlds, in alphabetical order.
+    """One table for each group of worlds, in alphabetical order.
 
     ``by`` is ``scenario`` (in a mixture), ``recording``, or a vehicle's type such as ``vehicle_2_type``; ``baseline``
     as in ``summarise``. Raises ``InvalidInput`` if the worlds have no groups, ``UnknownName`` for another name.
@@ -243,7 +243,7 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
 
 
 def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Result]) -> Sheet:
-    """Return one table of several evaluations, such as the tests of a standard: a section for each, a row per team.
+    """One table of several evaluations, such as the tests of a standard: a section for each, a row per team.
 
     A team passes a test if there is no impact in any world.
     """

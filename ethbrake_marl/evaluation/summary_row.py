@@ -62,7 +62,7 @@ class SummaryRow:
         return f"{self.agent} {EXPLOITS}" if self.exploits else self.agent
 
     def to_json(self) -> dict[str, Any]:
-        """Return each estimate with interval, standard error and degrees of freedom; None if unknown."""
+        """Each estimate with interval, standard error and degrees of freedom; None if unknown."""
         plain: dict[str, Any] = {
             "agent": self.agent, "knows": self.knows, "sees_through_channel": self.sees_through,
             "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,

@@ -73,7 +73,7 @@ def _to_the_end(game: Game, state: State) -> State:
 
 
 def _known(scenario: Scenario, state: State) -> dict[str, dict[str, float]]:
-    """Return for each learner the share of worlds in which it knows each other vehicle when it can first act."""
+    """For each learner, the share of worlds in which it knows each other vehicle when it can first act."""
     names: Any = scenario.vehicle_names
     acts_s = np.maximum(state.time_s[:, np.newaxis], state.latency_s)
     return {

@@ -43,7 +43,7 @@ class Face:
         return self.episode
 
     def _advance(self, actions: Floats) -> tuple[State, Step]:
-        """Return the state after a step, and what happened in it. The running episode changes only in ``_keep``."""
+        """State after a step, and what happened in it. The running episode changes only in ``_keep``."""
         before = self._begun("step")
         if not self.begins_again and before.clock[0, ENDED] == 1.0:
             raise InvalidInput("step: no episode is running; call reset first")
@@ -58,7 +58,7 @@ class Face:
         self.stream, self.episode = stream, state
 
     def _rewards(self, step: Step) -> Floats:
-        """Return the rewards of a step, [n, B], or vector rewards, [n, B, K]."""
+        """Rewards of a step, [n, B], or vector rewards, [n, B, K]."""
         rewards: Floats = (step.reward if step.vector is None else step.vector).take(self.bodies - 1, axis=1)
         return rewards
 
@@ -66,15 +66,15 @@ class Face:
         return dictionaries(self.game, state, step, stream.seeds_of(state), self.bodies)
 
     def describe_worlds(self) -> dict[str, Any]:
-        """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        """Drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         return self.stream.describe(self._begun("describe_worlds"))
 
     def describe_world(self) -> dict[str, Any]:
-        """Return ``describe_worlds`` of the first world, as plain numbers and texts."""
+        """``describe_worlds`` of the first world, as plain numbers and texts."""
         return {name: column[0].item() for name, column in self.describe_worlds().items()}
 
     def render(self) -> Any:
-        """Return pictures in the form that the render mode defines."""
+        """Pictures in the form that the render mode defines."""
         return self.renderer.render()
 
     def close(self, **kwargs: Any) -> None:

@@ -40,7 +40,7 @@ class OneLearner(Face):
         self._spec = spec and replace(spec, kwargs=listed, max_episode_steps=self._longest())
 
     def _longest(self) -> int:
-        """Return the largest number of steps of an episode in the scenario's worlds."""
+        """Largest number of steps of an episode in the scenario's worlds."""
         first_s = min(self.scenario.bounds("latency_s")[i - 1][0] for i in self.game.deciders)
         settings = self.game.settings
         return int(min(steps_to_horizon(first_s, settings), settings.most_steps))

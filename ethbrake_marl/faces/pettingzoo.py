@@ -25,14 +25,30 @@ Infos = dict[str, dict[str, Any]]
 
 
 class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: ignore[misc]  # PettingZoo has no types
-    """The vehicles of a line as agents, ``vehicle_1`` (front) to ``vehicle_N``.
+    """Emergency braking: N vehicles drive in one lane, Vehicle 1 brakes, and those behind it try to do little harm.
 
-    - Action of a learner, [1] in [-1, 1]: -1 brakes with full capacity, 0 coasts, +1 drives with full capacity. Actions
-      of scripted vehicles are ignored.
-    - End: all episodes end together, *terminated* when every vehicle is at rest and no command would move it,
-      *truncated* at the horizon.
-    - ``state()`` returns the full state of the line as a vector; ``episode`` is the ``State`` object. Infos:
-      ``episode.infos``.
+    The vehicles are the agents, ``vehicle_1`` (front) to ``vehicle_N``. Learners act; the others follow scripts.
+
+    **Action space.** ``Box(-1, 1, (1,), float32)`` for every agent: -1 brakes with full capacity, 0 coasts, +1 drives
+    with full capacity, once the vehicle's latency since the alert has elapsed. Every learner needs an action, unless
+    the environment has a shield; actions of scripted vehicles are ignored. With ``actions=K`` a learner's space is
+    ``Discrete(K)``.
+
+    **Observation space.** A float32 box of the features that the vehicle observes, each with its bounds; the attribute
+    ``features`` of the box has their names (``episode.features``). ``state()`` is the full state of the line as a
+    vector; ``episode`` is the ``State`` object.
+
+    **Rewards.** Minus the harm of the step: the sum of the squared closing speeds of its impacts (m2/s2), the same for
+    all vehicles. Other counts of harm, objectives of single vehicles and other terms: ``reward``.
+
+    **Start.** A world is drawn from the scenario at the alert, when Vehicle 1 begins to brake. The first observation
+    comes when the first learner's latency has elapsed. ``reset(seed=...)`` begins with the first world of the seed,
+    ``reset()`` goes on to the next one; the options of ``reset`` choose a world.
+
+    **End.** All agents end together: *terminated* when every vehicle is at rest and no command would move it,
+    *truncated* at the scenario's horizon. A step lasts ``time_step_s`` of the scenario, usually 0.1 s.
+
+    **Infos.** Time, commands, harm so far, seed and number of the world, and values of the shield (``episode.infos``).
 
     Args:
         scenario: a shipped name, the path or content of a YAML file, or a ``Scenario``.
@@ -105,7 +121,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return self.action_spaces[agent]
 
     def reward_space(self, agent: str) -> Any:
-        """Return an agent's space of vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
+        """Space of an agent's vector rewards. Raises ``InvalidInput`` if rewards are numbers."""
         if not self.game.rewarding.components:
             raise InvalidInput("reward_space: rewards are numbers here; make the environment with reward_vector")
         return self.reward_spaces[agent]
@@ -140,12 +156,12 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
         return answer
 
     def state(self) -> Observations:
-        """Return the full state of the line, [S] float32."""
+        """Full state of the line, [S] float32."""
         whole: Observations = full_state(self._begun("state"), *self._of_state)[0]
         return whole
 
     def _columns(self, actions: Mapping[str, Any]) -> Floats:
-        """Return the learners' actions, [1, L]. With a shield an action may be missing: NaN."""
+        """Actions of the learners, [1, L]. With a shield an action may be missing: NaN."""
         if not isinstance(actions, Mapping):
             raise InvalidInput(
                 f"step: actions = {actions!r}: must be a mapping from agent to action, such as {{'vehicle_2': [-1.0]}}"
@@ -175,7 +191,7 @@ parallel_env = EthBrakeParallelEnv
 
 
 def raw_env(scenario: AnyScenario = "paper-random", **settings: Any) -> Any:
-    """Return the environment in PettingZoo's AEC form (agents act in turns, front to rear), made by ``parallel_env``.
+    """Environment in PettingZoo's AEC form (agents act in turns, front to rear), made by ``parallel_env``.
 
     A bad action is refused at the turn of the last agent.
 

@@ -22,7 +22,7 @@ class Renderer:
         """Called after a step."""
 
     def render(self) -> Any:
-        """Return pictures in the form that the render mode defines; for many worlds, a list."""
+        """Pictures in the form that the render mode defines; for many worlds, a list."""
 
     def close(self) -> None:
         """Close windows and files."""
@@ -42,7 +42,7 @@ RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", registe
 
 
 def why_not(mode: str, many: bool = False) -> str | None:
-    """Return why a render mode cannot draw one world, or ``many``, on this machine; or None."""
+    """Why a render mode cannot draw one world, or ``many``, on this machine; or None."""
     try:
         getattr(RENDERERS[mode], "check", bool)(many)
     except EthBrakeError as error:
@@ -51,7 +51,7 @@ def why_not(mode: str, many: bool = False) -> str | None:
 
 
 def render_metadata(many: bool = False) -> dict[str, Any]:
-    """Return the entries of an environment's ``metadata`` about pictures, with the modes that work on this machine."""
+    """Entries of an environment's ``metadata`` about pictures, with the modes that work on this machine."""
     return {
         "render_modes": [mode for mode in RENDERERS if why_not(mode, many) is None],
         "render_fps": FRAMES_PER_SECOND,
@@ -69,7 +69,7 @@ class Metadata:
 
 
 def make_renderer(environment: Any, mode: str | None) -> Any:
-    """Return the renderer for a render mode. Raises ``InvalidInput`` for an unknown mode."""
+    """Renderer for a render mode. Raises ``InvalidInput`` for an unknown mode."""
     if mode is None:
         return Renderer()
     if mode not in RENDERERS:

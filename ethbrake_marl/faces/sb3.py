@@ -44,7 +44,7 @@ def make_sb3_vec_env(
     report: Sequence[str] = (),
     max_cycles: int | None = None,
 ) -> EthBrakeVecEnv:
-    """Return an environment for Stable-Baselines3 with ``n_envs`` worlds, simulated together.
+    """Environment for Stable-Baselines3 with ``n_envs`` worlds, simulated together.
 
     It has one row for each learner of each world, world by world: ``num_envs`` is ``n_envs`` times the learners.
     ``scenario``, ``learners``, ``reward``, ``observation``, ``actions``, ``report`` and ``max_cycles`` are as in
@@ -178,7 +178,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return seen, reward.astype(np.float32), over, infos
 
     def _last_infos(self, state: State, step: Step, ended: Any) -> list[dict[str, Any]]:
-        """Return the infos of each learner of the worlds ``ended`` (indices), whose last ``step`` led to ``state``."""
+        """Infos of each learner of the worlds ``ended`` (indices), whose last ``step`` led to ``state``."""
         terms = {name: term[ended] for name, term in step.terms.items()}
         step = step._replace(reward=step.reward[ended], out=step.out[:, ended], terms=terms)
         cut = (step.truncated & (not self.horizon_is_end)).repeat(len(self.bodies)).tolist()
@@ -207,7 +207,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         return np.concatenate([rows, more], axis=1, dtype=np.float32)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return everything that ``restore`` needs to continue from here, as arrays and numbers."""
+        """Everything that ``restore`` needs to continue from here, as arrays and numbers."""
         stream = [self.stream.seed, self.stream.next]
         return copy.deepcopy({"stream": stream, **{name: getattr(self, name) for name in SAVED}})
 
@@ -220,7 +220,7 @@ class EthBrakeVecEnv(Face, VecEnv):
             setattr(self, name, saved[name])
 
     def render(self, mode: str | None = None) -> Any:
-        """Return one text per world (``ansi``), or one picture of all worlds."""
+        """One text per world (``ansi``), or one picture of all worlds."""
         return self.get_images() if self.render_mode == "ansi" else VecEnv.render(self, mode)
 
     def get_images(self) -> list[Any]:

@@ -31,7 +31,7 @@ def shield(
     harm_count: str | None = None,
     **options: Any,
 ) -> Any:
-    """Return a shielded copy of an environment, of the same class, or a shielded team.
+    """Shielded copy of an environment, of the same class, or a shielded team.
 
     ``env`` is not changed; the copy starts with ``reset``. The shield acts inside the wrappers of ``env``: a wrapper
     that changes actions changes what is proposed to the shield. Infos: ``shield_...`` (docs/shield.md).
@@ -85,7 +85,7 @@ def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, o
 
 
 def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
-    """Return a shielded copy of an environment. If ``policy`` is a name, its agent minimises ``harm_count``.
+    """Shielded copy of an environment. If ``policy`` is a name, its agent minimises ``harm_count``.
 
     ``base`` is ``env`` without wrappers; ``around`` puts the shield around a team.
     """
@@ -111,7 +111,7 @@ def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Tea
 
 
 def playing(env: Any, game: Game) -> Any:
-    """Return a copy of an environment and its wrappers with another ``game``, without a running episode."""
+    """Copy of an environment and its wrappers with another ``game``, without a running episode."""
     base = env.unwrapped
     instead = {id(base.game): game, id(base.scenario): base.scenario, id(base.episode): None, id(base.renderer): None}
     other = copy.deepcopy(env, instead)

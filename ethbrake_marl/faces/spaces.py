@@ -15,7 +15,7 @@ from ethbrake_marl.motion.layout import Floats
 
 
 def feature_box(features: Sequence[Feature]) -> Box:
-    """Return a float32 box with the names of its entries in ``features``, which is saved with a model.
+    """Float32 box with the names of its entries in ``features``, which is saved with a model.
 
     The box is a plain one, because libraries look up the exact class of a space.
     """
@@ -26,12 +26,12 @@ def feature_box(features: Sequence[Feature]) -> Box:
 
 
 def reward_box(components: Sequence[Any]) -> Box:
-    """Return the space of vector rewards: float64, so a weighted sum equals the scalar reward to the last bit."""
+    """Space of vector rewards: float64, so a weighted sum equals the scalar reward to the last bit."""
     return Box(-np.inf, np.inf, (len(components),), np.float64)
 
 
 def action_space(count: int | None) -> Any:
-    """Return one learner's action space: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices.
+    """Action space of one learner: a box [1] from -1 (full braking) to 1 (full driving), or ``count`` indices.
 
     Indices stand for evenly spaced actions, as the attribute ``evenly_spaced`` of their space says.
     """
@@ -44,7 +44,7 @@ def action_space(count: int | None) -> Any:
 
 
 def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, count: int | None = None) -> Floats:
-    """Return actions as float64 of ``shape``; the input may lack axes of length 1, or have more.
+    """Actions as float64 of ``shape``; the input may lack axes of length 1, or have more.
 
     Index k of ``count`` stands for ``(2 k - count + 1) / (count - 1)``. Raises ``InvalidInput`` for a wrong shape or
     index, and for values that are not numbers. The range [-1, 1] is checked later, in ``Game.step``.

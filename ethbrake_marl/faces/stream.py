@@ -38,7 +38,7 @@ class Stream(NamedTuple):
     given: tuple[Drawn, int] | None = None  # the worlds that the last reset asked for, and their seed or -1
 
     def reset(self, n: int, seed: Any, options: Any = None) -> tuple[Stream, State]:
-        """Return new episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
+        """New episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
 
         A list has the seed of each row, which begins with the first world of its own seed. The first reset without a
         seed draws a random one. ``options`` may specify the worlds instead. Raises ``InvalidInput`` for a bad seed or
@@ -56,19 +56,19 @@ class Stream(NamedTuple):
         return self._replace(seed=chosen, next=after, given=given), self.game.reset(worlds)
 
     def next_episodes(self, rows: Ints) -> tuple[Stream, State]:
-        """Return new episodes in the next world of each row. They share no memory with other episodes."""
+        """New episodes in the next world of each row. They share no memory with other episodes."""
         worlds, after = self._draw(rows, self.seed, self.next)
         return self._replace(next=after), self.game.reset(worlds)
 
     def _draw(self, rows: Ints, seed: Any, first: Any) -> tuple[State, Any]:
-        """Return the next world of each row, and ``next`` after it."""
+        """Next world of each row, and ``next`` after it."""
         if isinstance(seed, int):
             return self.game.draw(len(rows), seed, first), first + len(rows)
         drawn = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), purpose="training") for k in rows]
         return State.join(drawn), first + np.isin(np.arange(len(first)), rows)
 
     def seeds_of(self, state: State, rows: Any = slice(None)) -> Any:
-        """Return the seed of each world of ``rows``, whose episodes are ``state``, or of all.
+        """Seed of each world of ``rows``, whose episodes are ``state``, or of all.
 
         It is -1 for a world that the caller made.
         """
@@ -76,7 +76,7 @@ class Stream(NamedTuple):
         return seed if self.given is None else np.where(state.clock[:, NUMBER] < 0.0, self.given[1], seed)
 
     def describe(self, state: State) -> dict[str, Any]:
-        """Return the drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
+        """Drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         numbers, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed, object)
         place, parts = np.arange(state.n), [] if self.given is None else [self.given[0]]
         of_stream = np.flatnonzero(numbers >= 0)
@@ -88,7 +88,7 @@ class Stream(NamedTuple):
         return {**columns, "world_seed": names["world_seed"], "world": names["world"]}
 
     def _asked_for(self, n: int, options: Any) -> tuple[Drawn, int] | None:
-        """Return the worlds that ``options`` of a reset specify, and their seed or -1; or None."""
+        """Worlds that ``options`` of a reset specify, and their seed or -1; or None."""
         if options is None:
             return None
         if not isinstance(options, Mapping):
@@ -120,7 +120,7 @@ class Stream(NamedTuple):
 
 
 def chosen_seed(seed: int | None) -> int:
-    """Return the seed, or for None a random one of 63 bits. Raises ``InvalidInput`` for a bad seed."""
+    """Seed, or for None a random one of 63 bits. Raises ``InvalidInput`` for a bad seed."""
     if seed is None:
         return int.from_bytes(np.random.SeedSequence().generate_state(2).tobytes(), "little") % 2**63
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not seed >= 0:

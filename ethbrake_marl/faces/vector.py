@@ -117,7 +117,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
 
 
 def masked(columns: dict[str, Any], rows: Bools) -> dict[str, Any]:
-    """Return infos in Gymnasium's vector form: arrays of values, each with the mask ``rows`` [n] of its valid rows."""
+    """Infos in Gymnasium's vector form: arrays of values, each with the mask ``rows`` [n] of its valid rows."""
     infos: dict[str, Any] = {}
     for name, column in columns.items():
         infos[name] = column.copy() if rows.all() else np.where(rows, column, np.zeros((), column.dtype))

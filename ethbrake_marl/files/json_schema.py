@@ -26,7 +26,7 @@ class FileSchema(GenerateJsonSchema):
 
 
 def schema_lines(kind: str, command: str) -> str:
-    """Return comment lines for a new YAML file that name its JSON Schema and the command that prints it.
+    """Comment lines for a new YAML file that name its JSON Schema and the command that prints it.
 
     ``kind`` is ``scenario`` or ``recipe``; ``command`` is a subcommand such as ``scenario schema``.
     """

@@ -71,7 +71,7 @@ class Wording:
         self.model, self._needed = model, needed
 
     def known(self, path: YamlPath) -> list[str]:
-        """Return the valid keys in place of the last key of ``path``."""
+        """Valid keys in place of the last key of ``path``."""
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
@@ -79,24 +79,24 @@ class Wording:
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
-        """Return advice about the missing key at ``path``."""
+        """Advice about the missing key at ``path``."""
         return self._needed
 
     def instead(self, key: str) -> str:
-        """Return advice about what to write instead of the unknown ``key``."""
+        """Advice about what to write instead of the unknown ``key``."""
         return ""
 
     def owner(self, path: YamlPath) -> str:
-        """Return the vehicle or pair that the value at ``path`` describes."""
+        """Vehicle or pair that the value at ``path`` describes."""
         return ""
 
     def right(self, detail: ErrorDetails) -> str:
-        """Return what would be valid in place of a value that pydantic rejects; empty: a general text is used."""
+        """What would be valid in place of a value that pydantic rejects; empty: a general text is used."""
         return ""
 
 
 def explain(document: Document, error: ValidationError, wording: Wording) -> InvalidInput:
-    """Return the error for the first mistake that pydantic reports, or for the first unknown key if there is one."""
+    """Error for the first mistake that pydantic reports, or for the first unknown key if there is one."""
     # A default that depends on an invalid field is no mistake of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
     shown = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
@@ -127,7 +127,7 @@ def read_model(source: str | Path | Document, model: type[Model], wording: Wordi
 
 
 def read_json_model(data: bytes, model: type[Model]) -> tuple[Any, Model]:
-    """Return a JSON file's content, as plain data and as ``model``. Raises ``ValueError`` with a one-line reason."""
+    """Content of a JSON file, as plain data and as ``model``. Raises ``ValueError`` with a one-line reason."""
     content = parse_strict_json(data)  # refuses repeated keys and NaN
     try:
         return content, model.model_validate_json(data)
@@ -153,7 +153,7 @@ def first_mistake(error: ValidationError) -> Mistake:
 
 
 def path_of(detail: ErrorDetails) -> YamlPath:
-    """Return the path, inside the file, of a mistake that pydantic reports.
+    """Path, inside the file, of a mistake that pydantic reports.
 
     Tags of unions are removed. If ``refuse`` raised the error, its ``at`` is appended.
     """
@@ -178,7 +178,7 @@ def _describe(detail: ErrorDetails, path: YamlPath, wording: Wording) -> str:
 
 
 def _show(detail: ErrorDetails) -> str:
-    """Return the text of the invalid value, or "" for a whole file. A float in place of an integer keeps its point."""
+    """Text of the invalid value, or "" for a whole file. A float in place of an integer keeps its point."""
     value = detail["input"]
     if isinstance(value, BaseModel) or not detail["loc"]:
         return ""
@@ -192,7 +192,7 @@ def _place(path: YamlPath, wording: Wording) -> str:
 
 
 def _unquote(detail: ErrorDetails) -> str:
-    """Return advice about a number in quotes, which YAML reads as text."""
+    """Advice about a number in quotes, which YAML reads as text."""
     value = detail["input"]
     quoted = detail["type"] == "float_type" and isinstance(value, str) and parse_numeral(value) is not None
     return "must be a number, not text; write it without quotes" if quoted else ""
@@ -221,7 +221,7 @@ def _right(detail: ErrorDetails) -> str:
 
 
 def suggestion(key: str, known: Iterable[str]) -> str:
-    """Return "did you mean ...?" or "renamed to ..." for an unknown ``key``, or "" if no known key is similar.
+    """Text "did you mean ...?" or "renamed to ..." for an unknown ``key``, or "" if no known key is similar.
 
     It also recognises a key with a wrong or missing unit, such as ``gaps_km`` or ``mass``.
     """

@@ -30,7 +30,7 @@ class Override:
         return ".".join(self.path)
 
     def inside(self) -> Override:
-        """Return the setting without its first key: for ``reward.harm=0.5``, ``harm=0.5``."""
+        """Setting without its first key: for ``reward.harm=0.5``, ``harm=0.5``."""
         return Override(self.text, self.path[1:], self.value)
 
     @staticmethod
@@ -66,7 +66,7 @@ class Override:
 
 
 def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
-    """Return a copy of ``part`` with the override's value at ``path``; missing mappings are created."""
+    """Copy of ``part`` with the override's value at ``path``; missing mappings are created."""
     if not path:
         return override.value
     key, rest = path[0], path[1:]

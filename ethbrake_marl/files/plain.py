@@ -24,7 +24,7 @@ def read_plain(
     refusal: type[EthBrakeError] = InvalidInput,
     follow_links: bool = True,
 ) -> bytes:
-    """Return the content of a plain file. Arguments and errors as in ``open_plain``."""
+    """Content of a plain file. Arguments and errors as in ``open_plain``."""
     with open_plain(path, limit_bytes, refusal=refusal, follow_links=follow_links) as stream:
         data = stream.read(limit_bytes + 1)  # files of /proc say that they are empty, and a file may grow
     if len(data) > limit_bytes:
@@ -82,7 +82,7 @@ def parse_strict_json(data: bytes) -> Any:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """Return the JSON object in a file of a training run. Raises ``InvalidInput`` if the file is missing or damaged."""
+    """JSON object in a file of a training run. Raises ``InvalidInput`` if the file is missing or damaged."""
     data = read_plain(file, LARGEST_OBJECT_BYTES)
     try:
         content = parse_strict_json(data)

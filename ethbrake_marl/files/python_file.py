@@ -40,7 +40,7 @@ def load_from_file(path: str, name: str, reads: str | None = None) -> Any:
 
 
 def files_run() -> dict[str, str]:
-    """Return file name -> SHA-256 of every Python file that this process ran, and of the files that they use.
+    """File name -> SHA-256 of every Python file that this process ran, and of the files that they use.
 
     For several files of one name, all their hashes are given, separated by commas.
     """
@@ -49,7 +49,7 @@ def files_run() -> dict[str, str]:
 
 
 def _run_file(path: Path, what: str) -> ModuleType:
-    """Return the module of a Python file, which runs if it has not run before. ``what`` names it in messages."""
+    """Module of a Python file, which runs if it has not run before. ``what`` names it in messages."""
     if not path.is_file():
         raise InvalidInput(f"{what}: {'is not a plain file' if path.exists() else 'does not exist'}")
     content, path = read_plain(path, _LIMIT_BYTES), path.resolve()

@@ -30,16 +30,16 @@ class Estimate:
         return self.interval or (self.value, self.value)
 
     def in_words(self, *, digits: int = 2, scale: float = 1.0, unit: str = "") -> str:
-        """Return value and interval, times ``scale``, as text, such as ``24.19 [23.85, 24.53]``."""
+        """Value and interval, times ``scale``, as text, such as ``24.19 [23.85, 24.53]``."""
         return Column("", digits=digits, scale=scale, unit=unit).show(self).in_words
 
     def to_json(self) -> dict[str, Any]:
-        """Return ``{"value": ..., "interval": [low, high] or None}``."""
+        """``{"value": ..., "interval": [low, high] or None}``."""
         return {"value": self.value, "interval": None if self.interval is None else list(self.interval)}
 
     @staticmethod
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
-        """Return estimates in flat form for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; None if unknown."""
+        """Estimates in flat form for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; None if unknown."""
         cells: dict[str, Any] = {}
         for name, each in estimates.items():
             cells[name] = None if each is None else each.value
@@ -80,7 +80,7 @@ class Column:
         return self.key or self.heading
 
     def show(self, cell: Cell) -> Shown:
-        """Return the text of a cell; a dash for None."""
+        """Text of a cell; a dash for None."""
         if cell is None or isinstance(cell, Shown):
             return cell or Shown(DASH)
         if isinstance(cell, str | int):
@@ -91,7 +91,7 @@ class Column:
         return Shown(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
 
     def in_terminal(self, shown: Shown) -> str:
-        """Return the text of a cell in a terminal. A second line (the interval) is shown dim."""
+        """Text of a cell in a terminal. A second line (the interval) is shown dim."""
         if self.interval == "beside":
             return shown.in_words
         return shown.value + (f"\n{shown.interval}" if shown.interval and self.interval == "below" else "")
@@ -137,7 +137,7 @@ class Sheet:
         return [column.name for column in self.formats]
 
     def shown(self) -> Iterator[str | tuple[Shown, ...]]:
-        """Yield each row as formatted cells, and each section as its name."""
+        """Each row as formatted cells, and each section as its name."""
         columns = self.formats
         for row in self.rows:
             if isinstance(row, str):
@@ -147,20 +147,20 @@ class Sheet:
                 yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
-        """Return the table with only the given columns (from 0)."""
+        """Table with only the given columns (from 0)."""
         names = list(columns)
         rows = [row if isinstance(row, str) else [row[k] for k in names if k < len(row)] for row in self.rows]
         return replace(self, columns=[self.columns[k] for k in names], rows=rows)
 
     def filled(self) -> list[int]:
-        """Return the indices of the columns that have a value in some row; all indices if there are no rows."""
+        """Indices of the columns that have a value in some row; all indices if there are no rows."""
         rows = [row for row in self.rows if not isinstance(row, str)]
         return [
             k for k in range(len(self.columns)) if not rows or any(k < len(row) and row[k] is not None for row in rows)
         ]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the table, with the note below, for a terminal.
+        """Table, with the note below, for a terminal.
 
         Names in the first column are never broken: names that do not fit become numbers, which are explained below the
         table.
@@ -200,7 +200,7 @@ class Sheet:
             yield Text(f"\n{note}", "dim")
 
     def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
-        """Return how many columns fit into ``width`` characters, and the number of each name that does not fit."""
+        """Number of columns that fit into ``width`` characters, and the number of each name that does not fit."""
         columns = self.formats
         texts = [[each.short or each.heading, *(row[k] for row in rows)] for k, each in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
@@ -215,7 +215,7 @@ class Sheet:
         return shown, {name: f"[{number}]" for number, name in enumerate(long, 1)}
 
     def json(self) -> list[dict[str, Any]]:
-        """Return one mapping per row, column name -> cell, without sections. An interval has an entry of its own."""
+        """One mapping per row, column name -> cell, without sections. An interval has an entry of its own."""
         rows = []
         for row in self.rows:
             if not isinstance(row, str):
@@ -230,7 +230,7 @@ class Sheet:
 
 
 def terminal_text(*shown: RenderableType) -> str:
-    """Return tables and texts as plain text, as wide as the terminal."""
+    """Tables and texts as plain text, as wide as the terminal."""
     from rich.console import Console
 
     text = io.StringIO()
@@ -240,7 +240,7 @@ def terminal_text(*shown: RenderableType) -> str:
 
 
 def flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row in which each pair ``x_interval`` becomes two entries, ``x_low`` and ``x_high``."""
+    """Row in which each pair ``x_interval`` becomes two entries, ``x_low`` and ``x_high``."""
     line: dict[str, Any] = {}
     for name, value in row.items():
         if name.endswith("_interval"):
@@ -252,7 +252,7 @@ def flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return ``flat`` rows as CSV with a header: all columns, in order of appearance. Missing values are empty."""
+    """``flat`` rows as CSV with a header: all columns, in order of appearance. Missing values are empty."""
     lines = [flat(row) for row in rows]
     text = io.StringIO(newline="")
     names = dict.fromkeys(name for line in lines for name in line)

@@ -26,7 +26,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path; its file is renamed to ``path`` if the block succeeds, otherwise deleted."""
+    """Temporary path, whose file is renamed to ``path`` if the block succeeds, otherwise deleted."""
     partial = _temporary(path.parent)
     try:
         yield partial
@@ -93,7 +93,7 @@ def write_output(path: str | Path, data: bytes, *, force: bool = False) -> None:
 
 @contextmanager
 def new_folder(path: Path, *, replace: bool = False) -> Iterator[Path]:
-    """Yield a temporary folder; it is renamed to ``path`` if the block succeeds, otherwise deleted.
+    """Temporary folder, which is renamed to ``path`` if the block succeeds, otherwise deleted.
 
     With ``replace`` an existing ``path`` is deleted after the block; without it, an existing ``path`` raises
     ``AlreadyExists``.

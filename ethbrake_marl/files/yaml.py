@@ -22,7 +22,7 @@ _NUMERAL = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
 
 
 def parse_numeral(text: str) -> float | None:
-    """Return the number in ``text`` (infinity if it is too large), or None if it is not a number."""
+    """Number in ``text`` (infinity if it is too large), or None if it is not a number."""
     return float(text) if _NUMERAL.fullmatch(text) else None
 
 
@@ -32,7 +32,7 @@ _RESERVED = {"null", "true", "false"}
 
 
 def flow_text(value: Any, longest: int | None = None) -> str:
-    """Return ``value`` as YAML on one line (flow style), which reads back as an equal value.
+    """``value`` as YAML on one line (flow style), which reads back as an equal value.
 
     ``value`` may consist of printable texts, lists, mappings with text keys, numbers, true, false and null. ``longest``
     cuts the text off, for error messages.
@@ -94,7 +94,7 @@ class Document:
     lines: Mapping[YamlPath, int]  # line number (from 1) of each value
 
     def where(self, path: YamlPath) -> str:
-        """Return file and line of a value, such as ``my.yaml, line 7``. A missing value has the line of its mapping."""
+        """File and line of a value, such as ``my.yaml, line 7``. A missing value has the line of its mapping."""
         for length in range(len(path), -1, -1):
             if path[:length] in self.lines:
                 return f"{self.file}, line {self.lines[path[:length]]}"
@@ -133,7 +133,7 @@ def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT)
 
 @lru_cache(maxsize=128)
 def _parse(text: str, file: str) -> tuple[Any, Mapping[YamlPath, int]]:
-    """Return content and lines, which are kept for the next reader of the same text (10 ms) and must not be changed."""
+    """Content and lines, which are kept for the next reader of the same text (10 ms) and must not be changed."""
     lines: dict[YamlPath, int] = {}
     try:
         node = yaml.compose(text, Loader=_Loader)
@@ -203,7 +203,7 @@ def _value(node: yaml.Node, path: YamlPath, lines: dict[YamlPath, int]) -> Any:
 
 
 def _scalar(node: yaml.ScalarNode) -> Any:
-    """Return the value of a scalar. Quoted and block scalars are always text."""
+    """Value of a scalar. Quoted and block scalars are always text."""
     if node.style is not None:
         return str(node.value)
     value = next(

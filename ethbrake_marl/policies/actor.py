@@ -24,7 +24,7 @@ class Actor:
         self.layers = layers_of(tensors, "policy", len(spec.policy_hidden))
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32. Raises ``InvalidInput``."""
+        """Actions [n, 1] in [-1, 1] for observations [n, F] float32. Raises ``InvalidInput``."""
         check_observations(observations, self.spec.observation_size)
         actions = np.empty((len(observations), 1), np.float32)
         for start in range(0, len(observations), BLOCK_ROWS):
@@ -33,7 +33,7 @@ class Actor:
         return actions
 
     def columns(self, x: Float32s) -> Float32s:
-        """Return the actions [1, rows] for observations as columns, [F, rows]."""
+        """Actions [1, rows] for observations as columns, [F, rows]."""
         y = self.forward(x)
         if self.spec.output == "choice":
             return self.actions[np.newaxis, y.argmax(axis=0)]

@@ -19,7 +19,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a 
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Return the policy in a bundle, or in the folder ``policy`` of a training run.
+    """Policy in a bundle, or in the folder ``policy`` of a training run.
 
     Raises ``InvalidInput`` if there is none, and ``CorruptBundle`` with file and reason if it is damaged.
     """
@@ -77,12 +77,12 @@ def _bundle_in(path: Path) -> Path:
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Return name -> folder of every shipped policy. The folder has its card and the bundle ``policy``."""
+    """Name -> folder of every shipped policy. The folder has its card and the bundle ``policy``."""
     return {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob("*/policy"))}
 
 
 def load_shipped(name: str) -> Policy:
-    """Return a shipped policy, such as ``universal``. Raises ``UnknownName``."""
+    """Shipped policy, such as ``universal``. Raises ``UnknownName``."""
     folders = shipped_policies()
     if name not in folders:
         raise unknown_name("shipped policy", name, folders)
@@ -90,7 +90,7 @@ def load_shipped(name: str) -> Policy:
 
 
 def load_named_policy(name: str) -> Policy:
-    """Return a shipped policy by its name, or another policy by the path of its run or bundle, such as ``./ppo``."""
+    """Shipped policy by its name, or another policy by the path of its run or bundle, such as ``./ppo``."""
     return load_policy(shipped_policies().get(name, name))
 
 
@@ -109,7 +109,7 @@ def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], 
 
 
 def load_drivers(folder: str | os.PathLike[str]) -> dict[str, Policy]:
-    """Return vehicle -> policy, front to rear, of a ``save_drivers`` folder. Raises the errors of ``load_policy``."""
+    """Vehicle -> policy, front to rear, of a ``save_drivers`` folder. Raises the errors of ``load_policy``."""
     path = Path(folder)
     names = sorted((each.name for each in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
     if names:

@@ -22,7 +22,7 @@ SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 
 
 def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers:
-    """Return (weight, bias) of each layer, from the tensors ``name.0.weight`` to ``name.output.bias``.
+    """(weight, bias) of each layer, from the tensors ``name.0.weight`` to ``name.output.bias``.
 
     ``hidden`` is the number of hidden layers.
     """

@@ -125,7 +125,7 @@ def _is_ours(own: Own) -> bool:
 
 
 def _tried(own: Own) -> tuple[float, ...]:
-    """Return a feature's values in the trial worlds: in one world if this package defines it, else in three."""
+    """A feature's values in the trial worlds: in one world if this package defines it, else in three."""
     state = _trial_worlds()
     if _is_ours(own):
         state = state.take(slice(1))

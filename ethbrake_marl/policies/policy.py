@@ -61,12 +61,12 @@ class Policy:
         return View(self.manifest.observation.features)
 
     def __call__(self, observations: Float32s) -> Float32s:
-        """Return the actions [n, 1] in [-1, 1] for observations [n, F] float32. A row does not depend on the others."""
+        """Actions [n, 1] in [-1, 1] for observations [n, F] float32. A row does not depend on the others."""
         return self.actor(observations)
 
     @classmethod
     def make(cls, tensors: Mapping[str, Float32s], *, network: NetworkSpec, observation: View, **manifest: Any) -> Self:
-        """Return a policy with these tensors. ``manifest``: all fields of ``Manifest`` except hashes and versions.
+        """Policy with these tensors. ``manifest``: all fields of ``Manifest`` except hashes and versions.
 
         Raises ``InvalidInput`` with the bad tensor or field.
         """
@@ -102,7 +102,7 @@ def serialised(tensors: Mapping[str, Float32s]) -> bytes:
 
 
 def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
-    """Return name -> read-only tensor, from the bytes of a safetensors file.
+    """Name -> read-only tensor, from the bytes of a safetensors file.
 
     Raises ``ValueError`` for a tensor of a wrong name, shape or type, or with an entry that is not finite.
     """

@@ -23,9 +23,8 @@ from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.decision import check_harm_count, check_learners, checked_drivers, spread
 from ethbrake_marl.shields.fallbacks import held, rollout
-from ethbrake_marl.shields.named import NamedShield
+from ethbrake_marl.shields.shield import NamedShield, check_harm_count, check_learners, checked_drivers, spread
 
 ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
 
@@ -67,7 +66,7 @@ class EpisodeShield:
             )
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision ``state``: which driver gets each episode."""
+        """Memory at the first decision ``state``: which driver gets each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
         remembered = begin(game.agents({body: agent})[body], alert, body)

@@ -26,7 +26,7 @@ ALONE = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried w
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
-    """Return the plans of constant actions from which a shield chooses at the alert, [n, T, L] each.
+    """Plans of constant actions from which a shield chooses at the alert, [n, T, L] each.
 
     One learner: E-V2X-BM. Several: full braking; E-V2X-BM of one learner while the others brake fully; and each
     learner's best share of its brakes, chosen one after the other.
@@ -46,13 +46,13 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
 
 
 def held(game: Game, actions: Floats) -> Floats:
-    """Return plans [n, T, L] that repeat the actions [n, L] up to the horizon."""
+    """Plans [n, T, L] that repeat the actions [n, L] up to the horizon."""
     decisions = int(np.ceil(game.settings.horizon_s / game.settings.time_step_s)) + 1
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)
 
 
 def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple[Floats, Floats]:
-    """Return the constant actions that do the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
+    """Constant actions that do the least harm, [n, 1, L], and an estimate of this harm, [n] m2/s2.
 
     It tries the next actions of ``plans`` [n, T, L], all of them harder or softer by the same ``CHANGES``, and, with
     several learners, one learner's other actions while the rest follow the plan. ``states`` may have several possible
@@ -76,7 +76,7 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
 def rollout(
     game: Game, drivers: Mapping[int, Agent], state: State, plans: Floats, count: str, most: Any = np.inf
 ) -> Floats:
-    """Return ``plans`` with the actions of agents that drive from ``state`` on, until the harm is above ``most`` [n].
+    """``plans`` with the actions of agents that drive from ``state`` on, until the harm is above ``most`` [n].
 
     ``state`` contains the agents' memories.
     """

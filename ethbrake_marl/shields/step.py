@@ -45,9 +45,15 @@ from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.decision import ShieldReason, check_harm_count, check_learners, checked_drivers, spread
 from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
-from ethbrake_marl.shields.named import NamedShield
+from ethbrake_marl.shields.shield import (
+    NamedShield,
+    ShieldReason,
+    check_harm_count,
+    check_learners,
+    checked_drivers,
+    spread,
+)
 
 NEARLY = 1e-9  # harm (m2/s2) by which a fallback's estimate may be too high, because it is rounded differently
 
@@ -116,11 +122,11 @@ class StepShield:
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the M possible states of each world, M rows per world, the nominal one first. Here M = 1."""
+        """M possible states of each world, M rows per world, the nominal one first. Here M = 1."""
         return state
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Return the harm of each plan, [n] m2/s2: the largest over the M possible states of a world.
+        """Harm of each plan, [n] m2/s2: the largest over the M possible states of a world.
 
         A simulation stops where its harm is above ``most``. The harm is infinite if a vehicle would bear more than its
         cap (``caps`` [n, N] m2/s2).
@@ -131,7 +137,7 @@ class StepShield:
         return harm
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
-        """Return the plans in which the shield's agents drive on until the harm is above ``most`` [n]."""
+        """Plans in which the shield's agents drive on until the harm is above ``most`` [n]."""
         return rollout(game, self.drivers, state, plans, self.count, most)
 
     def bound(self, memory: Memory) -> Floats:
@@ -147,12 +153,12 @@ class StepShield:
         return first_plans(game, alert, state, self.count)
 
     def cheapest(self, game: Game, states: State, plans: list[Floats]) -> tuple[Floats, Floats]:
-        """Return the plan with the smallest price in each world, and this price, [n] m2/s2."""
+        """Plan with the smallest price in each world, and this price, [n] m2/s2."""
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         return np.stack(plans)[prices.argmin(axis=0), np.arange(prices.shape[1])], prices.min(axis=0)
 
     def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
-        """Return the memory at the first decision; its plan is the best constant actions or the agents' rollout.
+        """Memory at the first decision; its plan is the best constant actions or the agents' rollout.
 
         ``states`` are the possible states (``seen``), ``agents`` body -> memory at the alert.
         """
@@ -210,7 +216,7 @@ class StepShield:
         )  # fmt: skip
 
     def asked(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
-        """Return the proposals [n, L], NaN for none, and the state with the new memories of the shield's agents.
+        """Proposals [n, L], NaN for none, and the state with the new memories of the shield's agents.
 
         The agents propose where nobody else does. An agent with a memory is asked at every decision, so it stays up to
         date.
@@ -293,7 +299,7 @@ def part(states: State, rows: Ints, M: int) -> State:
 
 @cache
 def trials(learners: int) -> Bools:
-    """Return which of the L proposals each trial includes, [1 + L, L]: all, then one by one; [1, 1] for one learner."""
+    """Which of the L proposals each trial includes, [1 + L, L]: all, then one by one; [1, 1] for one learner."""
     alone = np.eye(learners, dtype=np.bool_)
     return alone if learners == 1 else np.concatenate([alone.any(axis=0, keepdims=True), alone])
 

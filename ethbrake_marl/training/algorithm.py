@@ -26,17 +26,17 @@ class Algorithm(ABC):
 
     @abstractmethod
     def build(self, training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
-        """Return a new model on the CPU, with random numbers from the recipe's seed only.
+        """New model on the CPU, with random numbers from the recipe's seed only.
 
         ``environment`` has one row for each learner in each world.
         """
 
     def actors(self, model: BaseAlgorithm) -> list[Any]:
-        """Return the policies that choose actions, one for each of ``training.groups``."""
+        """Policies that choose actions, one for each of ``training.groups``."""
         return [model.policy]
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        """Return a copy of an actor's weights, name in a policy file -> tensor, for networks like PPO's or SAC's."""
+        """Copy of an actor's weights, name in a policy file -> tensor, for networks like PPO's or SAC's."""
         if network.output != "clip":
             inner = actor.actor
             return tensors_of("policy", [*inner.latent_pi, inner.mu]) | _of_layer("policy.log_std", inner.log_std)
@@ -49,7 +49,7 @@ class Algorithm(ABC):
 
 
 def tensors_of(name: str, layers: Iterable[nn.Module]) -> dict[str, Float32s]:
-    """Return the weights of linear layers: ``name.0.weight``, ... ``name.output.bias``."""
+    """Weights of linear layers: ``name.0.weight``, ... ``name.output.bias``."""
     *hidden, output = (layer for layer in layers if isinstance(layer, nn.Linear))
     tensors: dict[str, Float32s] = {}
     for k, layer in enumerate(hidden):

@@ -31,7 +31,7 @@ LARGEST_BYTES = 1 << 36
 
 
 def capture(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the state of a model, its environment and the global random generators."""
+    """State of a model, its environment and the global random generators."""
     environment: Any = model.env
     memory: Any = getattr(model, "replay_buffer", None)
     log = model.logger
@@ -87,7 +87,7 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
 
 
 def like(new: Any, saved: Any) -> Any:
-    """Return saved data with the types of ``new``: arrays instead of tensors, named tuples instead of plain ones.
+    """Saved data with the types of ``new``: arrays instead of tensors, named tuples instead of plain ones.
 
     Raises ``ValueError`` if entries, or shape or type of an array, differ.
     """
@@ -118,7 +118,7 @@ def to_tensors(tree: Any) -> Any:
 
 
 def files_in(folder: Path) -> list[Path]:
-    """Return the checkpoints in a folder, newest first."""
+    """Checkpoints in a folder, newest first."""
     return sorted(folder.glob("step_*.pt"), reverse=True)
 
 

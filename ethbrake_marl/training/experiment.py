@@ -55,7 +55,7 @@ class Report(Protocol):
     measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
-        """Return the tables to print, and a text that says where the report is; ``tell`` is called with progress."""
+        """Write the report; return the tables to print, and a text that says where it is. ``tell`` reports progress."""
 
 
 class Tables:
@@ -144,7 +144,7 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 def compared_teams(
     trained: TrainResult, scenario: Scenario, harm_count: str, baselines: Sequence[str]
 ) -> Mapping[str, Team]:
-    """Return the teams to compare: baselines, then the trained policies, without and with a shield.
+    """Teams to compare: baselines, then the trained policies, without and with a shield.
 
     With several learners there is also a team for each learner in which this learner brakes fully.
     """

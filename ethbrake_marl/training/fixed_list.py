@@ -25,7 +25,7 @@ OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not
 
 
 def measure_on_list(training: Training) -> Evaluate:
-    """Return a function that measures policies on the recipe's fixed list of worlds (key ``evaluation``).
+    """Function that measures policies on the recipe's fixed list of worlds (key ``evaluation``).
 
     Metrics are means over the worlds: ``first_impact_harm``, ``total_harm``, ``honest_cost`` (for exact impacts),
     ``collision_rate`` and ``horizon_rate`` (a vehicle still moves at the horizon). If a learner's objective is not the
@@ -64,5 +64,5 @@ def mean(values: Floats) -> float:
 
 
 def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
-    """Return the value by which a training picks its best policy, less is better; NaN if it was not measured."""
+    """Value by which a training picks its best policy, less is better; NaN if it was not measured."""
     return metrics.get(OBJECTIVE, metrics.get(COLUMN[harm_count], np.nan))

@@ -67,7 +67,7 @@ class Job(NamedTuple):
         return ""
 
     def result(self) -> dict[str, float]:
-        """Return the best measurement of a finished training: ``steps``, ``harm`` (the minimised count), and others."""
+        """Best measurement of a finished training: ``steps``, ``harm`` (the minimised count), and others."""
         count = self.training.recipe.reward.harm_count
         evaluations = read_object(RunFolder(self.folder).status)["evaluations"]
         best = min(evaluations, key=lambda each: deciding(each, count))

@@ -45,7 +45,7 @@ class LearningRate(FileModel):
     )
 
     def at(self, remaining: float) -> float:
-        """Return ``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
+        """``end + (start - end) (1 + cos(pi p)) / 2`` with ``p = 1 - remaining``.
 
         ``remaining`` is the fraction (1 to 0) of the training's steps that remains.
         """
@@ -157,7 +157,7 @@ class TrainingRecipe(FileModel):
         return 1
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the networks of a policy. Override this unless the actor has one action, clipped to [-1, 1]."""
+        """Networks of a policy. Override this unless the actor has one action, clipped to [-1, 1]."""
         shape = vars(self)["network"]
         return NetworkSpec(
             observation_size=observation_size,
@@ -168,7 +168,7 @@ class TrainingRecipe(FileModel):
         )
 
     def replace(self, **changes: Any) -> Self:
-        """Return the recipe with changed values, such as ``replace(seed=3)``. Raises the errors of ``load_recipe``."""
+        """Recipe with changed values, such as ``replace(seed=3)``. Raises the errors of ``load_recipe``."""
         content = {**self.model_dump(mode="json"), **{key: plain(value) for key, value in changes.items()}}
         changed = _checked(Document(f"recipe {self.name!r}", content, {}))
         return changed  # type: ignore[return-value]  # another class only with another algorithm
@@ -251,18 +251,18 @@ class SacRecipe(TrainingRecipe):
         return self.log_every_updates
 
     def network_spec(self, observation_size: int) -> NetworkSpec:
-        """Return the actor's network; a SAC policy is saved without critics."""
+        """The actor's network; a SAC policy is saved without critics."""
         return super().network_spec(observation_size).model_copy(update={"value_hidden": (), "output": "tanh"})
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Return name -> file of all recipes in the package, including those of extensions."""
+    """Name -> file of all recipes in the package, including those of extensions."""
     files = sorted(shipped_folder("train").rglob("*.yaml"), key=lambda file: file.name)
     return {file.stem: file for file in files}
 
 
 def usable_recipes() -> dict[str, Path]:
-    """Return name -> file of shipped recipes whose algorithm is installed."""
+    """Name -> file of shipped recipes whose algorithm is installed."""
     return {name: file for name, file in shipped_recipes().items() if _algorithm_in(read_yaml(file)) in ALGORITHMS}
 
 
@@ -304,7 +304,7 @@ def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
 
 class _RecipeWording(Wording):
     def known(self, path: YamlPath) -> list[str]:
-        """Return the valid keys in place of the last key of ``path``, including registered terms inside ``reward``."""
+        """Valid keys in place of the last key of ``path``, including registered terms inside ``reward``."""
         inside = super().known(path)
         return [*inside, *own_terms()] if path[:-1] == ("reward",) else inside
 
@@ -357,7 +357,7 @@ VARIANTS: Registry[type[Any]] = Registry(
 
 
 def algorithm_of(recipe: TrainingRecipe) -> Any:
-    """Return a new ``Algorithm`` for a recipe. Raises ``InvalidInput`` if it cannot use the recipe's device."""
+    """New ``Algorithm`` for a recipe. Raises ``InvalidInput`` if it cannot use the recipe's device."""
     if recipe.device == "cpu":
         algorithm = ALGORITHMS[recipe.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()

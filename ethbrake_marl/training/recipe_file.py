@@ -12,7 +12,7 @@ from ethbrake_marl.training.recipe import ALGORITHMS, TrainingRecipe
 
 
 def recipe_schema() -> dict[str, Any]:
-    """Return the JSON Schema of recipe files. The possible keys depend on ``algorithm``."""
+    """JSON Schema of recipe files. The possible keys depend on ``algorithm``."""
     classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
     places, whole = models_json_schema([(each, "validation") for each in classes.values()], schema_generator=FileSchema)
     parts = whole["$defs"]
@@ -44,7 +44,7 @@ def recipe_schema() -> dict[str, Any]:
 
 
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
-    """Return key -> meaning; a key without a description takes it from the base class."""
+    """Key -> meaning; a key without a description takes it from the base class."""
     meanings: dict[str, str] = {}
     for each in reversed(recipe.__mro__):
         for key, field in each.model_fields.items() if issubclass(each, TrainingRecipe) else ():

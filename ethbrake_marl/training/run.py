@@ -87,7 +87,7 @@ class RunFolder:
                 self.write_status(ended, reason=reason, written=written)
 
     def training(self) -> Training:
-        """Return the training that is recorded here.
+        """Training that is recorded here.
 
         Raises ``InvalidInput`` if this is not a run, if a file is damaged, or if a folder is a link.
         """
@@ -120,7 +120,7 @@ class RunFolder:
                 path.unlink()
 
     def open_logs(self, progress: str, steps: int | None) -> list[KVWriter]:
-        """Return the writers of ``progress.csv``, which starts with the text ``progress``, and of TensorBoard's events.
+        """Writers of ``progress.csv``, which starts with the text ``progress``, and of TensorBoard's events.
 
         ``steps``: number of steps so far, if a training is resumed; None: delete old events.
         """

@@ -80,7 +80,7 @@ class SeparatePolicies(BasePolicy):
         return [member for member in self.members if isinstance(member, ActorCriticPolicy)]
 
     def forward(self, observation: Tensor, deterministic: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """Return actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1].
+        """Actions [n, 1], values [n, 1] and log-probabilities [n] for observations [n, F + 1].
 
         The last column of an observation is the learner's number in its world, from 0.
         """
@@ -92,7 +92,7 @@ class SeparatePolicies(BasePolicy):
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
-        """Return the critics' values [n, 1] for observations [n, F + 1], whose last column is the learner's number."""
+        """Values of the critics, [n, 1], for observations [n, F + 1], whose last column is the learner's number."""
         values = torch.empty(len(observation), 1)
         for number, policy, rows in self._by_learner(observation):
             values[rows] = policy.predict_values(observation[rows][:, self.columns[number]])

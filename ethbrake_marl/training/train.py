@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,8 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.logger import Logger
 
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
@@ -24,7 +26,7 @@ from ethbrake_marl.registry import versions_used
 from ethbrake_marl.stopping import stop_on_signal
 from ethbrake_marl.training import checkpoint
 from ethbrake_marl.training.fixed_list import Measure, Policies, measure_on_list
-from ethbrake_marl.training.recipe import Scheme, TrainingRecipe
+from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, algorithm_of
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.training import Training
 from ethbrake_marl.training.updates import BetweenUpdates, Stopped, check_finite
@@ -123,7 +125,10 @@ def train(
     training = Training.of(recipe, scenario, **{key: value for key, value in changes.items() if value is not None})
     folder = RunFolder(directory)
     check_path(directory)
-    with _prepared(training, folder, measure, on_progress) as updates:
+    with _one_training() as stop, closing(make_environment(training)) as environment:
+        evaluate = None if measure is None else measure(training)
+        model = make_model(training, environment)
+        updates = BetweenUpdates(model, training, folder, evaluate, Progress.listener(on_progress), stop)
         folder.create(training.config(settings), force=force)
         with folder.held():
             return _learn(updates, None)
@@ -153,7 +158,10 @@ def resume(
     """
     folder = RunFolder(directory)
     training = folder.training()
-    with _prepared(training, folder, measure, on_progress) as updates, folder.held():
+    with _one_training() as stop, closing(make_environment(training)) as environment, folder.held():
+        evaluate = None if measure is None else measure(training)
+        model = make_model(training, environment)
+        updates = BetweenUpdates(model, training, folder, evaluate, Progress.listener(on_progress), stop)
         _check_unfinished(folder, training)
         saved, damaged = checkpoint.newest(folder.checkpoints)
         if saved is not None:
@@ -179,13 +187,11 @@ def _only(policies: Policies) -> Policy:
 
 
 @contextmanager
-def _prepared(
-    training: Training, folder: RunFolder, measure: Measure | None, on_progress: Told
-) -> Iterator[BetweenUpdates]:
-    """Build environment and model for a training, without writing anything; at the end restore the random generators.
+def _one_training() -> Iterator[Callable[[], bool]]:
+    """Let one training at a time use the random generators, and restore them afterwards.
 
-    Inside the block, Ctrl-C only sets a flag, and torch has its usual type and device and one thread: a second thread
-    makes training 3 to 15 times slower if another process uses the cores.
+    Inside the block, Ctrl-C only sets the flag that the yielded function returns, and torch has its usual type and
+    device and one thread: a second thread makes training 3 to 15 times slower if another process uses the cores.
     """
     if not _ONE_TRAINING.acquire(blocking=False):
         raise InvalidInput(
@@ -198,9 +204,8 @@ def _prepared(
     try:
         torch.set_num_threads(1)
         torch.set_default_dtype(torch.float32)
-        evaluate = None if measure is None else measure(training)
-        with usual, stop_on_signal() as stop, closing(make_environment(training)) as environment:
-            yield BetweenUpdates(training, folder, environment, evaluate, Progress.listener(on_progress), stop)
+        with usual, stop_on_signal() as stop:
+            yield stop
     finally:
         random.setstate(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
@@ -211,16 +216,28 @@ def _prepared(
 
 
 def make_environment(training: Training) -> EthBrakeVecEnv:
-    """Return the environment of a training, with one row for each learner in each world."""
+    """Environment of a training, with one row for each learner in each world."""
     recipe = training.recipe
     scenario, game = open_game(training.scenario, reward=recipe.reward, observation=list(training.row.names))
     appended = APPENDED.get(training.scheme)
     return EthBrakeVecEnv(scenario, game, recipe.n_envs, recipe.seed, recipe.horizon_is_end, appended)
 
 
+def make_model(training: Training, environment: EthBrakeVecEnv) -> BaseAlgorithm:
+    """New model of Stable-Baselines3, built by the recipe's algorithm. Raises ``InvalidInput`` for VecNormalize."""
+    model: BaseAlgorithm = algorithm_of(training.recipe).build(training, environment)
+    if model.get_vec_normalize_env() is not None:
+        raise InvalidInput(
+            f"algorithm {training.recipe.algorithm!r}: its model uses VecNormalize, whose statistics no policy file"
+            " holds; build the model without VecNormalize, since observations are already scaled"
+        )
+    return model
+
+
 def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainResult:
     """Train until the end or a stop, from the checkpoint ``saved`` on; save the policies, also after an error."""
     model, training, folder = updates.model, updates.training, updates.folder
+    model.set_logger(Logger(str(folder.path), []))
     if saved is not None:
         updates.restore(saved)
     folder.write_status("running", reason=None, stage=None, written=[])

@@ -30,7 +30,7 @@ class Training(NamedTuple):
 
     @classmethod
     def of(cls, recipe: Any, scenario: AnyScenario, **changes: Any) -> Training:
-        """Return the training for a recipe and a scenario, given in any form that their ``load_...`` functions accept.
+        """Training for a recipe and a scenario, given in any form that their ``load_...`` functions accept.
 
         Learners observe what the recipe lists, or else what the scenario lists. ``changes``: other values for keys of
         the recipe. Raises ``InvalidInput`` if recipe and scenario do not fit each other.
@@ -92,7 +92,7 @@ class Training(NamedTuple):
         return ", ".join(dict.fromkeys(declared[body - 1] for body in self.scenario.learners))
 
     def content(self) -> dict[str, dict[str, Any]]:
-        """Return everything that affects the training, including defaults, without titles and descriptions."""
+        """Everything that affects the training, including defaults, without titles and descriptions."""
         recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
         return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
 
@@ -111,7 +111,7 @@ class Training(NamedTuple):
         }
 
     def who_drives(self) -> str:
-        """Return a text such as ``scheme shared: policy drives vehicle_2, vehicle_3``."""
+        """Text such as ``scheme shared: policy drives vehicle_2, vehicle_3``."""
         parts = (f"{self.drivers[group[0]]} drives {', '.join(group)}" for group in self.groups)
         return f"scheme {self.scheme}: {'; '.join(parts)}"
 

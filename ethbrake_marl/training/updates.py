@@ -10,11 +10,9 @@ from typing import Any
 import torch
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from ethbrake_marl.errors import CorruptBundle, EthBrakeError, InvalidInput
-from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
+from ethbrake_marl.errors import CorruptBundle, EthBrakeError
 from ethbrake_marl.files.store import remove_folder
 from ethbrake_marl.policies.bundle import save_drivers
 from ethbrake_marl.policies.layers import Float32s
@@ -43,26 +41,20 @@ class BetweenUpdates(BaseCallback):
 
     def __init__(
         self,
+        model: BaseAlgorithm,
         training: Training,
         folder: RunFolder,
-        environment: EthBrakeVecEnv,
         evaluate: Evaluate | None,
         tell: OnProgress | None,
         stop: Callable[[], bool],
     ) -> None:
         super().__init__()
-        self.training, self.folder, self.evaluate, self.tell, self.stop = training, folder, evaluate, tell, stop
-        self.algorithm = algorithm_of(training.recipe)
-        self.model = self.algorithm.build(training, environment)
-        if self.model.get_vec_normalize_env() is not None:
-            raise InvalidInput(
-                f"algorithm {training.recipe.algorithm!r}: its model uses VecNormalize, whose statistics no policy file"
-                " holds; build the model without VecNormalize, since observations are already scaled"
-            )
-        self.model.set_logger(Logger(str(folder.path), []))
+        self.model, self.training, self.folder = model, training, folder
+        self.evaluate, self.tell, self.stop = evaluate, tell, stop
         self.count = 0  # updates so far
-        self.policies: Policies = {}  # the latest policies with finite weights
-        self.steps = self.updates = 0  # decisions and updates when `policies` was copied
+        self.weights: Sequence[Mapping[str, Float32s]] = []  # the latest finite weights, of each group's policy
+        self.steps = self.updates = 0  # decisions and updates when `weights` were copied
+        self.policies: Policies = {}  # made of `weights` when they are measured or saved
         self.best: Policies = {}  # best policies on the fixed list; empty if nothing was measured
         self.best_value = math.inf  # the metric of `best`
         self.evaluations: list[dict[str, float]] = []
@@ -93,7 +85,7 @@ class BetweenUpdates(BaseCallback):
         if due or stopping:
             self.write_checkpoint()
         if stopping:
-            self.take_policies()
+            self.keep_weights()
             raise Stopped
 
     def _on_rollout_end(self) -> None:
@@ -107,22 +99,25 @@ class BetweenUpdates(BaseCallback):
         recipe = self.training.recipe
         measured = self.evaluate is not None and (last or self.count % recipe.evaluation.every_updates == 0)
         if last or measured or self.count % recipe.updates_per_row == 0:
-            self.take_policies()
+            self.keep_weights()
+            if measured or self.count == 0:  # before the first update a tensor that fits no policy is refused
+                self.make_policies()
             if measured:
                 self.measure()
             self.log_row()
             self.report()
 
-    def take_policies(self) -> None:
-        """Store a copy of the current policies. Raises ``TrainingDiverged``."""
+    def keep_weights(self) -> None:
+        """Copy the current weights. Raises ``TrainingDiverged``."""
         check_finite(self.model)
-        actors, networks = self.algorithm.actors(self.model), self.training.networks
-        tensors = [self.algorithm.tensors(*pair) for pair in zip(actors, networks, strict=True)]
-        self.policies = policies_of(self.training, self.model.num_timesteps, tensors)
+        self.weights = weights_of(self.training, self.model)
         self.steps, self.updates = self.model.num_timesteps, self.count
 
+    def make_policies(self) -> None:
+        self.policies = policies_of(self.training, self.steps, self.weights)
+
     def measure(self) -> None:
-        """Measure the stored policies, and remember them if they are the best so far."""
+        """Measure the policies, and remember them if they are the best so far."""
         assert self.evaluate is not None
         begun = time.process_time()
         metrics = {name: float(value) for name, value in self.evaluate(self.policies).items()}
@@ -183,7 +178,7 @@ class BetweenUpdates(BaseCallback):
             )  # fmt: skip
             self.wall_start -= course["wall_s"]
             self.cpu_start = time.process_time() - course["cpu_s"]
-            self.take_policies()
+            self.keep_weights()
             if course["best"]:
                 tensors = [{name: each.numpy() for name, each in policy.items()} for policy in course["best"]]
                 self.best = policies_of(self.training, course["best_steps"], tensors)
@@ -196,6 +191,8 @@ class BetweenUpdates(BaseCallback):
 
     def save(self, status: Status, reason: BaseException | None = None) -> None:
         """Save the policies and the status; delete the checkpoints of a finished training."""
+        if self.weights:
+            self.make_policies()
         for policies, place in ((self.chosen, self.folder.policy), (self.policies, self.folder.last_policy)):
             if policies:
                 save_drivers(policies, place, replace=True)
@@ -223,13 +220,19 @@ def check_finite(model: BaseAlgorithm) -> None:
         )
 
 
-def policies_of(training: Training, steps: int, tensors: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
-    """Return learner -> policy after ``steps`` decisions, from the weights of each group's policy."""
+def weights_of(training: Training, model: BaseAlgorithm) -> list[dict[str, Float32s]]:
+    """Copy of the weights of each group's policy."""
+    algorithm = algorithm_of(training.recipe)
+    return [algorithm.tensors(*pair) for pair in zip(algorithm.actors(model), training.networks, strict=True)]
+
+
+def policies_of(training: Training, steps: int, weights: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
+    """Learner -> policy after ``steps`` decisions, from the weights of each group's policy."""
     recipe, scenario = training.recipe, training.scenario
     policies: dict[str, Policy] = {}
-    for learners, network, own in zip(training.groups, training.networks, tensors, strict=True):
+    for learners, network, tensors in zip(training.groups, training.networks, weights, strict=True):
         policy = Policy.make(
-            own,
+            tensors,
             network=network,
             observation=training.views[training.learners.index(learners[0])],
             algorithm=recipe.algorithm,

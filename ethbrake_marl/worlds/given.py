@@ -173,7 +173,7 @@ def _worlds(
 
 
 def _shown(value: Any) -> str:
-    """Return a value for a message; of an array or a column only its type."""
+    """Value for a message; of an array or a column only its type."""
     kind = getattr(value, "dtype", getattr(value, "type", None))
     return f"{value!r:.60}" if kind is None else f"{type(value).__name__} of {kind}"
 
@@ -195,7 +195,7 @@ def _numbers(what: str, value: Any) -> Floats:
 
 
 def _number(cell: Any) -> float:
-    """Return one object as a number. pandas marks a missing one by an ``NAType``."""
+    """One object as a number. pandas marks a missing one by an ``NAType``."""
     if cell is None or type(cell).__name__ == "NAType":
         return math.nan
     if isinstance(cell, bool) or not isinstance(cell, Real | Decimal):

@@ -36,7 +36,7 @@ class WithLoad(Part):
         return min(self.with_load) + low, max(self.with_load) + high
 
     def value(self, load: Floats, u: Floats) -> Floats:
-        """Return the quantity, [n], for each ``load`` (0 empty, 1 full); ``u``, uniform in [0, 1), draws the spread."""
+        """Quantity, [n], for each ``load`` (0 empty, 1 full); ``u``, uniform in [0, 1), draws the spread."""
         empty, full = self.with_load
         moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
         return moved if self.spread == 0.0 else moved + values(self.spread, u)

@@ -31,7 +31,7 @@ this. `python -m tests.docs.layout` makes this page from the code.
 | How do environments play it? | `faces/face.py`, on `faces/stream.py`: its episodes, drawn again when they end |
 | What would happen? | `episode/play.py`: `price` (a plan); `episode/hold.py`: `hold` (constant commands) |
 | Where does a number in a table come from? | `evaluation/`: `measures.py`, `statistics.py`, `summary.py` |
-| Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/decision.py` |
+| Why did the shield replace an action? | `shields/step.py`: the proof, then the code; codes in `shields/shield.py` |
 | What is a reward term? | `episode/terms.py` (formulas), `episode/reward.py` (weights, named rewards) |
 | Which agents are there? | `parts.py`, `agents/`; what names mean: `names.py`; [add one](../extend.md#an-agent) |
 | Who lets agents drive? | `agents/drive.py`: `play`, `drive` |

@@ -23,7 +23,7 @@ from ethbrake_marl.faces.shield import shield
 from ethbrake_marl.faces.vector import EthBrakeVectorEnv
 from ethbrake_marl.names import make_teams, register_shield
 from ethbrake_marl.policies.bundle import load_shipped
-from ethbrake_marl.shields.decision import ShieldReason
+from ethbrake_marl.shields.shield import ShieldReason
 from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.shields.attack import LINES, ONLY_ONE, PLAYS, TEAMS, WAYS, attack

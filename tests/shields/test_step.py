@@ -17,8 +17,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
-from ethbrake_marl.shields.decision import ShieldReason
 from ethbrake_marl.shields.fallbacks import first_plans
+from ethbrake_marl.shields.shield import ShieldReason
 from ethbrake_marl.shields.step import StepShield
 from ethbrake_marl.worlds.given import worlds_from_state
 from tests.shields.attack import LINES, WAYS

@@ -40,9 +40,9 @@ from ethbrake_marl.training.recipe import (
     register_algorithm,
 )
 from ethbrake_marl.training.run import RunFolder
-from ethbrake_marl.training.train import make_environment, train
+from ethbrake_marl.training.train import make_environment, make_model, train
 from ethbrake_marl.training.training import Training
-from ethbrake_marl.training.updates import TrainingDiverged, policies_of
+from ethbrake_marl.training.updates import TrainingDiverged, policies_of, weights_of
 from tests.refused import refused
 from tests.training.tiny import PAIR, TINY, TINY_SAC, TRAININGS, UPDATE, begin, dying_after, go_on, kept, killed
 
@@ -429,11 +429,9 @@ def test_device__chooses_the_variant_of_the_algorithm_and_is_resumed(
 @pytest.mark.parametrize("name", TRAININGS)
 def test_policy__acts_as_the_model_does_without_exploration(name: str) -> None:
     training = Training.of(*TRAININGS[name])
-    environment, algorithm = make_environment(training), algorithm_of(training.recipe)
-    model = algorithm.build(training, environment)
-    actors = algorithm.actors(model)
-    tensors = [algorithm.tensors(*pair) for pair in zip(actors, training.networks, strict=True)]
-    policies = policies_of(training, 5, tensors)
+    environment = make_environment(training)
+    model = make_model(training, environment)
+    policies = policies_of(training, 5, weights_of(training, model))
     seen = environment.reset()
     expected, _ = model.predict(seen, deterministic=True)
     for place, learner in enumerate(training.learners):

@@ -118,7 +118,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
         return TensorDict(content, batch_size=self.batch_size)
 
     def render(self, mode: str = "rgb_array") -> Any:
-        """Return a picture of the first world in the form that the render mode defines."""
+        """Picture of the first world in the form that the render mode defines."""
         if self.renderer is None:
             self.renderer = make_renderer(self, mode)
             self.renderer.began(self.episode.take([0]))
@@ -148,7 +148,7 @@ class LineTask(TaskClass):  # type: ignore[misc]
         return load_scenario(self.config["scenario"])
 
     def get_env_fun(self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any) -> Callable[[], Any]:
-        """Return a function that creates a ``LineEnv``. ``device`` is unused.
+        """Function that creates a ``LineEnv``. ``device`` is unused.
 
         Raises ``InvalidInput`` if task and BenchMARL do not agree on continuous or discrete actions.
         """

@@ -75,6 +75,38 @@ TOLD = {  # rows of `State.car` -> the piece of a message that tells them
 OF_IMPACTS = [HIT, FIRST, TOTAL, IMPACTS]
 
 
+class News(NamedTuple):
+    """What a vehicle has received of each body. A body is *located* if its place and speed have been received.
+
+    Body 0 is the obstacle, whose place is known to all who know the place of Vehicle 1.
+    """
+
+    pieces: Bools  # [n, N + 1, PIECES] what has been received (``messages.links``)
+    sample: Floats  # [n, SAMPLE_ROWS, N + 1] the newest values
+    located: Bools  # [n, N + 1]; never the obstacle, body 0
+    at_s: Floats  # [n, N + 1] time of the newest sample; 0 for a body that is not located
+
+    @property
+    def with_force(self) -> Bools:
+        """Whether a body is located and its acceleration has been received, [n, N + 1]."""
+        return self.located & self.pieces[:, :, P_ACCELERATION]
+
+    def fresh(self, state: State) -> Bools:
+        """Whether a body is located by a sample of the present, [n, N + 1]."""
+        return self.located & (self.at_s >= state.time_s[:, np.newaxis])
+
+    def speeds_and_ways(
+        self, speed: Floats, wanted: Floats, onset: Floats, limit: Floats, time_s: Floats
+    ) -> tuple[Floats, Floats]:
+        """Speeds (m/s) at ``time_s`` [n, 1], and ways (m) driven since the samples, without contact, [n, N + 1] each.
+
+        Bodies that are not located keep their ``speed``. Others, arguments of ``move_on``.
+        """
+        speed, way = np.where(self.located, self.sample[:, SAMPLE_SPEED], speed), np.zeros(speed.shape)
+        move_on(speed, way, wanted, onset - self.at_s, limit, np.where(self.located, time_s - self.at_s, 0.0))
+        return speed, way
+
+
 class MedianLine(NamedTuple):
     """The line that the vehicle ``body`` assumes before it has received anything."""
 
@@ -85,17 +117,11 @@ class MedianLine(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario, body: int) -> MedianLine:
-        """Return the line of a scenario in which every quantity has its median.
+        """Line of a scenario in which every quantity has its median.
 
         Raises ``InvalidInput`` for a mixture of scenarios, and for other vehicles with unknown commands.
         """
-        where = f"scenario {scenario.name!r}: estimated agents and shields need"
-        if scenario.members:
-            names = ", ".join(member.name for member in scenario.members)
-            raise InvalidInput(f"{where} the ranges of one scenario, but this is a mixture; give one of {names}")
-        for other, (name, role) in enumerate(scenario.roles.items(), 1):
-            if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
-                raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
+        check_predictable(scenario, body)
         N = scenario.vehicles
         alert = draw_once(scenario, lambda width, stream: np.full((1, width), 0.5), np.zeros(1, np.int64)).worlds
         news = np.zeros((1, N + 1))
@@ -104,7 +130,7 @@ class MedianLine(NamedTuple):
         return cls(body, alert, news, tuple(scenario.roles.values()))
 
     def commands(self, car: Floats, wanted: Floats) -> Floats:
-        """Return the commands of all bodies, [n, N + 1] m/s2 (body 0: the obstacle).
+        """Commands of all bodies, [n, N + 1] m/s2 (body 0: the obstacle).
 
         Scripts follow their rules, other learners brake fully, and the vehicle itself keeps ``wanted`` [n, N + 1].
         ``car``: as in ``State``.
@@ -116,15 +142,15 @@ class MedianLine(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Return the median lines at the alert.
+        """Median lines at the alert.
 
         They use what ``state`` shows at the first decision. Vehicles of which everything is known by then start as in
         the true worlds ``alert``, and so does the gap between two of them.
         """
-        pieces, news = self.received(state)
-        known = np.asarray(pieces[:, :, :P_INTENT].all(axis=2))
+        news = self.received(state)
+        known = np.asarray(news.pieces[:, :, :P_INTENT].all(axis=2))
         known[:, 0] = known[:, 1]
-        acts = known & (news[:, SAMPLE_FORCE] != 0.0)
+        acts = known & (news.sample[:, SAMPLE_FORCE] != 0.0)
         acts[:, self.body] = True
         line, car = (np.where(known[:, np.newaxis], *each) for each in zip(alert[:2], self.alert[:2], strict=True))
         both = known[:, :-1] & known[:, 1:]
@@ -133,24 +159,21 @@ class MedianLine(NamedTuple):
         car[:, LATENCY] = np.where(acts, alert.car[:, LATENCY], np.maximum(car[:, OWN_LATENCY], self.news_s))
         return alert._replace(line=line, car=car, wanted=self.commands(car, alert.wanted))
 
-    def received(self, state: State) -> tuple[Bools, Floats]:
-        """Return which quantities of each body the vehicle has received, [n, N + 1, PIECES], and the newest values.
-
-        The values are [n, SAMPLE_ROWS, N + 1] (``messages.links``, as are PIECES). Body 0 is the obstacle, whose place
-        is known to all who know the place of Vehicle 1.
-        """
+    def received(self, state: State) -> News:
         if NAME in state.memories:
-            pieces, news = known_pieces(state, self.body), newest(state, self.body)
+            pieces, sample = known_pieces(state, self.body), newest(state, self.body)
         else:
             known = state.know[:, self.body] <= state.time_s[:, np.newaxis]
             known[:, [0, self.body]] = True
-            pieces, news = known[:, :, np.newaxis].repeat(len(PIECES), axis=2), present(state)
+            pieces, sample = known[:, :, np.newaxis].repeat(len(PIECES), axis=2), present(state)
         pieces[:, 0] = False
         pieces[:, 0, P_PLACE] = pieces[:, 1, P_PLACE]
-        return pieces, news
+        located = np.asarray(pieces[:, :, [P_PLACE, P_SPEED]].all(axis=2))
+        located[:, 0] = False
+        return News(pieces, sample, located, np.where(located, sample[:, AT], 0.0))
 
     def heard(self, state: State, median: State) -> tuple[State, Bools]:
-        """Return the median lines after news, and in which worlds they had foretold it, [n].
+        """Median lines after news, and whether they had foretold it, [n].
 
         ``state``: the truth now. ``median``: the lines now; they are corrected where they are contradicted.
         """
@@ -161,69 +184,104 @@ class MedianLine(NamedTuple):
         return median, foretold
 
     def agrees(self, state: State, median: State) -> Bools:
-        """Return in which worlds the vehicle would have received and measured the same in the ``median`` line, [n].
+        """Whether the vehicle would have received and measured the same in the ``median`` line, [n].
 
         ``state``: the truth now.
         """
-        pieces, news = self.received(state)
-        far = np.abs(self.told(median, self.received(median)[1]) - self.told(state, news)) > SURPRISE
+        news = self.received(state)
+        far = np.abs(self.told(median, self.received(median).sample) - self.told(state, news.sample)) > SURPRISE
         impacts = slice(self.body - 1, self.body + 1)
         struck = median.line[:, HIT, impacts] != state.line[:, HIT, impacts]
-        return np.asarray(~((far & pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
+        return np.asarray(~((far & news.pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
 
-    def told(self, state: State, news: Floats) -> Floats:
-        """Return what a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
+    def told(self, state: State, sample: Floats) -> Floats:
+        """What a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
 
-        ``news``: as ``received`` returns it. A place is the distance (m) from this vehicle.
+        ``sample``: as in ``News``. A place is the distance (m) from this vehicle.
         """
         car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
         car[:, :, 0] = 0.0
-        own = news[:, PLACE, self.body, np.newaxis]
-        sample = np.stack([news[:, PLACE] - own, news[:, SAMPLE_SPEED], news[:, SAMPLE_FORCE]], axis=1)
-        return np.concatenate([sample, car], axis=1).transpose(0, 2, 1)
+        own = sample[:, PLACE, self.body, np.newaxis]
+        motion = np.stack([sample[:, PLACE] - own, sample[:, SAMPLE_SPEED], sample[:, SAMPLE_FORCE]], axis=1)
+        return np.concatenate([motion, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, median: State) -> State:
-        """Return median lines with received values in place of assumed ones; ``state`` is the truth now.
+        """Median lines with received values in place of assumed ones; ``state`` is the truth now.
 
         A received place and speed are moved on to the present by the sender's script, without contact. A sender that
         was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to
         this vehicle, within the order of the line. This vehicle measures its own motion and its own impacts.
         """
-        body, (pieces, news), time = self.body, self.received(state), state.time_s[:, np.newaxis]
+        body, news = self.body, self.received(state)
         line, car = median.line.copy(), median.car.copy()
         for row, piece in TOLD.items():
-            car[:, row, 1:] = np.where(pieces[:, 1:, piece], state.car[:, row, 1:], car[:, row, 1:])
-        known, acts = np.asarray(pieces[:, :, [P_PLACE, P_SPEED]].all(axis=2)), pieces[:, :, P_ACCELERATION]
-        known[:, 0] = False
-        at = np.where(known, news[:, AT], 0.0)
-        late = np.maximum(np.maximum(car[:, OWN_LATENCY], self.news_s), at)
-        late = np.where(known & acts & (news[:, SAMPLE_FORCE] != 0.0), at, np.where(known, late, car[:, LATENCY]))
-        car[:, LATENCY], car[:, LATENCY, body] = late, state.car[:, LATENCY, body]
+            car[:, row, 1:] = np.where(news.pieces[:, 1:, piece], state.car[:, row, 1:], car[:, row, 1:])
+        onset = self.onsets(news, car)
+        car[:, LATENCY], car[:, LATENCY, body] = onset, state.car[:, LATENCY, body]
         wanted = self.commands(car, state.wanted)
-        speed, way = np.where(known, news[:, SAMPLE_SPEED], line[:, SPEED]), np.zeros(known.shape)
-        move_on(speed, way, wanted, late - at, car[:, LIMIT], np.where(known, time - at, 0.0))
+        speed, way = news.speeds_and_ways(line[:, SPEED], wanted, onset, car[:, LIMIT], state.time_s[:, np.newaxis])
         line[:, SPEED] = speed
-        place = np.zeros(known.shape)
-        place[:, 2:] = -np.cumsum(line[:, GAP, 1:-1], axis=1)
-        place = np.where(known, news[:, PLACE] + way - news[:, PLACE, [body]], place - place[:, [body]])
-        ahead = np.where(pieces[:, 0, P_PLACE], news[:, PLACE, 0] - news[:, PLACE, body], line[:, GAP, 0] + place[:, 1])
-        place[:, body:0:-1] = in_order(place[:, body:0:-1], known[:, body:0:-1])
-        place[:, body:] = -in_order(-place[:, body:], known[:, body:])
-        fresh = known & (at >= time)
-        exact = fresh[:, 1:-1] & fresh[:, 2:]
-        line[:, GAP, 1:-1] = np.where(exact, state.gaps_m, np.maximum(place[:, 1:-1] - place[:, 2:], 0.0))
-        line[:, GAP, 0] = state.line[:, GAP, 0] if body == 1 else np.maximum(ahead - place[:, 1], 0.0)
-        force = np.where((late <= 0.0) | (late < time), wanted, 0.0)
-        line[:, FORCE] = np.where(fresh & acts, news[:, SAMPLE_FORCE], np.where(known, force, line[:, FORCE]))
-        line[:, FORCE, body] = state.line[:, FORCE, body]
+        line[:, GAP] = self.gaps(news, way, median, state)
+        line[:, FORCE] = self.forces(news, wanted, onset, median, state)
         line[:, OF_IMPACTS, body - 1 : body + 1] = state.line[:, OF_IMPACTS, body - 1 : body + 1]
         if body > 1:
-            line[:, HIT, 0] = np.where(pieces[:, 1, P_PLACE], news[:, OBSTACLE_HIT, 1], line[:, HIT, 0])
+            line[:, HIT, 0] = np.where(news.pieces[:, 1, P_PLACE], news.sample[:, OBSTACLE_HIT, 1], line[:, HIT, 0])
         return median._replace(line=line, car=car, wanted=wanted)
+
+    def onsets(self, news: News, car: Floats) -> Floats:
+        """Time at which each vehicle begins to react, [n, N + 1] s after the alert; of those not located, as before.
+
+        ``car``: as in ``State``, with the received values.
+        """
+        later = np.maximum(np.maximum(car[:, OWN_LATENCY], self.news_s), news.at_s)
+        accelerates = news.with_force & (news.sample[:, SAMPLE_FORCE] != 0.0)
+        return np.where(accelerates, news.at_s, np.where(news.located, later, car[:, LATENCY]))
+
+    def gaps(self, news: News, way: Floats, median: State, state: State) -> Floats:
+        """Gaps ahead of all vehicles (m), the obstacle's first, as in the row GAP of ``State.line``.
+
+        ``way`` [n, N + 1] (m): what vehicles have driven since their newest samples. ``state``: the truth now.
+        """
+        body, gaps = self.body, median.line[:, GAP].copy()
+        place = np.zeros(way.shape)  # distance from this vehicle (m)
+        place[:, 2:] = -np.cumsum(gaps[:, 1:-1], axis=1)
+        received = news.sample[:, PLACE] + way - news.sample[:, PLACE, [body]]
+        place = np.where(news.located, received, place - place[:, [body]])
+        obstacle = news.sample[:, PLACE, 0] - news.sample[:, PLACE, body]
+        ahead = np.where(news.pieces[:, 0, P_PLACE], obstacle, gaps[:, 0] + place[:, 1])
+        place[:, body:0:-1] = in_order(place[:, body:0:-1], news.located[:, body:0:-1])
+        place[:, body:] = -in_order(-place[:, body:], news.located[:, body:])
+        fresh = news.fresh(state)
+        exact = fresh[:, 1:-1] & fresh[:, 2:]
+        gaps[:, 1:-1] = np.where(exact, state.gaps_m, np.maximum(place[:, 1:-1] - place[:, 2:], 0.0))
+        gaps[:, 0] = state.line[:, GAP, 0] if body == 1 else np.maximum(ahead - place[:, 1], 0.0)
+        return gaps
+
+    def forces(self, news: News, wanted: Floats, onset: Floats, median: State, state: State) -> Floats:
+        """Acceleration of each body by its brakes or engine, [n, N + 1] m/s2; after its ``onset`` (s) it is ``wanted``.
+
+        ``state``: the truth now.
+        """
+        reacting = np.where((onset <= 0.0) | (onset < state.time_s[:, np.newaxis]), wanted, 0.0)
+        force = np.where(news.located, reacting, median.line[:, FORCE])
+        force = np.where(news.fresh(state) & news.with_force, news.sample[:, SAMPLE_FORCE], force)
+        force[:, self.body] = state.line[:, FORCE, self.body]
+        return force
+
+
+def check_predictable(scenario: Scenario, body: int) -> None:
+    """Raise ``InvalidInput`` for a mixture of scenarios, and for vehicles beside ``body`` with unknown commands."""
+    where = f"scenario {scenario.name!r}: estimated agents and shields need"
+    if scenario.members:
+        names = ", ".join(member.name for member in scenario.members)
+        raise InvalidInput(f"{where} the ranges of one scenario, but this is a mixture; give one of {names}")
+    for other, (name, role) in enumerate(scenario.roles.items(), 1):
+        if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
+            raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
 
 
 def without_channel(game: Game, median: State) -> tuple[Game, State]:
-    """Return the game and median lines in which every vehicle knows everything, for agents that drive there.
+    """Game and median lines in which every vehicle knows everything, for agents that drive there.
 
     A median line does not say when the truth would be received, so each vehicle's own latency ends when it reacts.
     """
@@ -234,7 +292,7 @@ def without_channel(game: Game, median: State) -> tuple[Game, State]:
 
 
 def in_order(place: Floats, known: Bools) -> Floats:
-    """Return places (m), [n, vehicles], raised where they would decrease from one vehicle to the next.
+    """Places (m), [n, vehicles], raised where they would decrease from one vehicle to the next.
 
     An unknown place is first lowered to the next ``known`` one, if it is beyond it.
     """

@@ -23,7 +23,7 @@ from ethbrake_marl.extensions.certified.robust import opened
 from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.algorithm_1 import EpisodeShield, Memory as EpisodeMemory
-from ethbrake_marl.shields.named import NamedShield
+from ethbrake_marl.shields.shield import NamedShield
 from ethbrake_marl.shields.step import Memory, StepShield
 from ethbrake_marl.worlds.scenario import Scenario
 
@@ -72,7 +72,7 @@ class EstimatedShield(StepShield):
         return applied, memory._replace(members=memory.members._replace(median=after))
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the median lines, with the present memories of the agents in ``state``."""
+        """Median lines, with the present memories of the agents in ``state``."""
         median: State = memory.members.median
         own = {body: state.memories[body] for body in self.drivers if body in state.memories}
         return median._replace(memories={**median.memories, **own})
@@ -156,7 +156,7 @@ class EstimatedEV2XBM:
 
 
 def differ(one: State, other: State) -> Bools:
-    """Return in which worlds two lines differ in speeds, gaps or parameters of vehicles, [n].
+    """Whether two lines differ in speeds, gaps or parameters of vehicles, [n].
 
     Latencies that are over are ignored.
     """

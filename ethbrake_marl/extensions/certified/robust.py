@@ -22,7 +22,7 @@ from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.motion.layout import BRAKING, GAP, IMPACTS, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import held
-from ethbrake_marl.shields.named import NamedShield
+from ethbrake_marl.shields.shield import NamedShield
 from ethbrake_marl.shields.step import Memory, StepShield
 
 SHARES = np.linspace(0.0, -1.0, 101)  # constant actions that are tried at the alert for the worst member
@@ -62,7 +62,7 @@ class RobustShield(StepShield):
         self.uncertainty = parse_uncertainty(uncertainty)
 
     def begin(self, game: Game, alert: State, state: State) -> Memory:
-        """Return the memory at the first decision, with the members of the worlds ``alert``.
+        """Memory at the first decision, with the members of the worlds ``alert``.
 
         Raises ``InvalidInput`` if the intervals do not fit the worlds.
         """
@@ -76,14 +76,14 @@ class RobustShield(StepShield):
         return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
 
     def seen(self, state: State, memory: Memory) -> State:
-        """Return the stored members, M rows for each world, with the present memories of the agents in ``state``."""
+        """Stored members, M rows for each world, with the present memories of the agents in ``state``."""
         states = joined(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)
         own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
         return states._replace(memories={**states.memories, **own})
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
-        """Return the harm of plans in the worst of the M ``states`` of each world, [n] m2/s2; or more than ``most``.
+        """Harm of plans in the worst of the M ``states`` of each world, [n] m2/s2; or more than ``most``.
 
         ``plans``: one for each world. ``caps`` is unused.
         """
@@ -92,7 +92,7 @@ class RobustShield(StepShield):
         return np.asarray(super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1))
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
-        """Return the step shield's plans, and the constant plan that is best in the worst member.
+        """Plans of the step shield, and the constant plan that is best in the worst member.
 
         ``states``: the members, M rows for each world of ``state``.
         """
@@ -131,7 +131,7 @@ def joined(states: State) -> State:
 
 
 def may_be_in(state: State, members: State) -> Bools:
-    """Return in which worlds all gaps and speeds are in the range of the ``members`` [n, M, ...], [n].
+    """Whether all gaps and speeds are in the range of the ``members`` [n, M, ...], [n].
 
     True after any impact. Before it, gaps and speeds are monotone in each quantity, so every world within the intervals
     lies in this range.

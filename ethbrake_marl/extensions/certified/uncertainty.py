@@ -55,7 +55,7 @@ class Uncertainty(NamedTuple):
         return ",".join(interval.text for interval in self.intervals)
 
     def members(self, alert: State) -> State:
-        """Return the members of worlds at the alert, M rows for each world: itself, then the corners of its box.
+        """Members of worlds at the alert, M rows for each world: itself, then the corners of its box.
 
         Corner k takes the high end of number i where bit i of k is 1. Raises ``InvalidInput`` if an interval does not
         fit the worlds, and for more than ``MOST_CORNERS`` corners.
@@ -73,7 +73,7 @@ class Uncertainty(NamedTuple):
         return whole.take(np.arange(whole.n).reshape(-1, alert.n).T.ravel())
 
     def draw(self, alert: State, rng: np.random.Generator, *, corners: bool = False) -> State:
-        """Return one random world from each world's box: uniform in the whole box, or one of its ``corners``.
+        """One random world from each world's box: uniform in the whole box, or one of its ``corners``.
 
         The *box* contains all worlds whose quantities are in the intervals.
         """
@@ -82,7 +82,7 @@ class Uncertainty(NamedTuple):
         return placed(alert, sides, np.round(shares) if corners else shares)
 
     def sides(self, alert: State) -> list[Side]:
-        """Return the uncertain numbers of the worlds, one for each vehicle or pair; an interval of width 0 makes none.
+        """Uncertain numbers of the worlds, one for each vehicle or pair; an interval of width 0 makes none.
 
         Raises ``InvalidInput`` if an interval does not fit the worlds.
         """
@@ -114,7 +114,7 @@ class Uncertainty(NamedTuple):
 
 
 def values_of(alert: State, key: str) -> Floats:
-    """Return the nominal values of a quantity such as ``gaps_m``, [n, N + 1]: one column per body (0: the obstacle).
+    """Nominal values of a quantity such as ``gaps_m``, [n, N + 1]: one column per body (0: the obstacle).
 
     Column 0 and the last gap have no meaning.
     """
@@ -122,7 +122,7 @@ def values_of(alert: State, key: str) -> Floats:
 
 
 def placed(alert: State, sides: list[Side], shares: Floats) -> State:
-    """Return worlds whose uncertain numbers ``sides`` are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
+    """Worlds whose uncertain numbers ``sides`` are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
 
     A vehicle that brakes fully does so with the new capacity. Without a V2X channel, a vehicle that reacts later also
     learns everything later. Raises ``InvalidInput`` if a script's command exceeds a capacity.

@@ -174,7 +174,7 @@ def driven(level: Level, drawn: Drawn, algorithm: str | None, jobs: Any) -> Meas
 
 
 def minimised(declared: Declared, count: str, game: Game, alert: State, last: State) -> Given:
-    """Return what the training minimises, as a mean over the learners, [n]: the objective ``declared`` in ``count``.
+    """What the training minimises, as a mean over the learners, [n]: the objective ``declared`` in ``count``.
 
     A measure, once the first two arguments are given; ``alert`` is unused.
     """
@@ -222,7 +222,7 @@ def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
 
 
 def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
-    """Return the least known harm in each world of ``own``, [m] m2/s2. ``answers`` are the results of all levels."""
+    """Least known harm in each world of ``own``, [m] m2/s2. ``answers`` are the results of all levels."""
     best = np.full(own.worlds.n, np.inf)
     for other in answers:
         can = can_imitate(own, other)
@@ -241,7 +241,7 @@ def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
 
 
 def can_imitate(own: Answer, other: Answer) -> Bools:
-    """Return in which worlds the learners of ``own`` can give the commands of the learners of ``other``, [m].
+    """Whether the learners of ``own`` can give the commands of the learners of ``other``, [m].
 
     They can if each learner of ``other`` learns in ``own``, the other vehicles of ``own`` have the same roles, lines
     and latencies are the same, and each decision time of ``other`` is also one of ``own``. Only ``own`` may have an

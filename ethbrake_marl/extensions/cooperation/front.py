@@ -55,7 +55,7 @@ class Front(NamedTuple):
 
 
 def weighted(borne: Floats, weights: Floats) -> Floats:
-    """Return the weighted harm ``N sum_i w_i h_i / sum_i w_i``, [...] m2/s2, as of the objective ``weighted``.
+    """Weighted harm ``N sum_i w_i h_i / sum_i w_i``, [...] m2/s2, as of the objective ``weighted``.
 
     ``borne`` [..., N] is the harm h of each vehicle, ``weights`` [N].
     """
@@ -66,7 +66,7 @@ def weighted(borne: Floats, weights: Floats) -> Floats:
 
 
 def weight_grid(vehicles: int, steps: int) -> Floats:
-    """Return W evenly spaced choices of weights, [W, N]. The weights of each choice sum to 1.
+    """W evenly spaced choices of weights, [W, N]. The weights of each choice sum to 1.
 
     From each row to the next, one weight rises by 1 / ``steps``, and another falls by as much. Raises ``InvalidInput``
     for more than ``MOST`` choices.
@@ -85,7 +85,7 @@ def weight_grid(vehicles: int, steps: int) -> Floats:
 
 
 def _divisions(vehicles: int, steps: int) -> list[list[int]]:
-    """Return all ways to divide ``steps`` parts among the vehicles; from one way to the next, one part moves."""
+    """All ways to divide ``steps`` parts among the vehicles; from one way to the next, one part moves."""
     if vehicles == 1:
         return [[steps]]
     divisions: list[list[int]] = []
@@ -96,7 +96,7 @@ def _divisions(vehicles: int, steps: int) -> list[list[int]]:
 
 
 def corners(vehicles: int) -> Floats:
-    """Return a choice of weights for each vehicle, [N, N]: 1 for this vehicle, ``SLIGHT`` for the others.
+    """Choice of weights for each vehicle, [N, N]: 1 for this vehicle, ``SLIGHT`` for the others.
 
     The others' harm decides only between commands under which this vehicle has almost the same harm.
     """
@@ -104,7 +104,7 @@ def corners(vehicles: int) -> Floats:
 
 
 def weight_table(rows: Sequence[Sequence[Any]]) -> Floats:
-    """Return choices of weights as an array, [W, N]. Raises ``InvalidInput`` for unequal rows and what is no number."""
+    """Choices of weights as an array, [W, N]. Raises ``InvalidInput`` for unequal rows and what is no number."""
     numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for row in rows for each in row)
     if not numbers or len({len(row) for row in rows}) != 1:
         shown = "; ".join(",".join(map(str, row)) for row in rows)
@@ -207,7 +207,7 @@ class Drivers(NamedTuple):
 def _searched(
     drivers: Drivers, worlds: State, weights: Floats, count: str, effort: Mapping[str, int], tell: Callable[[int], None]
 ) -> tuple[Pool, dict[str, Borne]]:
-    """Return all profiles that were found in some worlds, and the harm of each vehicle if agents drive."""
+    """All profiles that were found in some worlds, and the harm of each vehicle if agents drive."""
     pool = Pool(problem_of(drivers.game, worlds, count=count), count)
     driven, problem = _tried(pool, worlds, weights, drivers.preferring), pool.problem
     starts: list[list[Profiles]] = [[*starting_profiles(problem, worlds)] for _ in weights]
@@ -249,7 +249,7 @@ def _tried(
 
 
 def observes_weights(team: Team) -> bool:
-    """Return whether commands may depend on the weights of harm: no if there are only policies without this feature."""
+    """Whether commands may depend on the weights of harm: no if there are only policies without this feature."""
     policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
     seen = [() if policy is None else policy.observation.names for policy in policies]
     return team.shield is not None or any(not names or any("harm_weight" in name for name in names) for names in seen)
@@ -269,7 +269,7 @@ class Pool:
         return {count: each[-1] for count, each in self.borne.items()}
 
     def choice(self, weights: Floats) -> Ints:
-        """Return the number of the profile with the least weighted harm in each world, [n]; ties: the least harm."""
+        """Number of the profile with the least weighted harm in each world, [n]; ties: the least harm."""
         borne = np.stack(self.borne[self.count])
         amounts = weighted(borne, weights)
         least = amounts.min(axis=0)
@@ -283,7 +283,7 @@ class Pool:
         return Profiles(np.stack(ends)[place, rows], np.stack(commands)[place, rows])
 
     def least(self, weights: Floats) -> Borne:
-        """Return each vehicle's harm under the best profiles for all ``weights`` [W, N]: count -> [W, n, N]."""
+        """Each vehicle's harm under the best profiles for all ``weights`` [W, N]: count -> [W, n, N]."""
         chosen, rows = [self.choice(row) for row in weights], np.arange(self.problem.n)
         return {count: np.stack([np.stack(each)[k, rows] for k in chosen]) for count, each in self.borne.items()}
 

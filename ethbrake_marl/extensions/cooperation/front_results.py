@@ -44,7 +44,7 @@ Json = dict[str, Any]
 def front_results(
     front: Front, scenario: Scenario, drawn: Drawn, beside: Mapping[str, Borne], seed: int | None
 ) -> Json:
-    """Return the content of ``front.json``: the front, full braking, maximin, and the agents.
+    """Content of ``front.json``: the front, full braking, maximin, and the agents.
 
     Means have 95 % intervals over worlds, or over recordings. For each choice of weights, ``ratio`` is an agent's mean
     weighted harm divided by the front's (null if that is 0), ``above`` the difference. ``beside``: results beside the
@@ -90,7 +90,7 @@ def _vehicles(borne: Borne, by: Clusters) -> dict[str, list[Json]]:
 
 
 def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
-    """Return the hypervolumes of the front and of each agent, for two reference points.
+    """Hypervolumes of the front and of each agent, for two reference points.
 
     A point is the mean harm of all vehicles for one choice of weights. The first reference point is full braking
     (``full_brake`` [n, N] m2/s2), so only points count that are better for every vehicle. The second has, for each
@@ -114,7 +114,7 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
 
 
 def hypervolume(points: Floats, reference: Floats) -> float:
-    """Return the exact volume of the region between ``points`` [Q, N], which dominate it, and ``reference`` [N].
+    """Exact volume of the region between ``points`` [Q, N], which dominate it, and ``reference`` [N].
 
     Smaller coordinates are better. A point is ignored unless all its coordinates are below the reference point's. The
     region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
@@ -142,7 +142,7 @@ def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
 
 
 def front_sheet(results: Json) -> Sheet:
-    """Return a table with one row for each choice of weights, and for each result beside the front.
+    """Table with one row for each choice of weights, and for each result beside the front.
 
     Its columns are each vehicle's mean of what is weighted, the line's mean of every count, and each agent's ``ratio``.
     """

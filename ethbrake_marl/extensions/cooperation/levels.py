@@ -88,7 +88,7 @@ def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
 
 
 def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[TrainingRecipe]) -> list[Level]:
-    """Return one level for each value of a sweep, in ascending order; each is compared with the previous one.
+    """One level for each value of a sweep, in ascending order; each is compared with the previous one.
 
     Raises ``InvalidInput`` if the key is not a scenario's, if a setting or a recipe sets it too, or if its values make
     levels that cannot be compared.

@@ -43,7 +43,7 @@ Json = dict[str, Any]
 
 
 def compare(measured: Sequence[Measured], searched: int) -> Json:
-    """Return the comparison as plain data.
+    """Comparison as plain data.
 
     - ``levels``: results of each level and algorithm;
     - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
@@ -119,7 +119,7 @@ def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
 
 
 def _change(before: Measured, after: Measured, algorithm: str) -> Json:
-    """Return how harm differs between two levels. Seed k is compared with seed k, or with an only seed."""
+    """How harm differs between two levels. Seed k is compared with seed k, or with an only seed."""
     entry: Json = {"algorithm": algorithm}
     for word, one in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}
@@ -181,7 +181,7 @@ def conditions(plan: Ablation, number: int) -> str:
 
 
 def levels_csv(measured: Sequence[Measured], searched: int) -> str:
-    """Return CSV text with one row per level, algorithm and seed: the mean over worlds of each column of an evaluation.
+    """CSV text with one row per level, algorithm and seed: the mean over worlds of each column of an evaluation.
 
     The columns ``searched_*`` are means over the first ``searched`` worlds.
     """
@@ -236,7 +236,7 @@ def tables(results: Json) -> list[Sheet]:
 
 
 def sheet(title: str, rows: Sequence[Json], columns: Columns) -> Sheet:
-    """Return a table. A column's path says where its values are: ``first harm`` means ``row["first"]["harm"]``."""
+    """Table. A column's path says where its values are: ``first harm`` means ``row["first"]["harm"]``."""
     cells: list[list[Any]] = []
     for row in rows:
         cells.append([])

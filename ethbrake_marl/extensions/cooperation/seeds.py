@@ -23,7 +23,7 @@ CONFIDENCE = 0.95
 
 
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
-    """Return the mean over seeds and worlds of ``values``, or of ``values - baseline``, [seeds, worlds] each.
+    """Mean over seeds and worlds of ``values``, or of ``values - baseline``, [seeds, worlds] each.
 
     There is no interval for only one world or recording, or if all values are 0 without a baseline. A share (truth
     values without a baseline) always has one that contains Wilson's interval, because bootstrap intervals of nearly
@@ -47,7 +47,7 @@ def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None
 
 
 def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clusters = None) -> Estimate | None:
-    """Return the share of the possible reduction ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``.
+    """Share of the possible reduction ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``.
 
     All are [seeds, worlds]. None if ``mean(best) >= mean(worst)``, or if at least 5 % of the resamples leave almost
     nothing to reduce.
@@ -72,7 +72,7 @@ def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clus
 def _interval(
     sides: Sequence[Floats], of: Callable[[Floats], Floats], clusters: Clusters
 ) -> tuple[float, float] | None:
-    """Return the confidence interval of a statistic ``of`` the arguments' means, [resamples, arguments].
+    """Confidence interval of a statistic ``of`` the arguments' means, [resamples, arguments].
 
     ``sides``: the arguments, [seeds, worlds] each. None for only one world or recording.
     """

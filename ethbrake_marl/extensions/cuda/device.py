@@ -44,7 +44,7 @@ class Kernel(NamedTuple):
 
 
 def device_named(name: str) -> torch.device:
-    """Return a torch device: ``cpu``, ``cuda`` or ``cuda:1``. Raises ``InvalidInput`` if it cannot run the kernels."""
+    """Torch device: ``cpu``, ``cuda`` or ``cuda:1``. Raises ``InvalidInput`` if it cannot run the kernels."""
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError):
@@ -105,7 +105,7 @@ def as_arrays(given: Any) -> Any:
 
 
 def like(given: Any) -> Any:
-    """Return a kernel's arguments with empty arrays on the processor in place of tensors, to compile the kernel."""
+    """Arguments of a kernel with empty arrays on the processor in place of tensors, to compile the kernel."""
     return _with(given, lambda tensor: torch.empty((0,) * tensor.dim(), dtype=tensor.dtype).numpy())
 
 
@@ -119,7 +119,7 @@ def _with(given: Any, array_of: Callable[[Tensor], Any]) -> Any:
 
 
 def cells_of(given: Any) -> Iterator[Any]:
-    """Yield a kernel's arguments in the form that code compiled by numba expects.
+    """Arguments of a kernel in the form that code compiled by numba expects.
 
     An array becomes two unused pointers, its number of entries, the size of an entry in bytes, its address, shape and
     strides in bytes. A tuple becomes its parts.

@@ -77,7 +77,7 @@ class Mine(NamedTuple):
 
 
 def memory_of(bodies: int, learners: int, features: int, neighbours: int) -> Mine:
-    """Return the memory of one thread, for a processor."""
+    """Memory of one thread, for a processor."""
     return Mine(
         line=np.zeros((1, LINE_ROWS, bodies)),
         car=np.zeros((1, CAR_ROWS, bodies)),

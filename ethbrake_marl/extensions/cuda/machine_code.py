@@ -23,7 +23,7 @@ PTX_VERSION = "8.4"  # every driver from 550 on reads it, and nothing here needs
 def ptx_of(
     name: str, kernel: Callable[[], Callable[..., None]], given: tuple[Any, ...], capability: tuple[int, int]
 ) -> str:
-    """Return the PTX of a kernel, with the entry ``kernel``, for arguments of the types of ``given``.
+    """PTX of a kernel, with the entry ``kernel``, for arguments of the types of ``given``.
 
     ``name``: all that decides the code, except the sources. ``kernel``: makes the kernel, if its code is not stored
     yet. ``capability``: the GPU's compute capability. Raises ``MissingExtra`` if the code must be compiled and

@@ -14,7 +14,7 @@ from ethbrake_marl.extensions.cuda.kernels import Mine, play
 
 
 def play_thread(shapes: Mine) -> Callable[..., None]:
-    """Return the GPU kernel that runs ``play`` in n threads. ``shapes`` of their memory are constants of its code."""
+    """GPU kernel that runs ``play`` in n threads. ``shapes`` of their memory are constants of its code."""
     line, car, clock, know, wanted, proposed, scratch, out, rewards, value, seen = shapes
 
     def play_worlds(

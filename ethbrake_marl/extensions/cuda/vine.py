@@ -30,7 +30,7 @@ class CudaVine(Vine):
     """The algorithm vine on the recipe's device."""
 
     def new_model(self, training: Training, environment: EthBrakeVecEnv) -> CudaVineModel:
-        """Return a new model, with the same random weights as on a processor.
+        """New model, with the same random weights as on a processor.
 
         Raises ``InvalidInput`` for minibatches of different sizes, for what ``Worlds`` refuses, and for more worlds
         than the device has memory for.

@@ -177,7 +177,7 @@ class Worlds:
         self.kernel.launch(self.device, self.n, *self.arguments(actions, mode))
 
     def state(self) -> State:
-        """Return the episodes as the core's ``State`` on the processor."""
+        """Episodes as the core's ``State`` on the processor."""
         line, car, clock, know, wanted = (np.moveaxis(each.cpu().numpy(), -1, 0).copy() for each in self.now)
         return State(line, car, clock, know, wanted, {})
 
@@ -235,7 +235,7 @@ def check_runs(game: Game) -> None:
 
 
 def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Looking, Kernel]:
-    """Return the kernel ``play`` and its constant arguments. ``bodies``: number of bodies, vehicles and obstacle."""
+    """Kernel ``play`` and its constant arguments. ``bodies``: number of bodies, vehicles and obstacle."""
     on = partial(torch.tensor, device=device)
     settings, plan = game.settings, game.views[int(game.settings.learners[0])].plan
     ruling = Ruling(

@@ -96,7 +96,7 @@ def rounded_actions(team: Team, game: Game, alert: State) -> list[Observations]:
 
 
 def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator[dict[str, Any]]:
-    """Yield the columns of each decision, with one value for each world whose episode has not ended.
+    """Columns of each decision, with one value for each world whose episode has not ended.
 
     The learners take ``actions``; after the last of these they repeat it.
     """

@@ -50,7 +50,7 @@ class Seen(NamedTuple):
 
     @classmethod
     def of(cls, state: State, body: int, step_s: float) -> Seen:
-        """Return what vehicle ``body`` knows. ``state``: the worlds as the vehicle estimates them."""
+        """What vehicle ``body`` knows. ``state``: the worlds as the vehicle estimates them."""
         line, ahead = state.line, body - 1
         known = state.know[:, body, ahead] <= state.time_s if ahead else line[:, GAP, 0] < FAR_M
         front, force = np.where(known, line[:, [SPEED, FORCE], ahead].T, 0.0)
@@ -74,7 +74,7 @@ class Seen(NamedTuple):
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Return the command ``wanted_mps2``, with its deceleration growing by at most ``rate_mps3``, [n] m/s2."""
+        """Command ``wanted_mps2``, with its deceleration growing by at most ``rate_mps3``, [n] m/s2."""
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
@@ -123,13 +123,13 @@ def _human_notices(seen: Seen, p: Parameters) -> Bools:
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
-    """Return the danger [n]: 0 for a ``distance`` above ``safe``, 1 below ``unsafe``, and linear in between."""
+    """Danger [n]: 0 for a ``distance`` above ``safe``, 1 below ``unsafe``, and linear in between."""
     between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
 
 def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
-    """Return the proactive and the critical criterion of UN R157's fuzzy safety model, [n] each: danger from 0 to 1.
+    """The proactive and the critical criterion of UN R157's fuzzy safety model, [n] each: danger from 0 to 1.
 
     ``p``: parameters of the law ``r157_fsm``.
     """
@@ -257,7 +257,7 @@ class Controller:
 
 
 def make_controller(argument: str | None, settings: Any) -> Controller:
-    """Return the controller with the name ``settings.spec``, such as ``idm:T=1.0``.
+    """Controller with the name ``settings.spec``, such as ``idm:T=1.0``.
 
     ``argument``: values of parameters, such as ``T=1.0:a=2``; None: default values. Raises ``UnknownName`` for a
     parameter that the law does not have, and ``InvalidInput`` for a bad value.

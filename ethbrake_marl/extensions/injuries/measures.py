@@ -28,7 +28,7 @@ class Injuries:
         self.changes = np.maximum(self.changes, speed_changes(before, after))
 
     def result(self, last: State) -> Given:
-        """Return the injuries of the line, and of each vehicle, [n]."""
+        """Injuries of the line, and of each vehicle, [n]."""
         each = injured(self.changes, self.curve)
         return {"": each.sum(axis=1), **{f"{i + 1}": column for i, column in enumerate(each.T)}}
 

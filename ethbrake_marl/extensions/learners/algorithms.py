@@ -43,7 +43,7 @@ class Vine(Algorithm):
 
 class RolloutClassification(Algorithm):
     def build(self, training: Training, environment: EthBrakeVecEnv) -> RolloutClassificationModel:
-        """Return a new model, which brakes fully."""
+        """New model, which brakes fully."""
         return RolloutClassificationModel(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:

@@ -34,7 +34,7 @@ class Moment(NamedTuple):
     number: int  # steps so far
 
     def ask(self, act: Act) -> Floats:
-        """Return the actions of one policy for all learners, [m, L] float64."""
+        """Actions of one policy for all learners, [m, L] float64."""
         return act(self.seen.reshape(-1, self.seen.shape[2])).astype(np.float64).reshape(self.seen.shape[:2])
 
 
@@ -66,7 +66,7 @@ def play_on(game: Game, state: State, decide: Decide, gamma: float, *, at_least:
 
 
 def stands_for_good(before: State, after: State, weights: Floats) -> Bools:
-    """Return in which worlds all vehicles stand and will never move again, if actions depend only on observations, [n].
+    """Whether all vehicles of a world stand and will never move again, if actions depend only on observations, [n].
 
     There nothing has changed in this step, and no vehicle waits for its latency or for news. ``weights`` [6] are
     those of what counts as harm: a vehicle that presses against a standing one can still push it. Always False if
@@ -100,5 +100,5 @@ def find_standing(
 
 
 def moving(state: State) -> Bools:
-    """Return in which worlds a vehicle moves, [n]."""
+    """Whether a vehicle of a world moves, [n]."""
     return np.asarray(state.line[:, SPEED].any(axis=1))

@@ -46,7 +46,7 @@ class BranchingModel(BaseAlgorithm):
 
     @abstractmethod
     def new_policy(self) -> nn.Module:
-        """Return new networks with random weights."""
+        """New networks with random weights."""
 
     @abstractmethod
     def improve(self, seen: Any, states: Any) -> None:

@@ -73,12 +73,12 @@ class Averaged(nn.Module):
 
     @torch.no_grad()
     def best(self, observations: Float32s) -> Ints:
-        """Return which output of ``average`` is largest, [rows], for observations [rows, F]."""
+        """Number of the largest output of ``average``, [rows], for observations [rows, F]."""
         chosen: Ints = self.average(torch.from_numpy(observations)).argmax(dim=1).numpy()
         return chosen
 
     def weights(self, name: str) -> dict[str, Tensor]:
-        """Return the averaged weights under their names in a policy file, which begin with ``name``."""
+        """Averaged weights under their names in a policy file, which begin with ``name``."""
         linear = linear_layers(self.average)
         places = [f"{name}.{k}" for k in range(len(linear) - 1)] + [f"{name}.output"]
         layers = zip(places, linear, strict=True)
@@ -115,6 +115,6 @@ class Memory(nn.Module):
 
 
 def drawn(rows: Ints, count: int) -> Ints:
-    """Return ``count`` of the ``rows``, each at most once, in random order."""
+    """``count`` of the ``rows``, each at most once, in random order."""
     some: Ints = rows[torch.randperm(len(rows))[:count].numpy()]
     return some

@@ -6,6 +6,7 @@ Source: Lagoudakis and Parr, Reinforcement Learning as Classification, 2003.
 from __future__ import annotations
 
 import copy
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +22,29 @@ from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
 
 FOR_GOOD = 2**31  # steps, more than an episode has
+
+
+class Branches(NamedTuple):
+    """Simulations to the end, [M]: each begins at a decision with a choice, and leaves the rest to the network."""
+
+    decision: Ints  # 0 to B - 1
+    choice: Ints
+    steps: Ints  # for which the choice is held
+
+    @classmethod
+    def of(cls, tried: Ints, steps: Ints, choices: int) -> tuple[Branches, Ints]:
+        """One branch for each different choice of a decision, and the branches of ``tried``, [B, C].
+
+        ``tried`` [B, C] are numbers below ``choices``; those of a decision are held for ``steps`` [B].
+        """
+        pairs, back = np.unique(np.arange(len(tried))[:, np.newaxis] * choices + tried, return_inverse=True)
+        decision, choice = np.divmod(pairs, choices)
+        return cls(decision, choice, steps[decision]), back.reshape(tried.shape)
+
+    def with_full_braking(self, decisions: int) -> Branches:
+        """These branches, and then one for each of the decisions that brakes fully to the end."""
+        braking = np.arange(decisions), np.zeros(decisions, np.int64), np.full(decisions, FOR_GOOD)
+        return Branches(*(np.append(*parts) for parts in zip(self, braking, strict=True)))
 
 
 class Chooser(Averaged):
@@ -43,7 +67,7 @@ class Chooser(Averaged):
         return self.actions[self.best(observations)]
 
     def loss(self, some: Tensor, guide: float) -> Tensor:
-        """Return the loss at ``some`` stored decisions: the expected extra cost, plus ``guide`` times a convex term.
+        """Loss at ``some`` stored decisions: the expected extra cost, plus ``guide`` times a convex term.
 
         A choice has the probability softmax of the scores. Where a probability is close to 0 or 1, the gradient of the
         expected cost nearly vanishes, but the convex term's does not: it lowers the score of every tried choice but the
@@ -62,7 +86,7 @@ class RolloutClassificationModel(BranchingModel):
     recipe: RolloutClassificationRecipe
 
     def new_policy(self) -> nn.Module:
-        """Return a network that takes choice 0 at first, full braking."""
+        """Network that takes choice 0 at first, full braking."""
         return Chooser(len(self.features), self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -88,7 +112,7 @@ class RolloutClassificationModel(BranchingModel):
         self.logger.record("train/loss", float(np.mean(losses)))
 
     def choices_at(self, seen: Float32s) -> Ints:
-        """Return the choices to try for observations ``seen`` [B, F], [B, C]; the network's own one first."""
+        """Choices to try for observations ``seen`` [B, F], [B, C]; the network's own one first."""
         recipe, last, count = self.recipe, self.recipe.network.choices - 1, len(seen)
         own = self.policy.best(seen)
         tried = [own]
@@ -106,32 +130,29 @@ class RolloutClassificationModel(BranchingModel):
         Returns the numbers of the decisions, [B], the choices, [B, C], and their costs, [B, C]: minus the return,
         changed by the recipe's key ``caution``.
         """
-        recipe, chooser, learners = self.recipe, self.policy, self.learners
-        alive = np.flatnonzero(moving(states).repeat(learners))
-        rows = drawn(alive, recipe.tried)
+        recipe = self.recipe
+        rows = drawn(np.flatnonzero(moving(states).repeat(self.learners)), recipe.tried)
         tried = self.choices_at(seen[rows])
-        every, steps_of = recipe.network.choices, self.drawn_steps(len(rows))
-        pairs, back = np.unique(np.arange(len(rows))[:, np.newaxis] * every + tried, return_inverse=True)
-        decision, choice = np.divmod(pairs, every)
-        steps = steps_of[decision]
-        if recipe.caution:  # one more branch of each decision brakes fully to the end
-            decision = np.append(decision, np.arange(len(rows)))
-            choice = np.append(choice, np.zeros(len(rows), np.int64))
-            steps = np.append(steps, np.full(len(rows), FOR_GOOD))
-        learner = rows[decision] % learners
+        branches, branch = Branches.of(tried, self.drawn_steps(len(rows)), recipe.network.choices)
+        if not recipe.caution:
+            return rows, tried, self.costs_of(states, rows, branches)[branch]
+        cost = self.costs_of(states, rows, branches.with_full_braking(len(rows)))
+        costs, of_braking = cost[branch], cost[len(branches.choice) :, np.newaxis]
+        done = 1.0 - self._current_progress_remaining
+        costs += recipe.caution * done * np.maximum(costs - of_braking, 0.0)
+        return rows, tried, costs
+
+    def costs_of(self, states: State, rows: Ints, branches: Branches) -> Floats:
+        """Cost of each branch, [M]: minus the return of the learner that decides. ``rows`` [B]: its decisions."""
+        chooser, learners = self.policy, self.learners
+        world, learner = np.divmod(rows[branches.decision], learners)
 
         def decide(now: Moment) -> Floats:
             flat = now.seen.reshape(-1, now.seen.shape[2])
-            choices, held = chooser.best(flat), np.flatnonzero(now.number < steps[now.rows])
+            choices, held = chooser.best(flat), np.flatnonzero(now.number < branches.steps[now.rows])
             whose = now.rows[held]
-            choices[held * learners + learner[whose]] = choice[whose]
+            choices[held * learners + learner[whose]] = branches.choice[whose]
             return chooser.actions[choices].astype(np.float64).reshape(now.seen.shape[:2])
 
-        branches = states.take(rows[decision] // learners)
-        gained, _ = play_on(self.game, branches, decide, recipe.gamma, at_least=max(recipe.holds))
-        cost = -gained[np.arange(len(decision)), learner]
-        costs = cost[back].reshape(tried.shape)
-        if recipe.caution:
-            done = 1.0 - self._current_progress_remaining
-            costs += recipe.caution * done * np.maximum(costs - cost[len(pairs) :, np.newaxis], 0.0)
-        return rows, tried, costs
+        gained, _ = play_on(self.game, states.take(world), decide, self.recipe.gamma, at_least=max(self.recipe.holds))
+        return -gained[np.arange(len(world)), learner]

@@ -15,7 +15,7 @@ from ethbrake_marl.policies.policy import Policy
 
 
 def starting_policy(name: str, recipe: str) -> Policy:
-    """Return the policy of an agent's name such as ``ppo`` or ``policy@runs/mine``.
+    """Policy of an agent's name such as ``ppo`` or ``policy@runs/mine``.
 
     ``recipe`` is for error messages. Raises the errors of ``make_agent``, and ``InvalidInput`` for an agent that is no
     policy.
@@ -27,7 +27,7 @@ def starting_policy(name: str, recipe: str) -> Policy:
 
 
 def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
-    """Return the weights of ``policy`` for a network ``wanted`` that observes ``features``.
+    """Weights of ``policy`` for a network ``wanted`` that observes ``features``.
 
     Raises ``InvalidInput`` for other layers, and if ``features`` lack one that the policy observes.
     """
@@ -47,7 +47,7 @@ def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], 
 
 
 def widened(policy: Policy, features: Sequence[str]) -> dict[str, Float32s]:
-    """Return the actor's weights for observations ``features``, with weight 0 for those that it did not know."""
+    """Weights of the actor for observations ``features``, with weight 0 for those that it did not know."""
     tensors = {name: tensor.copy() for name, tensor in policy.tensors.items() if name.startswith("policy.")}
     first = np.zeros((len(tensors["policy.0.weight"]), len(features)), np.float32)
     first[:, [list(features).index(name) for name in policy.observation.names]] = tensors["policy.0.weight"]

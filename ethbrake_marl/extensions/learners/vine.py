@@ -38,7 +38,7 @@ class Actor(Averaged):
 
     @torch.no_grad()
     def means(self, observations: Float32s) -> Float32s:
-        """Return the outputs of the network that is being trained (not of its average), [rows], for [rows, F]."""
+        """Outputs of the network that is being trained (not of its average), [rows], for [rows, F]."""
         means: Float32s = self.learning(torch.from_numpy(observations))[:, 0].numpy()
         return means
 
@@ -116,7 +116,7 @@ class VineModel(BranchingModel):
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
-        """Return the gradient at each decision, [B] float32, from the returns and moves of its two branches, [2B]."""
+        """Gradient at each decision, [B] float32, from the returns and moves of its two branches, [2B]."""
         (up, down), (higher, lower) = gained.chunk(2), moved.chunk(2)
         measured = (up - down) / (higher - lower)
         gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)
@@ -142,7 +142,7 @@ class VineModel(BranchingModel):
 
 
 def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
-    """Return targets of the actor's outputs, and the weights of the squared errors in the loss, [B] each.
+    """Targets of the actor's outputs, and the weights of the squared errors in the loss, [B] each.
 
     Let m be the present output and g the slope of the return at m. Then ``weight = |g| / radius + anchor`` and ``target
     = m + g / weight``: the target is less than ``radius`` away, and ``(weight / 2) (output - target)^2`` has the slope

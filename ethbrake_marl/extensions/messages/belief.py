@@ -53,7 +53,7 @@ LOOK_AHEAD = ("place", "speed", "braking_capacity", "latency", "mass")  # pieces
 
 
 def known_pieces(state: State, observer: int) -> Bools:
-    """Return whether the body ``observer`` knows each quantity in ``PIECES`` of each body, [n, N + 1, PIECES].
+    """Whether the body ``observer`` knows each quantity in ``PIECES`` of each body, [n, N + 1, PIECES].
 
     *Pieces* are the quantities that a message can contain, such as speed and intent (the newest command). Body 0 is the
     obstacle. The observer knows what the messages of a vehicle contain, its intent only after the first message; and
@@ -73,7 +73,7 @@ def known_pieces(state: State, observer: int) -> Bools:
 
 
 def believed(state: State, observer: int) -> State:
-    """Return the state as the body ``observer`` estimates it. What it does not know is NaN, except gaps.
+    """State as the body ``observer`` estimates it. What it does not know is NaN, except gaps.
 
     Old samples are moved on to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which it
     knows nothing. ``wanted`` has the newest intents (commands received). Gaps add up to the distances of bodies with a
@@ -93,7 +93,7 @@ def believed(state: State, observer: int) -> State:
 
 
 def believed_whole(state: State, observer: int) -> State:
-    """Return the state as the body ``observer`` estimates it, without the vehicles that it cannot predict.
+    """State as the body ``observer`` estimates it, without the vehicles that it cannot predict.
 
     It can predict a vehicle of which it knows all quantities but the intent. For the others ``know`` is infinite.
     """
@@ -109,7 +109,7 @@ def _known_if(state: State, observer: int, holds: Bools) -> Floats:
 
 
 def ages_s(state: State) -> Floats:
-    """Return the age of the newest sample that body i has of body j, [n, N + 1, N + 1] s; infinite if it has none.
+    """Age of the newest sample that body i has of body j, [n, N + 1, N + 1] s; infinite if it has none.
 
     Body 0 is the obstacle. Without periodic messages it is 0, because then i knows the present state, from
     ``state.know`` on.

@@ -70,7 +70,7 @@ class Messages:
         return read if by_name else read[""]
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Return the keys of ``v2x`` that messages after the first use. Raises an error for keys without effect."""
+        """Keys of ``v2x`` that messages after the first use. Raises an error for keys without effect."""
         tells = _value(v2x, "tells")
         right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
         sent = v2x.hears != "none" and v2x.timing != "latency"

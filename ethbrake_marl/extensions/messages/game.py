@@ -69,7 +69,7 @@ class GameWithMessages(Game):
         return {body: believing(agent) for body, agent in drivers.items()}
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Return which bodies (0: obstacle) vehicle ``body`` does not fully know at its first decision, [n, N + 1]."""
+        """Bodies (0: obstacle) that vehicle ``body`` does not fully know at its first decision, [n, N + 1]."""
         memory: Memory = alert.memories[NAME]
         unseen = memory.seen_s[:, body] > alert.car[:, LATENCY, body, np.newaxis]
         lacks = ~memory.contents[:, :, [P_BRAKING, P_LATENCY, P_MASS]].all(axis=2)
@@ -77,7 +77,7 @@ class GameWithMessages(Game):
         return np.asarray(super().hides(alert, body) | lacks | (old & unseen))
 
     def own_infos(self, state: State) -> dict[str, Any]:
-        """Return the infos of messages, and those of the shield: name -> [n, N], one value for each vehicle that acts.
+        """Infos of messages, and those of the shield: name -> [n, N], one value for each vehicle that acts.
 
         ``known_from_s_vehicle_2``: time from which a vehicle acts on news of Vehicle 2 (s; infinite: never).
         ``age_s_vehicle_2``: age of its newest sample of Vehicle 2, with periodic messages (s; infinite: none).
@@ -100,7 +100,7 @@ def _remembering(state: State, memory: Memory) -> State:
 
 
 def believing(agent: Any) -> Any:
-    """Return an agent that acts on what its vehicle estimates, if ``agent`` uses only sensors and messages.
+    """Agent that acts on what its vehicle estimates, if ``agent`` uses only sensors and messages.
 
     Any other agent is returned unchanged.
     """
@@ -180,7 +180,7 @@ class Believer:
         return str(getattr(self.script, "name", type(self.script).__name__))
 
     def begin(self, alert: State, body: int) -> Any:
-        """Return the script's memory at the alert. Raises ``InvalidInput`` if it will not know what it needs.
+        """Memory of the script at the alert. Raises ``InvalidInput`` if it will not know what it needs.
 
         A script may have ``needs_ahead``: quantities of the vehicle ahead that messages must contain until it is in
         sight.
@@ -191,7 +191,7 @@ class Believer:
         return self.script.begin(believed(alert, body), body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Return the script's commands, [n] m/s2, and its new memory; it acts on what vehicle ``body`` knows.
+        """Commands of the script, [n] m/s2, and its new memory; it acts on what vehicle ``body`` knows.
 
         Raises ``InvalidInput`` for a script that needs more.
         """

@@ -83,12 +83,12 @@ class Memory(NamedTuple):
 
 
 def samples_kept(delay_s: float, time_step_s: float) -> int:
-    """Return how many samples to store so that a delayed message finds its own: those of one delay, and three more."""
+    """Number of samples to store so that a delayed message finds its own: those of one delay, and three more."""
     return math.ceil(delay_s / time_step_s - ON_GRID) + 3
 
 
 def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, kept: int) -> Memory:
-    """Return the memory at the alert, before any message.
+    """Memory at the alert, before any message.
 
     ``contents`` [N, PIECES]: what messages of each vehicle contain. ``heard_s`` and ``seen_s`` [n, N, N]: when vehicle
     i can use the first message of j, and when it begins to measure j (s). ``channel``: as in ``Memory``. ``kept``:
@@ -107,7 +107,7 @@ def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, ke
 
 
 def present(state: State) -> Floats:
-    """Return the sample that each body would send now, [n, SAMPLE_ROWS, N + 1] (body 0: the obstacle).
+    """Sample that each body would send now, [n, SAMPLE_ROWS, N + 1] (body 0: the obstacle).
 
     Places are relative to Vehicle 1. The intent of a vehicle is its last command; 0 before it knows of the alert.
     """
@@ -121,7 +121,7 @@ def present(state: State) -> Floats:
 
 
 def begin(alert: State, start_s: Floats, time_step_s: float) -> Memory:
-    """Return the memory at the first decision, ``start_s`` [n], with what has been received since the alert.
+    """Memory at the first decision, ``start_s`` [n], with what has been received since the alert.
 
     Until then vehicles execute ``alert.wanted``.
     """
@@ -152,7 +152,7 @@ def _own(memory: Memory) -> Memory:
 
 
 def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
-    """Return the state at ``until_s`` [n], and the way of Vehicle 1, [n] m: how much nearer a fixed post is."""
+    """State at ``until_s`` [n], and the way of Vehicle 1, [n] m: how much nearer a fixed post is."""
     line = state.line.copy()
     line[line[:, GAP, 0] >= FAR_M, GAP, 0] = POST_M
     after = advanced(state._replace(line=line), until_s)
@@ -173,7 +173,7 @@ def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:
 
 
 def newest(state: State, observer: int) -> Floats:
-    """Return the newest sample of each body that the body ``observer`` has, [n, SAMPLE_ROWS, N + 1]."""
+    """Newest sample of each body that the body ``observer`` has, [n, SAMPLE_ROWS, N + 1]."""
     memory: Memory = state.memories[NAME]
     if not memory.is_periodic:
         return present(state)
@@ -228,7 +228,7 @@ def take_sample(samples, news, i, j, sent, rows):
 
 @kernel
 def chance(key, link, number):
-    """Return the random number in [0, 1) that decides whether message ``number`` of a link is lost: a SplitMix64 hash.
+    """Random number in [0, 1) that decides whether message ``number`` of a link is lost: a SplitMix64 hash.
 
     ``key``: of the world, as in ``Memory.channel``. ``link``: number of the link.
     """
@@ -243,7 +243,7 @@ def chance(key, link, number):
 
 @kernel
 def moved_on(speed, force, limit, duration):
-    """Return a vehicle's speed (m/s) and way (m) after ``duration`` (s) under a constant force, without contact.
+    """Speed (m/s) and way (m) of a vehicle after ``duration`` (s) under a constant force, without contact.
 
     ``force``: acceleration (m/s2). ``limit``: speed up to which it drives (m/s). A vehicle that moves backward brakes
     to rest, whatever the sign of its force.

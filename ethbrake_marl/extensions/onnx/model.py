@@ -14,7 +14,7 @@ CAPACITIES = ("own.braking_capacity", "own.driving_capacity")
 
 
 def to_onnx(policy: Policy) -> bytes:
-    """Return an ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
+    """ONNX model: ``observation`` [n, F] float32 -> ``action`` [n, 1] and ``acceleration_mps2`` [n, 1].
 
     The acceleration is the action times the observed braking or driving capacity. Results may differ from this
     package's by rounding. Its metadata list the names of the observed ``features``. Raises ``InvalidInput`` if the

@@ -78,7 +78,7 @@ class Avoidability(NamedTuple):
 
 @kernel
 def spare_gap(gap, v_l, a_l, v_f, a_f):
-    """Return the smallest gap (m) if follower and leader brake fully from now on; negative: they make contact.
+    """Smallest gap (m) if follower and leader brake fully from now on; negative: they make contact.
 
     If the follower comes to rest last, it is the gap at rest. Otherwise the gap is smallest when both speeds are equal,
     or now if the leader is at least as fast. ``gap``: now (m). v (m/s), a (m/s2): speed and braking capacity of leader
@@ -93,7 +93,7 @@ def spare_gap(gap, v_l, a_l, v_f, a_f):
 
 @kernel
 def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
-    """Return how long (s) a vehicle can drive with ``u`` (m/s2) before it must brake fully to stay behind the leader.
+    """Time (s) for which a vehicle can drive with ``u`` (m/s2) before it must brake fully to stay behind the leader.
 
     Also return when the gap becomes 0 (s), and whether both vehicles still move then: if so, ``a_f > a_l`` and they are
     equally fast; otherwise the follower comes to rest behind the standing leader. Both times are infinite if the
@@ -121,7 +121,7 @@ def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
 
 @large
 def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
-    """Return the same as ``drive_before_braking``, for a follower with the speed limit ``limit`` (m/s)."""
+    """The same as ``drive_before_braking``, for a follower with the speed limit ``limit`` (m/s)."""
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         drive, touch, moving = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
@@ -136,7 +136,7 @@ def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
 
 @kernel
 def lowest_while_coasting(at):
-    """Return the smallest gap (m) to the rear vehicle until the controlled vehicle, which coasts, may act.
+    """Smallest gap (m) to the rear vehicle until the controlled vehicle, which coasts, may act.
 
     ``at``: the world at the alert (``line``). The gap is a convex function of time: it is smallest when both are
     equally fast, or at the start or end.
@@ -151,13 +151,13 @@ def lowest_while_coasting(at):
 
 @kernel
 def met(gap, closing):
-    """Return whether a pair with this gap (m) and closing speed (m/s) has or had an impact."""
+    """Whether a pair with this gap (m) and closing speed (m/s) has or had an impact."""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > TOUCH_MPS)
 
 
 @kernel
 def plan_behind(at, ahead, v_l, out):
-    """Return the plan (``plans``) of the largest trajectory of the world ``at`` (``line``).
+    """Plan (``plans``) of the largest trajectory of the world ``at`` (``line``).
 
     Also write the columns DRIVE, TOUCH and FOLLOW of ``out`` (``decide``). The vehicle drives as hard as it can, then
     brakes fully, then follows the front vehicle, which is ``ahead`` (m) at the start and has the speed ``v_l`` (m/s).

@@ -28,7 +28,7 @@ CELL_COLUMNS = 5
 
 @large
 def gentlest_between(kind, at, early, late):
-    """Return a lower bound (m/s) on the closing speed of first contacts between ``early`` and ``late``.
+    """Lower bound (m/s) on the closing speed of first contacts between ``early`` and ``late``.
 
     The smallest closing speed falls with the time, with one exception: if the leader brakes harder than the controlled
     vehicle, it rises by at most the difference of the braking capacities in each second. Arguments: see ``proofs``.
@@ -41,7 +41,7 @@ def gentlest_between(kind, at, early, late):
 
 @kernel
 def decision_around(at, early, late):
-    """Return start and end (s) of the decision step that contains both times, ``early`` and ``late`` (s).
+    """Start and end (s) of the decision step that contains both times, ``early`` and ``late`` (s).
 
     If there is none, or if commands may change at any time, return ``late`` twice. ``at``: one world (``line``).
     """
@@ -56,7 +56,7 @@ def decision_around(at, early, late):
 
 @large
 def lacking(kind, at, early, late, softest, hard, begin):
-    """Return by how much (m/s2), at least, the command at a first contact differs from the best one after it.
+    """Least difference (m/s2) between the command at a first contact and the best command after it.
 
     Braking makes a contact with the front vehicle gentle, but driving softens the impact from behind that follows; at
     the rear it is the other way round. The command is the same in the whole decision step, which starts at ``begin``
@@ -79,7 +79,7 @@ def lacking(kind, at, early, late, softest, hard, begin):
 
 @large
 def harm_of(kind, at, early, late, soft, hard, floor):
-    """Return a lower bound (m2/s2) on the harm of the first contacts in a cell.
+    """Lower bound (m2/s2) on the harm of the first contacts in a cell.
 
     The cell contains the times ``early`` to ``late`` and the closing speeds ``soft`` to ``hard``. Arguments: see
     ``proofs``.
@@ -144,7 +144,7 @@ def divide(kind, at, floor, count, row, cells):
 
 @large
 def least_harm(kind, at, first, last, floor, best, enough, cells):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s).
+    """Lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s).
 
     Arguments: see ``proofs``.
     """
@@ -173,7 +173,7 @@ def least_harm(kind, at, first, last, floor, best, enough, cells):
 
 @kernel
 def next_split(kind, at, time, last):
-    """Return the next time (s) of a decision or of the front vehicle's standstill after ``time``; at most ``last``.
+    """Next time (s) of a decision or of the front vehicle's standstill after ``time``; at most ``last``.
 
     The standstill counts only if the first contact is in front (``kind``). ``at``: one world (``line``).
     """

@@ -20,7 +20,7 @@ from ethbrake_marl.motion.compiling import kernel, large
 
 @kernel
 def flight_lead(pair, opening, flight):
-    """Return the *lead* of a flight: the speed (m/s) that the controlled vehicle gains, minus what it gives up for it.
+    """*Lead* of a flight: the speed (m/s) that the controlled vehicle gains, minus what it gives up for it.
 
     The gain is its speed minus the speed of the centre of mass. For a flight of L seconds (``flight``) with the opening
     speed o, the lead is ``share (press L - o) - G``. G is the speed (m/s) that the vehicle must give up so that the two
@@ -40,7 +40,7 @@ def flight_lead(pair, opening, flight):
 
 @kernel
 def best_flight(pair, opening):
-    """Return the duration (s) of the flight with the largest lead among those that begin with ``opening`` (m/s).
+    """Duration (s) of the flight with the largest lead among those that begin with ``opening`` (m/s).
 
     Infinite if a longer flight always has a larger lead. ``pair``: see the module.
     """
@@ -61,7 +61,7 @@ def best_flight(pair, opening):
 
 @large
 def lead(pair, opening, shortest, longest, lost):
-    """Return the largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
+    """Largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
     It is the maximum over all opening speeds up to ``opening``: with a limited time, a smaller one may lead to more.
     ``pair``, ``lost``: see the module.
@@ -83,7 +83,7 @@ def lead(pair, opening, shortest, longest, lost):
 
 @kernel
 def decays(pair):
-    """Return whether ``reach`` limits the speed that the vehicle can gain in any flight.
+    """Whether ``reach`` limits the speed that the vehicle can gain in any flight.
 
     False if the vehicle may gain speed by accelerating less now and bouncing more strongly later. ``pair``, with
     ``reach``: see the module.
@@ -100,7 +100,7 @@ def decays(pair):
 
 @large
 def largest_lead(pair, opening, lost, late, end, since, until):
-    """Return an upper bound (m/s) on the speed of the controlled vehicle minus the speed of the centre of mass.
+    """Upper bound (m/s) on the speed of the controlled vehicle minus the speed of the centre of mass.
 
     The centre of mass is taken to move as if the vehicle executed the extreme command from the first contact on. In
     reality the command of the earlier decision still applies in the *window*, the rest of the decision step, from
@@ -131,7 +131,7 @@ def largest_lead(pair, opening, lost, late, end, since, until):
 
 @kernel
 def widest_flight(share, slack, press, drive, bounce, closing, back, time):
-    """Return the largest ``sqrt(p^2 + 2 press s)`` (m/s) in the flights from a partner that brakes harder.
+    """Largest ``sqrt(p^2 + 2 press s)`` (m/s) in the flights from a partner that brakes harder.
 
     p is the speed (m/s) at which vehicle and partner separate, s the gap (m) between them. Holds for ``time`` seconds;
     infinite if no bound is known. ``slack``: braking capacity of the partner minus the vehicle's (m/s2). ``drive``: the

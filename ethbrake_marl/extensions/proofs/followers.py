@@ -43,7 +43,7 @@ LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)
 
 @kernel
 def value_of(line, time):
-    """Return the value at ``time`` of a piecewise linear function, a tuple (start, slope, turn, bend, turn, bend).
+    """Value at ``time`` of a piecewise linear function, a tuple (start, slope, turn, bend, turn, bend).
 
     ``start + slope t + bend max(t - turn, 0) + bend max(t - turn, 0)``; each turn has its own bend.
     """
@@ -53,14 +53,14 @@ def value_of(line, time):
 
 @kernel
 def least_of_line(line, since, until):
-    """Return the smallest value of a piecewise linear function (see ``value_of``) from ``since`` to ``until``."""
+    """Smallest value of a piecewise linear function (see ``value_of``) from ``since`` to ``until``."""
     first, second = min(max(line[2], since), until), min(max(line[4], since), until)
     return min(value_of(line, since), value_of(line, until), value_of(line, first), value_of(line, second))
 
 
 @large
 def least_closing(line, pair, opening, lost, late, end, until):
-    """Return the smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
+    """Smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
     It is a difference v - d: v is the closing speed of the second neighbour relative to the centre of mass of the pair,
     which ``line`` describes as a function of time (``value_of``; a bend may be negative); d, from ``largest_lead``, is
@@ -80,7 +80,7 @@ def least_closing(line, pair, opening, lost, late, end, until):
 
 @kernel
 def rear_after(at, early):
-    """Return the rear vehicle's distance to the leader (m) and speed (m/s) at ``early``, and its onset (s after it).
+    """Rear vehicle's distance to the leader (m) and speed (m/s) at ``early``, and its onset (s after it).
 
     The *onset* is the time at which it begins to brake. Arguments: see ``proofs``.
     """
@@ -90,20 +90,24 @@ def rear_after(at, early):
 
 @large
 def pushed_by_leader(at, early, late, closing, end, lack):
-    """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with the leader.
+    """Lower bound (m/s) on the rear pair's closing speed after a first contact with the leader.
 
-    It follows from the motion of the centre of mass of leader and controlled vehicle; 0: none proven. If the leader is
-    at rest at ``early``, a later first contact leads to the same motion at a later time, so ``late``, ``end`` and
-    ``lack`` do not matter. Arguments: see ``proofs``.
+    1. The *block*, leader and controlled vehicle together, moves like its centre of mass: at first with ``speed`` and
+       the acceleration ``push``, until the leader stands at ``stand``.
+    2. The rear vehicle has reached the block by the time ``until``. 0 is returned if it need not.
+    3. The bound is the speed at which the rear vehicle closes in on the block, minus the largest amount by which the
+       controlled vehicle may then be faster than the block.
+
+    Arguments: see ``proofs``.
     """
     share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
     behind, v_r, onset = rear_after(at, early)
+    if v_l <= 0.0:  # a later contact with a leader at rest leads to the same motion, only later
+        late, end, lack = early, early, 0.0
+    late, end, lost = late - early, end - early, lack * (end - late)
     speed, push = v_l + rest * closing, rest * at[U_F] - share * at[A_L]
     stand = (speed + rest * bounce * closing) / at[A_L]
-    late, end, lost = late - early, end - early, lack * (end - late)
-    if v_l <= 0.0:
-        late, end, lack, lost = 0.0, 0.0, 0.0, 0.0
     block = with_window(push, late, end, -rest * lack, stand, share * at[A_L])
     until = walk(behind, speed, block, v_r, braking(onset, at[A_R]), onset + v_r / at[A_R])[1]
     if until == math.inf:
@@ -120,7 +124,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 
 @large
 def held_by_leader(at, early, late, closing):
-    """Return a lower bound (m/s) on the rear pair's closing speed after a first contact with a harder braking leader.
+    """Lower bound (m/s) on the rear pair's closing speed after a first contact with a harder braking leader.
 
     It holds because the controlled vehicle then stays near the leader. 0: none proven. Arguments: see ``proofs``.
     """
@@ -156,7 +160,7 @@ def held_by_leader(at, early, late, closing):
 
 @large
 def after_front(at, early, late, closing, end, lack):
-    """Return a lower bound (m2/s2) on the rear pair's squared closing speed after a first contact with the leader.
+    """Lower bound (m2/s2) on the rear pair's squared closing speed after a first contact with the leader.
 
     It is the largest of several lower bounds. Arguments: see ``proofs``.
     """
@@ -177,7 +181,7 @@ def after_front(at, early, late, closing, end, lack):
 
 @kernel
 def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
-    """Return the smallest squared closing speed (m2/s2) at which a braking vehicle (f) reaches the braking leader (l).
+    """Smallest squared closing speed (m2/s2) at which a braking vehicle (f) reaches the braking leader (l).
 
     v is a speed (m/s), a a braking capacity (m/s2). f brakes with at most ``a_f``. ``gap`` and ``least_gap`` are the
     largest and smallest possible gap (m); ``least_gap`` is used only if the leader brakes harder. The result is 0 if
@@ -192,7 +196,7 @@ def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
 
 @large
 def pushed_by_rear(at, early, late, closing, end, lack, gap):
-    """Return a lower bound (m/s) on the front pair's closing speed after the rear vehicle's first contact.
+    """Lower bound (m/s) on the front pair's closing speed after the rear vehicle's first contact.
 
     It follows from the motion of the centre of mass of rear and controlled vehicle. The controlled vehicle must brake
     at least as hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m). Other arguments: see
@@ -216,7 +220,7 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
 
 @large
 def after_rear(at, early, late, closing, end, lack):
-    """Return a lower bound (m2/s2) on the front pair's squared closing speed after the rear vehicle's first contact.
+    """Lower bound (m2/s2) on the front pair's squared closing speed after the rear vehicle's first contact.
 
     Arguments: see ``proofs``.
     """
@@ -238,7 +242,7 @@ def after_rear(at, early, late, closing, end, lack):
 
 @large
 def after(kind, at, early, late, closing, end, lack):
-    """Return a lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact.
+    """Lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact.
 
     Arguments: see ``proofs``.
     """

@@ -38,7 +38,7 @@ HALVINGS = 60
 
 @kernel
 def leader(at, time):
-    """Return speed (m/s) and way (m) of the front vehicle at ``time`` if it brakes from now on without being pushed.
+    """Speed (m/s) and way (m) of the front vehicle at ``time`` if it brakes from now on without being pushed.
 
     ``time`` (s) counts from now. ``at``: one world (see the module).
     """
@@ -48,7 +48,7 @@ def leader(at, time):
 
 @kernel
 def follower(at, time):
-    """Return speed (m/s) and way (m) of the rear vehicle at ``time`` (s from now) if it is not pushed.
+    """Speed (m/s) and way (m) of the rear vehicle at ``time`` (s from now) if it is not pushed.
 
     It coasts until its latency has elapsed, then brakes fully. ``at``: one world (see the module).
     """
@@ -57,7 +57,7 @@ def follower(at, time):
 
 
 def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
-    """Return one row ``at`` of numbers for each world, [n, COLUMNS]; the controlled vehicle is ``body`` (1: Vehicle 1).
+    """One row ``at`` of numbers for each world, [n, COLUMNS]; the controlled vehicle is ``body`` (1: Vehicle 1).
 
     ``time_step_s``: time between decisions; 0: commands may change at any time.
     """

@@ -89,7 +89,7 @@ class LowerBound(NamedTuple):
 
 @kernel
 def front_bound(at):
-    """Return the smallest squared closing speed (m2/s2) and the latest time (s) of the front pair's first contact.
+    """Smallest squared closing speed (m2/s2) and the latest time (s) of the front pair's first contact.
 
     The time is infinite if full braking avoids the contact. ``at``: one world (``line``).
     """
@@ -101,7 +101,7 @@ def front_bound(at):
 
 @kernel
 def rear_bound(at):
-    """Return the smallest squared closing speed (m2/s2) and the latest time (s) of the rear pair's first contact.
+    """Smallest squared closing speed (m2/s2) and the latest time (s) of the rear pair's first contact.
 
     Full drive attains both; the time is infinite if it avoids the contact. ``at``: one world (``line``).
     """
@@ -111,7 +111,7 @@ def rear_bound(at):
 
 @large
 def last_first(kind, at, first, last):
-    """Return the latest time (s), at most ``last``, of a contact with one neighbour before any with the other.
+    """Latest time (s), at most ``last``, of a contact with one neighbour before any with the other.
 
     By bisection, from ``first`` (s), at which it is possible. The later the contact in front, the shorter the vehicle
     drives, so the rear vehicle comes nearer; the later the contact behind, the shorter it brakes, so it comes nearer to
@@ -135,7 +135,7 @@ def last_first(kind, at, first, last):
 
 @large
 def last_meeting(at, first):
-    """Return the latest time (s) of a contact with the front vehicle, and the latest before any with the rear vehicle.
+    """Latest time (s) of a contact with the front vehicle, and the latest before any with the rear vehicle.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
     speed. ``first`` is the earliest time (s) of a contact with the front vehicle. ``at``: one world (``line``).
@@ -150,7 +150,7 @@ def last_meeting(at, first):
 
 @large
 def soft_harm(kind, at, early, late, floor, best):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late``.
+    """Lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late``.
 
     The closing speed of these contacts may have any value. Arguments: see ``proofs``.
     """
@@ -164,7 +164,7 @@ def soft_harm(kind, at, early, late, floor, best):
 
 @kernel
 def outer_contact(at):
-    """Return time (s) and squared closing speed (m2/s2) at which the rear vehicle would reach the front vehicle.
+    """Time (s) and squared closing speed (m2/s2) at which the rear vehicle would reach the front vehicle.
 
     As if the controlled vehicle were not there; infinite and 0 if never. ``at``: one world (``line``).
     """
@@ -174,7 +174,7 @@ def outer_contact(at):
 
 @large
 def front_first(at, floor, best, enough, cells):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all three.
+    """Lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all three.
 
     In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
     vehicle relative to the front vehicle, and the front pair's is at least the smallest possible one at this time. Such
@@ -204,7 +204,7 @@ def front_first(at, floor, best, enough, cells):
 
 @large
 def rear_first(at, floor, best, enough, cells):
-    """Return a lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle.
+    """Lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle.
 
     Arguments: see ``proofs``.
     """
@@ -236,7 +236,7 @@ def rear_first(at, floor, best, enough, cells):
 
 @kernel
 def last_rest(at):
-    """Return the time (s) after which no more harm happens that the combined bound of the world ``at`` counts."""
+    """Time (s) after which no more harm happens that the combined bound of the world ``at`` counts."""
     stand = rest_of_rear(at)
     way = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
     room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
@@ -246,7 +246,7 @@ def last_rest(at):
 
 @large
 def combined_bound(at, until, front, rear, cells):
-    """Return a lower bound (m2/s2) on the harm of a world with unavoidable contact, first in front or behind.
+    """Lower bound (m2/s2) on the harm of a world with unavoidable contact, first in front or behind.
 
     0 if some of the counted harm may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds on
     the harm of each pair alone (m2/s2). ``at``, ``cells``: see ``proofs``.
@@ -288,7 +288,7 @@ def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
 def lower_bound(
     state: State, body: int = 2, *, count: str = "first", horizon_s: float = 8.0, time_step_s: float | None = None
 ) -> LowerBound:
-    """Return a proven lower bound on the harm of every episode, over all commands of the vehicle ``body`` from now on.
+    """Proven lower bound on the harm of every episode, over all commands of the vehicle ``body`` from now on.
 
     ``harm = early + max(front_pair + rear_pair, combined)``; each term is lowered by the largest possible rounding
     error (``rounding``). ``early`` includes what has already happened. ``combined`` is 0 where contact can be avoided.
@@ -355,7 +355,7 @@ def _check_asked(state: State, start: Floats, count: str, horizon_s: float, time
 
 
 def rounding(state: State, body: int) -> Floats:
-    """Return the largest difference between a bound and the harm in the engine that rounding can cause, [n] m2/s2.
+    """Largest difference between a bound and the harm in the engine that rounding can cause, [n] m2/s2.
 
     A squared closing speed is ``D = w^2 + 2 b g``, with closing speed w, closing acceleration b and gap g. Let ``V`` be
     the largest speed in the line, ``G`` the sum of its gaps, ``A`` the largest closing acceleration and ``a`` the

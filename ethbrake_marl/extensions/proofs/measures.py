@@ -44,7 +44,7 @@ def proven_harm(game: Game, alert: State, last: State) -> Given:
 
 
 def _controlled(game: Game, alert: State, *, together: bool = False) -> int:
-    """Return the controlled vehicle, or 2 for Vehicles 2 and 3 together. Raises ``InvalidInput`` for other learners."""
+    """Controlled vehicle, or 2 for Vehicles 2 and 3 together. Raises ``InvalidInput`` for other learners."""
     learners = game.settings.learners.tolist()
     others = [body for body in range(1, alert.vehicles + 1) if body not in learners]
     if game.scripts or (alert.wanted[:, others] != -capacities(alert.car, BRAKING, alert.time_s)[:, others]).any():

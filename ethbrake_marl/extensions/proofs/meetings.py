@@ -35,7 +35,7 @@ _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speed
 
 @large
 def gentlest_front(at, time):
-    """Return the smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and its ``drive``.
+    """Smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and its ``drive``.
 
     To be at a place at a time with the smallest speed, drive first (for ``drive`` s) and then brake. ``at``: one world
     (``line``).
@@ -59,7 +59,7 @@ def gentlest_front(at, time):
 
 @kernel
 def braked_then_driven(at, brake, time):
-    """Return way (m) and speed (m/s) at ``time`` if the vehicle brakes first, at most to rest, and then drives.
+    """Way (m) and speed (m/s) at ``time`` if the vehicle brakes first, at most to rest, and then drives.
 
     ``brake``: how long it brakes (s). ``at``: one world (``line``).
     """
@@ -76,7 +76,7 @@ def braked_then_driven(at, brake, time):
 
 @large
 def braking_to_rear(at, time):
-    """Return how long (s) the vehicle must brake first to be in contact with the rear vehicle at ``time`` (s).
+    """Time (s) for which the vehicle must brake first to be in contact with the rear vehicle at ``time`` (s).
 
     Then it drives. ``at``: one world (``line``).
     """
@@ -93,7 +93,7 @@ def braking_to_rear(at, time):
 
 @large
 def gentlest(kind, at, time):
-    """Return the smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake`` (s).
+    """Smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake`` (s).
 
     To be at a place at a time with the largest speed, brake first and then drive. ``brake`` is infinite if the vehicle
     reaches its speed limit by then. ``kind``, ``at``: see ``proofs``.
@@ -127,13 +127,13 @@ def braking_first(at, brake):
 
 @kernel
 def rest_of_rear(at):
-    """Return the time (s) at which the rear vehicle of the world ``at`` comes to rest if nothing pushes it."""
+    """Time (s) at which the rear vehicle of the world ``at`` comes to rest if nothing pushes it."""
     return at[ONSET_R] + at[V_R] / at[A_R]
 
 
 @large
 def meet_front(at, drive):
-    """Return when (s) a vehicle that drives first, for ``drive`` s, meets the front vehicle; infinite: never.
+    """Time (s) at which a vehicle that drives first, for ``drive`` s, meets the front vehicle; infinite: never.
 
     Then it brakes. ``at``: one world (``line``).
     """
@@ -142,7 +142,7 @@ def meet_front(at, drive):
 
 @large
 def meet_rear(at, brake):
-    """Return when (s) a vehicle that brakes first, for ``brake`` s, meets the rear vehicle; infinite: never.
+    """Time (s) at which a vehicle that brakes first, for ``brake`` s, meets the rear vehicle; infinite: never.
 
     Then it drives. ``at``: one world (``line``).
     """
@@ -151,7 +151,7 @@ def meet_rear(at, brake):
 
 @large
 def stays_ahead(at, drive, until):
-    """Return whether a vehicle that drives for ``drive`` s, then brakes, avoids the rear one until ``until`` (s).
+    """Whether a vehicle that drives for ``drive`` s, then brakes, avoids the rear one until ``until`` (s).
 
     ``at``: one world (``line``).
     """
@@ -160,7 +160,7 @@ def stays_ahead(at, drive, until):
 
 @large
 def stays_behind(at, brake, until):
-    """Return whether a vehicle that brakes for ``brake`` s, then drives, avoids the front one until ``until`` (s).
+    """Whether a vehicle that brakes for ``brake`` s, then drives, avoids the front one until ``until`` (s).
 
     ``at``: one world (``line``).
     """

@@ -15,13 +15,13 @@ from ethbrake_marl.motion.contact import contact
 
 @kernel
 def braking(onset, deceleration):
-    """Return the plan (see the module): coast until ``onset`` (s), then brake to rest with ``deceleration`` (m/s2)."""
+    """Plan (see the module): coast until ``onset`` (s), then brake to rest with ``deceleration`` (m/s2)."""
     return 0.0, onset, 0.0, onset, 0.0, onset, -deceleration, math.inf
 
 
 @kernel
 def with_window(u, late, end, change, turn, step):
-    """Return a plan (see the module): accelerate with ``u``, plus ``step`` after ``turn``, plus ``change`` in a window.
+    """Plan (see the module): accelerate with ``u``, plus ``step`` after ``turn``, plus ``change`` in a window.
 
     The window is from ``late`` to ``end``. Accelerations in m/s2, times in s.
     """
@@ -32,13 +32,13 @@ def with_window(u, late, end, change, turn, step):
 
 @kernel
 def time_to_limit(v, u, limit):
-    """Return the time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 without need or drive."""
+    """Time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 without need or drive."""
     return (limit - v) / u if u > 0.0 and v < limit else 0.0
 
 
 @kernel
 def drive_then_brake(v, u, limit, drive, deceleration):
-    """Return the plan (see the module): drive for ``drive`` seconds, then brake to rest.
+    """Plan (see the module): drive for ``drive`` seconds, then brake to rest.
 
     It drives with ``u`` (m/s2) from the speed ``v`` up to ``limit`` (m/s), and brakes with ``deceleration`` (m/s2).
     """
@@ -47,7 +47,7 @@ def drive_then_brake(v, u, limit, drive, deceleration):
 
 @kernel
 def brake_then_drive(v, u, limit, brake, deceleration):
-    """Return the plan (see the module): brake for ``brake`` seconds, at most to rest, then drive.
+    """Plan (see the module): brake for ``brake`` seconds, at most to rest, then drive.
 
     It brakes with ``deceleration`` (m/s2) from the speed ``v`` (m/s), and drives with ``u`` (m/s2) up to ``limit``
     (m/s).
@@ -58,7 +58,7 @@ def brake_then_drive(v, u, limit, brake, deceleration):
 
 @kernel
 def piece_at(plan, now, v):
-    """Return a plan's acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops then.
+    """A plan's acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops then.
 
     ``plan``: see the module. ``v``: the vehicle's present speed (m/s).
     """
@@ -76,7 +76,7 @@ def piece_at(plan, now, v):
 
 @large
 def walk(gap, v_front, front, v_rear, rear, until):
-    """Return the smallest gap of two vehicles (m), the time (s) of their first contact, and its squared closing speed.
+    """Smallest gap of two vehicles (m), the time (s) of their first contact, and its squared closing speed.
 
     They begin with ``gap`` (m), ``v_front`` and ``v_rear`` (m/s, at least 0), and follow the plans ``front`` and
     ``rear`` until ``until`` (s), as if they could pass through each other: a negative smallest gap is the depth of

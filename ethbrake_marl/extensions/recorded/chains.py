@@ -26,7 +26,7 @@ class Chains(NamedTuple):
 
 
 def cut_chains(recording: Recording, vehicles: int) -> Chains:
-    """Return the chains of ``vehicles`` vehicles in a recording, ordered by time and by the queue's front vehicle.
+    """Chains of ``vehicles`` vehicles in a recording, ordered by time and by the queue's front vehicle.
 
     The first chain of a queue begins with its front vehicle, the next one directly behind it, and so on. Raises
     ``InvalidInput`` if too many vehicles have faulty data.
@@ -61,7 +61,7 @@ def cut_chains(recording: Recording, vehicles: int) -> Chains:
 
 
 def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
-    """Return the rows of ``states`` of vehicles that follow another one, with ``gap`` (m) and ``front_car``.
+    """Rows of ``states`` of vehicles that follow another one, with ``gap`` (m) and ``front_car``.
 
     ``front_car`` is the row of the vehicle ahead; each vehicle occurs once per moment. ``left_out`` counts what is left
     out.

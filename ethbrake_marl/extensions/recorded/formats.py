@@ -90,7 +90,7 @@ _ROLES = ("time", "vehicle", "lane", "front", "length", "speed")  # keys of ``--
 
 
 def format_of(name: DataFormat, columns: str = "") -> Format:
-    """Return the format of recorded traffic with this name.
+    """Format of recorded traffic with this name.
 
     ``columns`` is for the format ``table`` only: ``time=t,vehicle=id,lane=lane,front=x,length=l,speed=v,units=m``. All
     values except ``units`` are names of columns. ``time=t/1000``: the column ``t`` has times in 1/1000 s. ``units``:

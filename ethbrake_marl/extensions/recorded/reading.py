@@ -64,7 +64,7 @@ def reading(file: Path) -> Iterator[BufferedReader]:
 
 
 def read_cells(file: Path, entry: Format) -> Cells:
-    """Return the columns of a format in a file; lines before the header are ignored.
+    """Columns of a format in a file; lines before the header are ignored.
 
     Raises ``InvalidInput``, which names file, line and column, if a column is missing or occurs twice, and for a cell
     that is empty or not a number; ``NotARecording`` if more than half of the columns are missing.

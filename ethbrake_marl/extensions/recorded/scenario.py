@@ -186,7 +186,7 @@ def read_rows(
 
 
 def files_of(folder: Path, entry: Format, refused: list[str]) -> dict[str, Path]:
-    """Return the files of a format in a folder and its subfolders, or the one file: printable name -> path.
+    """Files of a format in a folder and its subfolders, or the one file: printable name -> path.
 
     Errors for subfolders that cannot be read are added to ``refused``. Names that begin with a dot, and links to
     folders, are ignored.

@@ -176,7 +176,7 @@ def _check_positions(recording: Recording, every_s: float) -> None:
 
 
 def _openacc(raw: Any, cells: Cells, entry: Format) -> Any:
-    """Return the states of cars whose speeds and gaps were recorded, in numbered columns.
+    """States of cars whose speeds and gaps were recorded, in numbered columns.
 
     Car k + 1 follows car k if the speeds of both cars and the gap between them (column ``IVS`` with the number k) are
     recorded. The first car of a queue has position 0, every other car minus the sum of the gaps up to the first.

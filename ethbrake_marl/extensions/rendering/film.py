@@ -24,7 +24,7 @@ ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a pictu
 
 
 def film_scenes(world: State, team: Team, game: Game) -> list[Scene]:
-    """Return 25 scenes per second from the alert on, and the last one."""
+    """25 scenes per second from the alert on, and the last one."""
     motion, scenes = Motion(game, world, 0), list[Scene]()
     for _, state in play(game, world, team):
         motion.step(state)

@@ -47,7 +47,7 @@ def width_of(words: str, size: int) -> float:
 
 
 def fitting(choices: Sequence[str], width: float, size: int) -> str:
-    """Return the first text that is at most ``width`` pixels wide, or else the last one."""
+    """First text that is at most ``width`` pixels wide, or else the last one."""
     return next((words for words in choices if width_of(words, size) <= width), choices[-1])
 
 
@@ -87,7 +87,7 @@ class Pen:
 
 
 def picture(scene: Scene) -> Frame:
-    """Return a scene as a picture, [304, 800, 3] uint8."""
+    """Scene as a picture, [304, 800, 3] uint8."""
     pen = Pen(scene)
     draw_road(pen)
     for body in range(1, len(scene.wanted)):

@@ -82,15 +82,15 @@ class Scene(NamedTuple):
         return self.front_m + float(self.line[GAP, 0])
 
     def command(self, body: int) -> float:
-        """Return the command in effect (m/s2); 0 before the body's latency has elapsed."""
+        """Command in effect (m/s2); 0 before the body's latency has elapsed."""
         return float(self.wanted[body]) if self.car[LATENCY, body] <= self.time_s else 0.0
 
     def share(self, body: int) -> float:
-        """Return the command as a share of the capacity, -1 (brakes fully) to 1 (drives fully)."""
+        """Command as a share of the capacity, -1 (brakes fully) to 1 (drives fully)."""
         return float(action_of(self.car, body, self.command(body), self.time_s))
 
     def said_of(self, body: int) -> str:
-        """Return what a vehicle does, in words such as "brakes 3.0 m/s2"."""
+        """What a vehicle does, in words such as "brakes 3.0 m/s2"."""
         latency, command = float(self.car[LATENCY, body]), self.command(body)
         if latency > self.time_s:
             return f"acts from {latency:.2f} s" if latency < math.inf else "never acts"
@@ -144,7 +144,7 @@ class Motion:
         self.wanted, self.ended = state.wanted[self.row].copy(), bool(state.ended[self.row])
 
     def at(self, time_s: float) -> tuple[Floats, float, tuple[Impact, ...]]:
-        """Return line, place of Vehicle 1 and recent impacts at a time of this motion (s after the alert)."""
+        """Line, place of Vehicle 1 and recent impacts at a time of this motion (s after the alert)."""
         line = self.line.copy()
         line[GAP, 0] = ahead_m = min(line[GAP, 0], POST_M)
         counts, scratch = line[IMPACTS].copy(), scratch_for(len(self.wanted))
@@ -170,7 +170,7 @@ class Motion:
 
 
 def whole_road(state: State, row: int) -> tuple[float, float]:
-    """Return the road (m) that the line needs until it rests, if all vehicles brake fully as soon as they can.
+    """Road (m) that the line needs until it rests, if all vehicles brake fully as soon as they can.
 
     A rear vehicle that would come to rest farther ahead is taken to push the others.
     """

@@ -50,7 +50,7 @@ class Viewer:
         return picture(scene)
 
     def step_frames(self, fps: int = SMOOTH_FPS, row: int = 0) -> list[Any]:
-        """Return the last step of world ``row`` as pictures, ``fps`` per second of the episode."""
+        """Last step of world ``row`` as pictures, ``fps`` per second of the episode."""
         check_whole_number("step_frames: fps", fps, 1)
         motion = self.motion(row)
         count = max(round((motion.until_s - motion.start_s) * fps), 1)

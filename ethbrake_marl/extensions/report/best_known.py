@@ -47,6 +47,6 @@ class BestKnown(NamedTuple):
 
 
 def shown_counts(compared: Compared) -> dict[str, str]:
-    """Return the counts to show, count -> column: both harms, and what agents minimise if its best is known, too."""
+    """Counts to show, count -> column: both harms, and what agents minimise if its best is known, too."""
     known, minimised = BestKnown.of(compared.result), compared.harm_count
     return HARM if known is not None and minimised not in known.harm else {**HARM, minimised: COLUMN[minimised]}

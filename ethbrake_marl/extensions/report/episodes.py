@@ -31,7 +31,7 @@ MOST_SHOWN = 3  # agents that are shown at the start
 def player(
     compared: Compared, focus: str, kinds: Mapping[int, str], records: Mapping[str, Sequence[EpisodeRecord]]
 ) -> Markup:
-    """Return the player of some worlds. It shows ``focus``, the agent that the page is about, and the last agent first.
+    """Player of some worlds. It shows ``focus``, the agent that the page is about, and the last agent first.
 
     ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, with
     samples ``SAMPLE_S`` apart.
@@ -79,7 +79,7 @@ def episode_data(record: EpisodeRecord) -> dict[str, Any]:
 
 
 def pieces_of(record: EpisodeRecord) -> Floats:
-    """Return the motion as pieces of constant acceleration, [k, 1 + 3 N].
+    """Motion as pieces of constant acceleration, [k, 1 + 3 N].
 
     The columns of a piece: the time at which it begins (s), place of Vehicle 1 (m), N - 1 gaps (m), N speeds (m/s), N
     accelerations (m/s2). An impact between two samples ends a piece; the next one leads from there to the second
@@ -102,7 +102,7 @@ def pieces_of(record: EpisodeRecord) -> Floats:
 
 
 def moved(pieces: Floats, t: Floats, N: int) -> Floats:
-    """Return pieces of motion of N vehicles (``pieces_of``), without times, ``t`` [k] seconds after they begin."""
+    """Pieces of motion of N vehicles (``pieces_of``), without times, ``t`` [k] seconds after they begin."""
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
     gaps = pieces[:, 2 : 1 + N] + ways[:, :-1] - ways[:, 1:]
@@ -115,7 +115,7 @@ def replaced_at_s(record: EpisodeRecord) -> list[float]:
 
 
 def _impacts(record: EpisodeRecord) -> list[list[float]]:
-    """Return seven numbers of each impact, in order of time.
+    """Seven numbers of each impact, in order of time.
 
     The time (s), the pair (-1: the obstacle), the closing speed (m/s), whether it is the pair's first impact, the
     number of impacts so far, and both harms so far (m2/s2), which end with those of the episode.
@@ -159,7 +159,7 @@ def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
 
 
 def worst_rows(compared: Compared, focus: str) -> Ints:
-    """Return at most ten rows in which ``focus`` did worst, by what agents minimise, minus the best known if any."""
+    """At most ten rows in which ``focus`` did worst, by what agents minimise, minus the best known if any."""
     result, count, known = compared.result, compared.harm_count, BestKnown.of(compared.result)
     best = 0.0 if known is None else known.harm.get(count, 0.0)
     value = result[focus][COLUMN[count]] - best

@@ -55,7 +55,7 @@ Curve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
 
 
 def over_seeds(trainings: Sequence[Mapping[Any, float]]) -> Curve:
-    """Return the mean of several training runs, plus and minus one standard deviation over the seeds.
+    """Mean of several training runs, plus and minus one standard deviation over the seeds.
 
     ``trainings``: for each run, step or progress -> value. The curve has the steps that all runs have.
     """
@@ -197,7 +197,7 @@ DECELERATION_POINTS = 2001  # evenly spaced decelerations
 
 
 def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float) -> Floats:
-    """Return the harm if vehicle ``body`` holds each of the decelerations ``at`` [C] (m/s2), [3, C] m2/s2.
+    """Harm if vehicle ``body`` holds each of the decelerations ``at`` [C] (m/s2), [3, C] m2/s2.
 
     Rows: first-impact harm predicted by the paper's closed form, and simulated first-impact and total harm.
     """

@@ -37,7 +37,7 @@ class Section(NamedTuple):
 
 
 def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Sequence[Section]) -> str:
-    """Return a page. ``lead`` is the text below its title; ``opening``, parts above the table of contents."""
+    """Page. ``lead`` is the text below its title; ``opening``, parts above the table of contents."""
     style, script = (Markup("\n".join(map(read_file, names))) for names in (_STYLES, _SCRIPTS))
     values = {"title": title, "lead": lead, "opening": opening, "sections": sections, "style": style, "script": script}
     return str(fill("page.html.j2", **values))
@@ -49,12 +49,12 @@ def part(name: str, *values: object) -> Markup:
 
 
 def table(sheet: Sheet) -> Markup:
-    """Return the table as HTML, with title and note. Pandas, which writes plain tables, is not in the extra."""
+    """Table as HTML, with title and note. Pandas, which writes plain tables, is not in the extra."""
     return part("table", sheet)
 
 
 def drawing(figure: Figure, title: str, description: str) -> Markup:
-    """Return the HTML of a figure, with ``title`` and ``description`` for screen readers.
+    """HTML of a figure, with ``title`` and ``description`` for screen readers.
 
     The caption moves from the picture to the page, so that a phone can show it.
     """
@@ -67,7 +67,7 @@ def drawing(figure: Figure, title: str, description: str) -> Markup:
 
 
 def data(name: str, content: object) -> Markup:
-    """Return ``content`` as JSON for the page's scripts, in an HTML element with the id ``name``.
+    """``content`` as JSON for the page's scripts, in an HTML element with the id ``name``.
 
     The characters < > and & are escaped, so the content cannot end the element or begin a new one.
     """
@@ -78,17 +78,17 @@ def data(name: str, content: object) -> Markup:
 
 
 def fill(file: str, **values: Any) -> Markup:
-    """Return a template filled with values. HTML (``Markup``) stays unchanged, everything else is escaped."""
+    """Template filled with values. HTML (``Markup``) stays unchanged, everything else is escaped."""
     return Markup(_environment().get_template(file).render(values))
 
 
 def shown(value: object) -> str:
-    """Return ``value`` as text; control characters, and characters that change the writing direction, are escaped."""
+    """``value`` as text; control characters, and characters that change the writing direction, are escaped."""
     return value if isinstance(value, Markup) else plain_text(str(value), keep=_STAY)
 
 
 def breakable(name: str) -> Markup:
-    """Return the text with places for line breaks after signs, as in ``e_v2x_bm:pairwise``; HTML stays unchanged."""
+    """Text with places for line breaks after signs, as in ``e_v2x_bm:pairwise``; HTML stays unchanged."""
     return name if isinstance(name, Markup) else Markup("<wbr>").join(map(shown, _AFTER_SIGN.split(name)))
 
 

@@ -64,7 +64,7 @@ SHOWN_WITH = ("paper-random", "paper-random-early")  # the second is the variant
 
 
 def is_papers_test(scenario: Scenario) -> bool:
-    """Return whether results in this scenario can be compared with the paper's."""
+    """Whether results in this scenario can be compared with the paper's."""
     return scenario.name in SHOWN_WITH and is_as_shipped(scenario)
 
 

@@ -34,7 +34,7 @@ COUNTED_WORDS = {  # count -> verb, noun, and what is counted
 
 
 def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]) -> str:
-    """Return the page's first sentence: the harm of the agent ``focus`` compared with full braking.
+    """First sentence of the page: the harm of the agent ``focus`` compared with full braking.
 
     It names the tests in which the agent does about as much harm as full braking, or more. ``tests``: title -> results
     of the same agents in another test.
@@ -67,7 +67,7 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
 
 
 def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
-    """Return how an agent's harm differs from full braking's: "as much" if the 95 % interval contains 0."""
+    """How an agent's harm differs from full braking's: "as much" if the 95 % interval contains 0."""
     difference = row[f"{harm}_difference"]
     if difference is None or (difference.interval is None and row.episodes > 1):
         return "as much"
@@ -153,7 +153,7 @@ def measured(agents: SummaryTable) -> list[Markup]:
 
 
 def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
-    """Return the worlds in which ``focus`` did worst, at most ten. Those that the player shows have a button."""
+    """Worlds in which ``focus`` did worst, at most ten. Those that the player shows have a button."""
     result, known, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}

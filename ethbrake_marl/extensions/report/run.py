@@ -120,7 +120,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
 
 
 def telling_row(compared: Compared, learned: str) -> int:
-    """Return the row of a typical world: the median harm saved by ``learned``, where full braking does harm."""
+    """Row of a typical world: the median harm saved by ``learned``, where full braking does harm."""
     harm = COLUMN[compared.harm_count]
     before = compared.result[BASELINE][harm]
     rows = np.flatnonzero(before > 0.0)

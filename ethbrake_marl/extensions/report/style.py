@@ -82,7 +82,7 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **how: Any) -> tuple[Figure, list[Axes]]:
-    """Return a figure with ``rows`` times ``columns`` panels, and their axes, row by row.
+    """Figure with ``rows`` times ``columns`` panels, and their axes, row by row.
 
     ``size_in``: width and height in inches. ``how``: arguments of matplotlib's ``subplots``.
     """
@@ -91,13 +91,13 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 
 
 def series_style(number: int) -> dict[str, Any]:
-    """Return the style of curve ``number`` (from 0) for matplotlib's ``plot``. After the last style they repeat."""
+    """Style of curve ``number`` (from 0) for matplotlib's ``plot``. After the last style they repeat."""
     k = number % len(COLOURS)
     return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
 
 def label_text(text: str, most: int = 40) -> str:
-    """Return ``text`` as a label of at most ``most`` characters.
+    """``text`` as a label of at most ``most`` characters.
 
     Dollar signs do not start a formula, and characters that the font lacks are escaped.
     """
@@ -129,7 +129,7 @@ def finish(
 
 @in_our_style
 def picture_bytes(figure: Figure, path: str | Path) -> bytes:
-    """Return a PNG, SVG or PDF file, by the ending of ``path``. The same figure always gives the same bytes.
+    """PNG, SVG or PDF file, by the ending of ``path``. The same figure always gives the same bytes.
 
     Raises ``InvalidInput`` for another ending.
     """
@@ -151,11 +151,11 @@ def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> N
 
 
 def plain(value: float, _: int) -> str:
-    """Return an axis label's number as text such as 1000, not as a power of ten."""
+    """Number of an axis label as text such as 1000, not as a power of ten."""
     return f"{value:g}"
 
 
 def quantities(world: State) -> str:
-    """Return the quantities of one world as text such as ``d = (7, 7) m; v = (20, 18, 20) m/s; ...``."""
+    """Quantities of one world as text such as ``d = (7, 7) m; v = (20, 18, 20) m/s; ...``."""
     ranges = ranges_of(quantities_of(world))
     return caption({"scenario": "", "count": 1, **ranges}).partition("; ")[2]

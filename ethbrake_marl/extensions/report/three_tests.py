@@ -27,12 +27,12 @@ KEPT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the shor
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
-    """Return whether a scenario equals the shipped one of its name, except title, description and source."""
+    """Whether a scenario equals the shipped one of its name, except title, description and source."""
     return scenario.content(without=WORDS) == load_scenario(scenario.name).content(without=WORDS)
 
 
 def other_tests(scenario: Scenario) -> list[Scenario]:
-    """Return the other two of the three shipped tests; nothing for another scenario."""
+    """The two other shipped tests; nothing for a scenario that is not shipped."""
     if scenario.name not in TESTS or not is_as_shipped(scenario):
         return []
     return [load_scenario(name) for name in TESTS if name != scenario.name]
@@ -43,7 +43,7 @@ def title_of(name: str) -> str:
 
 
 def brief(compared: Compared, others: Mapping[str, Compared]) -> Sheet:
-    """Return a short table: collision rate, both harms and, if agents minimise it, the honest cost with the push.
+    """Short table: collision rate, both harms and, if agents minimise it, the honest cost with the push.
 
     ``others``: results in other tests, name -> results; their means follow below.
     """

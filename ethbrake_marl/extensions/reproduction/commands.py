@@ -77,7 +77,7 @@ def reproduce_command(
 
 
 def chosen_policies(text: str) -> dict[str, str]:
-    """Return the agents to use as PPO and SAC: name -> agent name. ``text`` replaces some, such as ``ppo=policy@RUN``.
+    """Agents to use as PPO and SAC: name -> agent name. ``text`` replaces some, such as ``ppo=policy@RUN``.
 
     Raises ``InvalidInput`` if one cannot drive here.
     """

@@ -38,7 +38,7 @@ EXPECTED, PROVEN, ALONE = "E-V2X-BM, predicted", "least harm, proven", "PPO, not
 
 
 def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Floats]:
-    """Return the first-impact harm of each strategy under a reading of the paper's text: strategy -> [n] m2/s2.
+    """First-impact harm of each strategy under a reading of the paper's text: strategy -> [n] m2/s2.
 
     ``policies``: name -> agent name. What E-V2X-BM predicts and, for exact impacts, the proven bound are included.
     """
@@ -48,7 +48,7 @@ def lines_of(reading: Reading, episodes: int, policies: Mapping[str, str]) -> di
 
 
 def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[str, Floats]:
-    """Return the harm in the paper's fixed-step map, with policies trained as in the paper: strategy -> [seeds, n].
+    """Harm in the paper's fixed-step map, with policies trained as in the paper: strategy -> [seeds, n].
 
     In m2/s2. Strategies without a policy have [n]. Empty without such trainings.
     """
@@ -58,7 +58,7 @@ def process_lines(reading: Reading, episodes: int, settings: Settings) -> dict[s
 
 
 def estimate(line: Floats, rows: Floats) -> Estimate:
-    """Return the mean of the harm ``line``, [n] or [seeds, n], in the worlds ``rows``, with a 95 % interval.
+    """Mean of the harm ``line``, [n] or [seeds, n], in the worlds ``rows``, with a 95 % interval.
 
     The interval is over the worlds or, if there are several seeds, over the seeds.
     """
@@ -78,7 +78,7 @@ def less_in_each(groups: Groups, smaller: str, larger: str) -> list[Less]:
 
 
 def show_harm(stem: str, title: str, readings: Mapping[str, Groups], shown: Sequence[str], x_label: str) -> Made:
-    """Return a figure of mean harm, with a panel for each reading of the paper, and a table for each.
+    """Figure of mean harm, with a panel for each reading of the paper, and a table for each.
 
     ``readings``: name of the reading -> ``Groups`` of worlds. ``shown``: strategies that the figure shows. ``stem``: of
     its file's name.

@@ -14,12 +14,12 @@ LATEX = str.maketrans({
 
 
 def lines_of(sheet: Sheet) -> list[list[str]]:
-    """Return the texts of headings and rows."""
+    """Texts of headings and rows."""
     return [sheet.headings, *([cell.in_words for cell in row if not isinstance(cell, str)] for row in sheet.shown())]
 
 
 def markdown(sheet: Sheet) -> str:
-    """Return the table as Markdown, without title and note."""
+    """Table as Markdown, without title and note."""
     heads, *rows = lines_of(sheet)
     rule = ["---" if column.text else "---:" for column in sheet.formats]
     escaped = [[text.replace("|", "\\|") for text in row] for row in rows]
@@ -27,7 +27,7 @@ def markdown(sheet: Sheet) -> str:
 
 
 def latex(sheet: Sheet) -> str:
-    """Return a LaTeX ``tabular`` for the package ``booktabs``, without title and note."""
+    """LaTeX ``tabular`` for the package ``booktabs``, without title and note."""
     heads, *rows = (" & ".join(text.translate(LATEX) for text in line) + r" \\" for line in lines_of(sheet))
     kinds = "".join("l" if column.text else "r" for column in sheet.formats)
     begin, end = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule"], [r"\bottomrule", r"\end{tabular}"]

@@ -59,7 +59,7 @@ def is_finished(run: Path) -> bool:
 
 
 def trained(folder: Path, group: str) -> dict[str, list[Path]]:
-    """Return the finished trainings of a group of trainings (such as ``RANDOM``): recipe -> folder for each seed.
+    """Finished trainings of a group of trainings (such as ``RANDOM``): recipe -> folder for each seed.
 
     Recipes with an unfinished training are left out.
     """
@@ -100,13 +100,13 @@ def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
 
 
 def unconverged(folder: Path) -> str:
-    """Return the agent name of the policy that the paper calls "obtained from training before convergence occurred"."""
+    """Agent name of the policy that the paper calls "obtained from training before convergence occurred"."""
     ((run,),) = trained(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"
 
 
 def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
-    """Return the policies trained as in the paper, of one ``group`` of trainings: name -> one agent name per seed.
+    """Policies trained as in the paper, of one ``group`` of trainings: name -> one agent name per seed.
 
     Empty without ``settings.full``.
     """
@@ -245,7 +245,7 @@ def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Clai
 
 
 def faster(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
-    """Return the claim that SAC converges faster, as undecided.
+    """Claim that SAC converges faster, as undecided.
 
     The paper's axis is the progress of trainings of unknown length. ``courses``: name -> learning curves.
     ``by_decisions``: the claim, judged by the number of decisions.

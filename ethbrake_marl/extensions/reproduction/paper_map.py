@@ -105,7 +105,7 @@ def sample(state: State, step_s: float) -> State:
 
 
 def collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
-    """Return the paper's r_collision: minus ``k_energy w^2`` of every pair that overlaps at the sample, [n].
+    """The paper's r_collision: minus ``k_energy w^2`` of every pair that overlaps at the sample, [n].
 
     w is the closing speed before the impacts of the sample, the state ``before``; ``step`` and ``after`` are unused. A
     pair counts at each sample of its overlap, also while it separates: the paper's Gamma asks for the gap alone.
@@ -121,7 +121,7 @@ class MappedGame(Game):
     __slots__ = ()
 
     def first_decision(self, alert: State) -> State:
-        """Return the episodes at the first decision.
+        """Episodes at the first decision.
 
         Raises ``InvalidInput`` for worlds with an impact before it, and for worlds of a scenario with exact impacts.
         """
@@ -177,7 +177,7 @@ class PaperMap:
             require(key not in scenario.sources, (key,), UNSHOWN, right)
 
     def game(self, game: Game) -> Game:
-        """Return the game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
+        """Game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
         counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
         if game.settings.weights[OF_PASSED:].any() or counted:
             what = f"the term {counted[0]}" if counted else "harm_count honest"

@@ -46,7 +46,7 @@ def outcome_of(last: State) -> Outcome:
 
 
 def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED) -> Table:
-    """Return the table of the paper's random test, with 95 % intervals, under a reading of its text.
+    """Table of the paper's random test, with 95 % intervals, under a reading of its text.
 
     ``policies``: agent names of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the coupled H* in the paper's map.
     """
@@ -56,7 +56,7 @@ def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIP
 
 
 def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
-    """Return collisions and harm (m2/s2) of each world, [n] each, as a reading of the paper reports them.
+    """Collisions and harm (m2/s2) of each world, [n] each, as a reading of the paper reports them.
 
     ``row``: strategy (a row of the table). ``spec``: agent name of the policy in a hybrid.
     """
@@ -79,7 +79,7 @@ def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple
 
 
 def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str = "first") -> Outcome:
-    """Return the outcome of the policy where its harm is at most ``bound`` (H*, [n] m2/s2), else that of E-V2X-BM.
+    """Outcome of the policy where its harm is at most ``bound`` (H*, [n] m2/s2), else that of E-V2X-BM.
 
     ``baseline``: outcome of E-V2X-BM. ``counted``: ``first`` or ``total``, the harm that is compared.
     """
@@ -88,7 +88,7 @@ def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str 
 
 
 def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
-    """Return collisions and harm, [n] each: as they happened, or as they were predicted at the alert.
+    """Collisions and harm, [n] each: as they happened, or as they were predicted at the alert.
 
     ``numbers`` says which: ``realised``, ``predicted``, or ``predicted harm, realised collisions``.
     """
@@ -130,7 +130,7 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
 
 @cache
 def plan(plans: Reading, episodes: int) -> Choice:
-    """Return the deceleration that E-V2X-BM chooses under the reading ``plans``, [n], and the harm that it predicts.
+    """Deceleration that E-V2X-BM chooses under the reading ``plans``, [n], and the harm that it predicts.
 
     It uses the paper's closed form, without restitution and time steps. If several decelerations do the same least
     harm, the reading says which is taken: the smallest, middle or largest.

@@ -60,7 +60,7 @@ class Reading(NamedTuple):
         return "; ".join(say(field, getattr(self, field)) for field in changed) or "as stated"
 
     def only(self, *fields: str) -> Reading:
-        """Return a copy with only these fields; all others have their default values."""
+        """Copy with only these fields; all others have their default values."""
         return Reading(**{field: getattr(self, field) for field in fields})
 
     def scenario(self, name: str) -> Scenario:

@@ -92,12 +92,12 @@ COMBINED = Gap("several at once", "", "", (
 
 
 def numbers_of(table: Table) -> Floats:
-    """Return collision rate and mean harm of the four rows, [4, 2]; the other printed numbers follow from them."""
+    """Collision rate and mean harm of the four rows, [4, 2]; the other printed numbers follow from them."""
     return np.array([[each.value for each in row] for row in table.values()])
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> float:
-    """Return the root mean square of the relative differences of a table's eight numbers, ours / printed - 1."""
+    """Root mean square of the relative differences of a table's eight numbers, ours / printed - 1."""
     return float(np.sqrt(np.square(numbers / printed - 1.0).mean()))
 
 

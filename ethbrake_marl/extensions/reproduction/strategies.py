@@ -31,7 +31,7 @@ MAP_STEP_S = 0.1
 
 
 def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Outcome]:
-    """Return the outcome of each strategy under a reading of the paper: name -> outcome.
+    """Outcome of each strategy under a reading of the paper: name -> outcome.
 
     If impacts are exact, E-V2X-BM (coupled) and its hybrids are included. ``policies``: name -> agent name. Hybrids
     decide by first-impact harm.
@@ -53,7 +53,7 @@ def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> 
 
 
 def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[str, list[dict[str, Outcome]]]:
-    """Return the outcomes of policies trained as in the paper, alone and in the hybrid, in the paper's fixed-step map.
+    """Outcomes of policies trained as in the paper, alone and in the hybrid, in the paper's fixed-step map.
 
     Policy -> for each seed, strategy -> outcome. Empty without such trainings.
     """
@@ -65,6 +65,6 @@ def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[
 
 
 def least_harm(reading: Reading, episodes: int) -> Floats:
-    """Return a proven lower bound on the harm of every strategy under exact impacts, [n] m2/s2."""
+    """Proven lower bound on the harm of every strategy under exact impacts, [n] m2/s2."""
     scenario, _, alert = opened(reading.only(*WORLDS), episodes)
     return lower_bound(alert, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm

@@ -71,7 +71,7 @@ def number_claims(
     *,
     not_ours: bool = False,
 ) -> list[Claim]:
-    """Return every number that the paper prints in a table as a claim, compared with ours.
+    """Every number that the paper prints in a table as a claim, compared with ours.
 
     ``stated``, ``nearest``: our outcomes under the paper's parameters as stated, and in the reading nearest to its
     results. ``least`` [n] m2/s2: proven lower bound, as stated. ``not_ours``: the policies are the user's.
@@ -108,7 +108,7 @@ def number_claims(
 
 
 def outcomes_sheet(title: str, found: Mapping[str, Outcome], least: Floats) -> Sheet:
-    """Return a table of collision rates and harm. ``found``: strategy -> outcome.
+    """Table of collision rates and harm. ``found``: strategy -> outcome.
 
     ``least`` [n] m2/s2: proven lower bound.
     """
@@ -127,7 +127,7 @@ COLUMNS = PERCENT, *map(Column, ("First-impact harm", "Total harm", "Predicted h
 
 
 def process_sheet(settings: Settings, reading: Reading, episodes: int) -> list[Sheet]:
-    """Return a table of policies trained as in the paper, in its fixed-step map: means over seeds with t intervals.
+    """Table of policies trained as in the paper, in its fixed-step map: means over seeds with t intervals.
 
     Empty without such trainings.
     """
@@ -176,7 +176,7 @@ def over_seeds(process: Mapping[str, Sequence[Mapping[str, Outcome]]], smaller: 
 
 
 def conclusions(found: Mapping[str, Outcome], policies: Iterable[str]) -> dict[str, list[Less]]:
-    """Return the paper's conclusions from its table: statement -> the comparisons that must hold.
+    """The paper's conclusions from its table: statement -> the comparisons that must hold.
 
     ``found``: strategy -> outcome.
     """

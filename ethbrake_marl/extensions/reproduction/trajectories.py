@@ -73,7 +73,7 @@ def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
 
 
 def all_records(settings: Settings) -> dict[str, Records]:
-    """Return recorded episodes under the paper's parameters as stated, and in the reading nearest to its results.
+    """Recorded episodes under the paper's parameters as stated, and in the reading nearest to its results.
 
     Reading -> (policy, scenario number) -> episode. After trainings by the paper's own recipes, also the episodes of
     their first seed.
@@ -165,7 +165,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
 
 
 def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
-    """Return a recorded quantity under PPO, and under SAC at the same times; a finished episode keeps its last value.
+    """Recorded quantity under PPO, and under SAC at the same times; a finished episode keeps its last value.
 
     ``number``: the paper's Scenario 1 or 2. ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair, from
     0.
@@ -176,7 +176,7 @@ def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
 
 
 def apart(records: Records, number: int, what: str) -> float:
-    """Return the root mean square over time of the difference between PPO and SAC, for Vehicle 2.
+    """Root mean square over time of the difference between PPO and SAC, for Vehicle 2.
 
     ``number``: the paper's Scenario 1 or 2. ``what``: attribute of ``EpisodeRecord``.
     """
@@ -185,7 +185,7 @@ def apart(records: Records, number: int, what: str) -> float:
 
 
 def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
-    """Return claims that one quantity is smaller than another in a world, as stated and in the nearest reading.
+    """Claims that one quantity is smaller than another in a world, as stated and in the nearest reading.
 
     ``readings``: for both, claim -> words, (smaller quantity) - (larger one).
     """
@@ -202,7 +202,7 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
 
 
 def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
-    """Return the first command of Vehicle 2, the sum of its changes (m/s2), and the share of time in which it brakes.
+    """First command of Vehicle 2, the sum of its changes (m/s2), and the share of time in which it brakes.
 
     The share is of the time in which it moves after its latency.
     """

@@ -55,7 +55,7 @@ class Planner:
         return Memory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        """Return vehicle ``body``'s commands at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
+        """Vehicle ``body``'s commands at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
         raise NotImplementedError
 
     def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
@@ -128,7 +128,7 @@ class Searched(Planner):
 
 
 def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
-    """Return the game with ``body`` as its only learner, while other learners brake fully, and its worlds at the alert.
+    """Game with ``body`` as its only learner, while other learners brake fully, and its worlds at the alert.
 
     Raises ``InvalidInput`` if an agent drives another vehicle, because its commands are not known at the alert.
     """

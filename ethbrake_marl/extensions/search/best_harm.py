@@ -92,7 +92,7 @@ def _searched(
 
 
 def starting_profiles(problem: Problem, alert: State, given: Sequence[Profiles] = ()) -> list[Profiles]:
-    """Return the profiles with which a search begins: constant commands, ``given``, and for a single vehicle some more.
+    """Profiles with which a search begins: constant commands, ``given``, and for a single vehicle some more.
 
     These are E-V2X-BM's choice and profiles of full driving and full braking.
     """

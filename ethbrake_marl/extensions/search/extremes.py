@@ -26,7 +26,7 @@ WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # steps by which the second cha
 
 
 def extreme_profiles(problem: Problem) -> Profiles:
-    """Return the best profiles of full driving and full braking for one controlled vehicle, [n * KEPT], world by world.
+    """Best profiles of full driving and full braking for one controlled vehicle, [n * KEPT], world by world.
 
     The meetings with its neighbours are computed as if these braked fully. In worlds without neighbours, or with a
     vehicle that moves backward, the profiles coast.

@@ -71,7 +71,7 @@ class Field(NamedTuple):
 
 @kernel
 def value_of(world, line):
-    """Return what the search minimises (m2/s2), plus a little of the other count of harm, which decides ties.
+    """What the search minimises (m2/s2), plus a little of the other count of harm, which decides ties.
 
     ``world``: a ``World``. ``line`` [LINE_ROWS, N + 1]: the present state of its bodies.
     """
@@ -121,7 +121,7 @@ def follow(world, lines, ends, commands, phase, most):
 
 @large
 def draw(random):
-    """Return the next random number in [0, 1) of a splitmix64 generator, whose state is ``random`` [1]."""
+    """Next random number in [0, 1) of a splitmix64 generator, whose state is ``random`` [1]."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -142,13 +142,13 @@ def draw_sign(random):
 
 @kernel
 def allowed(command, low, high):
-    """Return a command limited to ``low`` ... ``high``, rounded toward 0 to a multiple of 1 / RESOLUTION (m/s2)."""
+    """Command limited to ``low`` ... ``high``, rounded toward 0 to a multiple of 1 / RESOLUTION (m/s2)."""
     return int(min(max(command, low), high) * RESOLUTION) / RESOLUTION
 
 
 @large
 def draw_command(world, b):
-    """Return a random command (m/s2) of the controlled vehicle number ``b`` of a ``World``.
+    """Random command (m/s2) of the controlled vehicle number ``b`` of a ``World``.
 
     Likely are full braking, full driving, 0, and the command of the vehicle ahead.
     """
@@ -312,32 +312,33 @@ def improve(world, room, ends, commands, budget, drawing, least):
     except in plans.
     """
     change, lines, tried = room.change, room.lines, room.tried
-    value, active, spent, phase, again = math.inf, 0, -1, 0, False
     new_ends, new_commands = room.ends[: ends.shape[0]], room.commands[: ends.shape[0]]
-    for _ in range(4 * budget + 1):
+    begin = min(0, ends.shape[0])  # no literal, as in `gather`
+    value, active = follow(world, lines, ends, commands, begin, math.inf)
+    if active < 0 or not value < math.inf:
+        return math.inf, 0
+    spent, again = 0, False
+    for _ in range(4 * budget):
         if spent >= budget or value <= least:
             break
+        if not again:
+            draw_change(world, active, drawing, change)
+        phase, again = int(change[PHASE]), False
         copy_profile(ends, commands, new_ends, new_commands)
-        if spent >= 0:  # the first profile that is tried is the given one
-            if not again:
-                draw_change(world, active, drawing, change)
-            phase, again = int(change[PHASE]), False
-            if not apply_change(change, world.bounds, new_ends, new_commands):
-                spent += 1 if drawing[KIND] == PLAN else 0
-                continue
-        copy_line(lines[phase], tried[phase])
+        if not apply_change(change, world.bounds, new_ends, new_commands):
+            spent += 1 if drawing[KIND] == PLAN else 0
+            continue
         spent += 1
+        copy_line(lines[phase], tried[phase])
         new, reached = follow(world, tried, new_ends, new_commands, phase, value)
         if reached < 0 or not new < value:
-            if active == 0:
-                return math.inf, 0
             continue
         value, active = new, reached
         copy_profile(new_ends, new_commands, ends, commands)
         for p in range(phase + 1, reached + 1):
             copy_line(tried[p], lines[p])
         change[AMOUNT] *= 2.0
-        again = spent > 0 and change[WHAT] != SET
+        again = change[WHAT] != SET
     return value, active
 
 

@@ -16,7 +16,7 @@ from ethbrake_marl.registry import Part
 
 
 def least(game: Game, alert: State) -> dict[str, Floats]:
-    """Return the least known value of each count, count -> [n] m2/s2.
+    """Least known value of each count, count -> [n] m2/s2.
 
     The honest cost is included only if it is known in all worlds. Raises ``InvalidInput`` if the least harm of a world
     is in no shipped table.

@@ -66,13 +66,13 @@ class Profiles(NamedTuple):
         return Profiles(self.ends[rows], self.commands_mps2[rows])
 
     def stepwise(self, decisions: int) -> Floats:
-        """Return the commands at each of the first ``decisions`` decisions, [n, decisions, B] m/s2."""
+        """Commands at each of the first ``decisions`` decisions, [n, decisions, B] m/s2."""
         phase = (self.ends[:, np.newaxis] <= np.arange(decisions)[:, np.newaxis]).sum(axis=2)
         phase = np.minimum(phase, self.ends.shape[1] - 1)
         return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
 
     def shortened(self) -> Profiles:
-        """Return profiles with ``MOST_PHASES`` phases. Those of a longer one have its command at their beginning."""
+        """Profiles with ``MOST_PHASES`` phases. Those of a longer one have its command at their beginning."""
         ends, commands = Profiles.padded([self], MOST_PHASES)[0]
         fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
         few = np.minimum(np.array([*FEW_ENDS, np.iinfo(np.int64).max]), ends[:, -1:])
@@ -82,7 +82,7 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def of_steps(commands_mps2: Floats, last_step: Ints) -> Profiles:
-        """Return profiles with one phase for each decision, from commands [n, T, B].
+        """Profiles with one phase for each decision, from commands [n, T, B].
 
         ``last_step`` [n]: number of decisions before the horizon.
         """
@@ -107,7 +107,7 @@ class Profiles(NamedTuple):
 
 
 def best_of(found: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
-    """Return the least of several harms [n] in each world, and its profile. ``found``: pairs; ties: the first."""
+    """Least of several harms [n] in each world, and its profile. ``found``: pairs; ties: the first."""
     harms = np.stack([harm for harm, _ in found])
     pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
     every = Profiles.padded([profiles for _, profiles in found])
@@ -155,13 +155,13 @@ class Problem(NamedTuple):
         return self._replace(harm_count=count)
 
     def even_grid(self, number: int) -> Floats:
-        """Return evenly spaced commands from full braking to full driving, [n, number, B] m/s2."""
+        """Evenly spaced commands from full braking to full driving, [n, number, B] m/s2."""
         low, high = self.bounds[:, np.newaxis, :, 0], self.bounds[:, np.newaxis, :, 1]
         share = np.linspace(0.0, 1.0, number)[:, np.newaxis]
         return np.minimum(low + share * (high - low), high)
 
     def constant(self, commands_mps2: Floats) -> Profiles:
-        """Return profiles with constant commands [n, Q, B], as [n * Q]: first the Q profiles of world 0, and so on.
+        """Profiles with constant commands [n, Q, B], as [n * Q]: first the Q profiles of world 0, and so on.
 
         Each consists of several phases with the same command, which a search can change one by one.
         """
@@ -194,18 +194,18 @@ class Problem(NamedTuple):
         return State(line, car, clock, know, wanted, memories)
 
     def value(self, last: State, count: str | None = None) -> Floats:
-        """Return what the search minimises if episodes end in ``last``, [n] m2/s2; if given, in another ``count``."""
+        """What the search minimises if episodes end in ``last``, [n] m2/s2; if given, in another ``count``."""
         value, weights = np.empty(self.n), weights_of(self.harm_count if count is None else count)
         worths(last.line, self.shares, weights, self.aim, value)
         return value
 
     def values(self, profiles: Profiles) -> dict[str, Floats]:
-        """Return the ``value`` in each count of harm if the vehicles follow ``profiles``: count -> [n] m2/s2."""
+        """``value`` in each count of harm if the vehicles follow ``profiles``: count -> [n] m2/s2."""
         last = self.follow(profiles)
         return {count: self.value(last, count) for count in COUNTS}
 
     def minimising(self, weights: Floats, *, largest: bool = False) -> Problem:
-        """Return the problem that minimises the sum of the vehicles' harm times ``weights`` [n, N].
+        """Problem that minimises the sum of the vehicles' harm times ``weights`` [n, N].
 
         ``largest``: the largest of these products instead.
         """
@@ -247,7 +247,7 @@ def problem_of(
     objective: Declared = "total",
     deciders: Sequence[int] | None = None,
 ) -> Problem:
-    """Return the problem of finding the best commands of some vehicles in worlds at the alert.
+    """Problem of finding the best commands of some vehicles in worlds at the alert.
 
     Learners that are not among ``bodies`` brake fully; all other vehicles hold the commands of their roles.
 
@@ -281,14 +281,14 @@ def problem_of(
 
 
 def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
-    """Return worlds at the alert in which some vehicles brake fully, whatever their roles say."""
+    """Worlds at the alert in which some vehicles brake fully, whatever their roles say."""
     wanted = alert.wanted.copy()
     wanted[:, bodies] = -capacities(alert.car, BRAKING, alert.time_s)[:, bodies]
     return alert._replace(wanted=wanted)
 
 
 def beside_braking(problem: Problem, alone: Problem, profiles: Profiles) -> Profiles:
-    """Return profiles of all controlled vehicles of a problem: one follows ``profiles``, the others brake fully.
+    """Profiles of all controlled vehicles of a problem: one follows ``profiles``, the others brake fully.
 
     ``alone``: the problem of this one vehicle, in the same worlds. Its first decision may be later, because its latency
     is longer; if its decisions are not also decisions of ``problem``, they are rounded to the nearest ones.
@@ -303,7 +303,7 @@ def beside_braking(problem: Problem, alone: Problem, profiles: Profiles) -> Prof
 
 
 def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
-    """Return a hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
+    """Hash of everything that decides the harm of a profile, [n]: 8 bytes of BLAKE2b of each world.
 
     Hashed are the world, the commands of all other vehicles, which vehicles are controlled (``bodies``), and ``times``
     [n, 4]: first decision, time step, number of steps, end.
@@ -327,7 +327,7 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
 
 
 def aimed(problem: Problem, objective: Declared) -> Problem:
-    """Return the problem with ``objective``, as under a scenario's key, as what its search minimises.
+    """Problem with ``objective``, as under a scenario's key, as what its search minimises.
 
     Raises ``InvalidInput`` if the controlled vehicles' objective is neither a weighted sum of harm nor ``maximin``, or
     differs among them.
@@ -350,7 +350,7 @@ def aimed(problem: Problem, objective: Declared) -> Problem:
 
 @kernel
 def worth(line, shares, weights, aim):
-    """Return what a search minimises (m2/s2) in one world. It never decreases during an episode.
+    """What a search minimises (m2/s2) in one world. It never decreases during an episode.
 
     ``line`` [LINE_ROWS, N + 1]: the present state. ``shares`` [3, N + 1], ``aim``: as in ``Problem``. ``weights`` [6]:
     of the count of harm.

@@ -94,7 +94,7 @@ def joined(parts: Sequence[Profiles], n: int) -> Profiles:
 
 
 def search_world(world: World, room: Room, given: Profiles, last: int, budget: int) -> Profiles | None:
-    """Return the best profile of one world, [1]; None if no profile can be simulated.
+    """Best profile of one world, [1]; None if no profile can be simulated.
 
     ``given``: profiles that are tried first. ``last``: number of decisions. ``budget``: number of profiles to simulate.
 
@@ -138,7 +138,7 @@ def sort(field: Field, left: int) -> None:
 
 
 def compact(ends: Ints, commands: Floats) -> Profiles:
-    """Return a profile [1] without empty phases, with neighbouring phases of equal commands joined.
+    """Profile [1] without empty phases, with neighbouring phases of equal commands joined.
 
     ``ends`` [K], ``commands`` [K, B] m/s2.
     """
@@ -210,7 +210,7 @@ def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 
 
 
 def seeded(identity: UInt64s, seed: int) -> UInt64s:
-    """Return the initial state of each world's random number generator, [n], from its ``identity`` [n] and the seed."""
+    """Initial state of each world's random number generator, [n], from its ``identity`` [n] and the seed."""
     with np.errstate(over="ignore"):
         z = identity ^ np.uint64((int(seed) * 0xD1342543DE82EF95) % 2**64)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

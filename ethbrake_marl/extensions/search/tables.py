@@ -78,7 +78,7 @@ class BestHarmTable:
         return np.where(self.identity[rows] == identity, rows, -1)
 
     def stored(self, problem: Problem, count: str) -> tuple[Floats, Profiles]:
-        """Return the least known harm of the problem's worlds, [n] m2/s2, and its profiles, [n].
+        """Least known harm of the problem's worlds, [n] m2/s2, and its profiles, [n].
 
         ``count``: which harm (``episode.counts``). A world that is not in the table has infinite harm and the profile
         of coasting.
@@ -107,12 +107,12 @@ def _shipped() -> tuple[BestHarmTable, ...]:
 
 
 def shipped_tables() -> tuple[BestHarmTable, ...]:
-    """Return the shipped tables that were made with this installation's physics, in the order of their files' names."""
+    """Shipped tables that were made with this installation's physics, in the order of their files' names."""
     return tuple(table for table in _shipped() if table.header.get("physics") == physics_digest())
 
 
 def outdated_tables() -> dict[str, str]:
-    """Return why other shipped tables are not used: name of the scenario -> one line."""
+    """Why other shipped tables are not used: name of the scenario -> one line."""
     now = physics_digest()
     others = {table.header["scenario"]: table.header.get("physics") for table in _shipped()}
     return {
@@ -124,7 +124,7 @@ def outdated_tables() -> dict[str, str]:
 
 
 def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
-    """Return the least harm of each world in the shipped tables, [n] m2/s2, and the commands (profiles) that do it.
+    """Least harm of each world in the shipped tables, [n] m2/s2, and the commands (profiles) that do it.
 
     ``count``: which harm (``episode.counts``). A world that is in no table has infinite harm and coasts.
     """

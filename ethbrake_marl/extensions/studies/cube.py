@@ -23,7 +23,7 @@ class Cube(NamedTuple):
     places: tuple[Place, ...]
 
     def worlds(self, points: Floats) -> State:
-        """Return the worlds at ``points`` [n, d] of [0, 1)."""
+        """Worlds at ``points`` [n, d] of [0, 1)."""
         index = np.arange(len(points), dtype=np.int64)
 
         def numbers(width: int, stream: tuple[int, ...]) -> Floats:
@@ -36,14 +36,14 @@ class Cube(NamedTuple):
         return draw_once(self.scenario, numbers, index).worlds
 
     def accepts(self, worlds: State) -> Bools:
-        """Return whether the scenario accepts the worlds, [n]. Some scenarios reject worlds with an early impact."""
+        """Whether the scenario accepts the worlds, [n]. Some scenarios reject worlds with an early impact."""
         if self.scenario.early_impacts == "keep" or not self.scenario.learners:
             return np.ones(worlds.n, np.bool_)
         return ~has_early_impact(self.scenario, worlds)
 
 
 def cube_of(scenario: Scenario) -> Cube:
-    """Return the coordinates of a scenario: all random numbers whose change changes a world.
+    """Coordinates of a scenario: all random numbers whose change changes a world.
 
     Raises ``InvalidInput`` if nothing is random, for a mixture of scenarios, and for a channel with random delays or
     losses, which a table of worlds cannot store.

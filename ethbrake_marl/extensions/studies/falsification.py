@@ -54,7 +54,7 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 
 
 def far_apart(points: Floats, scores: Floats, count: int) -> Ints:
-    """Return at most ``count`` rows of ``points`` [m, d] with high finite ``scores`` [m], highest first.
+    """At most ``count`` rows of ``points`` [m, d] with high finite ``scores`` [m], highest first.
 
     Any two of the points differ by at least ``APART`` in some coordinate.
     """

@@ -43,7 +43,7 @@ class Measure(NamedTuple):
 
     @classmethod
     def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> Measure:
-        """Return the measure ``name`` of ``agent``.
+        """Measure ``name`` of ``agent``.
 
         ``against``: the other agent; None: none, or the best known commands. Agents are names or objects, as for
         ``eb.evaluate``. Raises ``InvalidInput`` if ``against`` is not used, or a name means several agents, and the
@@ -62,7 +62,7 @@ class Measure(NamedTuple):
         return cls(name, loaded, game, sum(teams, ()), harm_count)
 
     def __call__(self, worlds: State) -> Measured:
-        """Return the measure in some worlds. Raises ``InvalidInput`` for ``bound`` without a shield."""
+        """Measure in some worlds. Raises ``InvalidInput`` for ``bound`` without a shield."""
         last, *other = (drive(self.game, worlds, team) for team in self.teams)
         harm = last.harm(self.harm_count)
         if self.name == "harm":
@@ -109,7 +109,7 @@ class Measure(NamedTuple):
 
 
 def states_of(worlds: State, scenario: Scenario) -> list[dict[str, float]]:
-    """Return each world's initial state: gaps, speeds, and what the scenario does not fix, by name of the column."""
+    """Each world's initial state: gaps, speeds, and what the scenario does not fix, by name of the column."""
     fixed = fixed_columns(scenario)
     columns = {name: values for name, values in quantities_of(worlds).items() if name not in fixed}
     return [

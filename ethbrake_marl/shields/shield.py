@@ -1,16 +1,17 @@
-"""What every shield reports after a decision, and the reward term that counts replaced actions."""
+"""What all shields share: how a name makes one, checks, the reasons that they report, and a reward term."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from enum import IntEnum
-from typing import Any
+from inspect import signature
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent, check_agent
+from ethbrake_marl.agents.drive import Agent, Team, check_agent
 from ethbrake_marl.episode.counts import check_count
-from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput
@@ -41,6 +42,34 @@ class ShieldReason(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
+class NamedShield(NamedTuple):
+    """Makes a shield of one class for a team. Text after the colon of its name sets the option ``argument``."""
+
+    shield: Callable[..., Shield]  # (drivers, harm_count=..., **options); one called ``scenario`` is the worlds'
+    argument: str | None = None  # the option that is the text after the colon
+
+    def __call__(self, team: Team, text: str | None, settings: Any) -> Team:
+        """Team with the shield. Raises ``InvalidInput`` for bad options, and for a team that has a shield.
+
+        ``text`` follows the colon of the shield's name; ``settings`` are ``names.AgentSettings``.
+        """
+        if team.shield is not None:
+            raise InvalidInput(f"shield: team {team.name!r} already has a shield")
+        wanted, options = signature(self.shield), {**settings.options, "harm_count": settings.harm_count}
+        if "scenario" in wanted.parameters:
+            options["scenario"] = settings.needed_scenario()
+        if text is not None:
+            if self.argument is None or self.argument in options:
+                raise InvalidInput(f"shield {settings.spec!r}: {text!r} cannot follow the colon; leave it out")
+            options[self.argument] = text
+        try:
+            wanted.bind(team.drivers, **options)
+        except TypeError as error:
+            known = ", ".join([*wanted.parameters][1:])
+            raise InvalidInput(f"shield {settings.spec!r}: {error}; its options: {known}") from None
+        return team._replace(shield=self.shield(team.drivers, **options))
+
+
 def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
     for body, agent in (drivers or {}).items():
         check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
@@ -58,7 +87,7 @@ def check_harm_count(count: str) -> None:
 
 
 def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
-    """Return values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
+    """Values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
     wide = np.full((state.n, state.vehicles), other, columns.dtype)
     wide[:, game.settings.learners - 1] = columns
     return wide
