@@ -9,8 +9,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ethbrake_marl.episode.game import Game, Script, Shield
+from ethbrake_marl.episode.script_calls import ask_script, begin_script, guard_scripts
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step, asked, begin
+from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
@@ -126,8 +127,8 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     """
     game = team.game(game)
     if game.shield is None:
-        state, agents, actions = game.reset(alert), game.agents(team.drivers), np.zeros((alert.n, 0))
-        memories = {body: begin(agent, alert, body) for body, agent in agents.items()}
+        state, agents, actions = game.reset(alert), game.agents(guard_scripts(team.drivers)), np.zeros((alert.n, 0))
+        memories = {body: begin_script(agent, alert, body) for body, agent in agents.items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.
         game = game._replace(scripts={**game.scripts, **agents}, rules=game.rules._replace(learners=NOBODY))
@@ -153,7 +154,7 @@ def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, A
     """
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
-        commands, after[body] = asked(agent, state, memories[body], body)
+        commands, after[body] = ask_script(agent, state, memories[body], body)
         actions[:, column] = to_action(state, body, commands)
     return actions, after
 

@@ -11,6 +11,7 @@ import numpy as np
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
+from ethbrake_marl.episode.script_calls import ask_script, begin_script
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Rules, Step
 from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
@@ -79,8 +80,8 @@ class Game(NamedTuple):
         if self.scripts:
             wanted = wanted.copy()
             for body, script in self.scripts.items():
-                memory = one_step.begin(script, alert, body)
-                wanted[:, body], memories[body] = one_step.asked(script, alert, memory, body)
+                memory = begin_script(script, alert, body)
+                wanted[:, body], memories[body] = ask_script(script, alert, memory, body)
         state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:

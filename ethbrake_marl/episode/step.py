@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import COUNTS
+from ethbrake_marl.episode.script_calls import ask_scripts
 from ethbrake_marl.episode.state import (
     CLOCK_COLUMNS,
     END,
@@ -20,9 +21,8 @@ from ethbrake_marl.episode.state import (
     TIME,
     State,
     check_exact,
-    mapped,
 )
-from ethbrake_marl.errors import AgentFailed, EthBrakeError, InvalidInput, PhysicsError, describe_error
+from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.drive import FAILED, MET, drive, drive_worlds
 from ethbrake_marl.motion.layout import (
@@ -297,7 +297,7 @@ def step(
     ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
     actions = numbers_of(rules, actions, state.n)
-    line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
+    line, car, clock, know, wanted, memories = ask_scripts(scripts, state) if scripts else state
     if not donate:
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
@@ -313,23 +313,12 @@ def step(
     return State(line, car, clock, know, wanted, memories), Step(reward, out, rules.time_step_s)
 
 
-def scripted(scripts: Mapping[int, Any], state: State) -> State:
-    """State with new commands and memories of the ``scripts``; its commands are a new array."""
-    wanted, memories, commands = state.wanted.copy(), dict(state.memories), {}
-    for i, script in scripts.items():
-        commands[i], memories[i] = asked(script, state, memories[i], i)
-    running = ~state.ended  # nothing changes in an episode that has ended
-    for i, command_mps2 in commands.items():
-        np.copyto(wanted[:, i], command_mps2, where=running)
-    return state._replace(wanted=wanted, memories=memories)
-
-
 def decided(rules: Rules, scripts: Mapping[int, Any], state: State, actions: Floats | None) -> State:
     """State with the commands of scripts and learners, as at the beginning of a step; arguments of ``step``."""
     given = proposals(rules, numbers_of(rules, actions, state.n), state.n)
     if np.isnan(given).any():
         _check_actions(rules, given[np.isnan(given).any(axis=1).argmax()])
-    state, learners = scripted(scripts, state), rules.learners
+    state, learners = ask_scripts(scripts, state), rules.learners
     capacity = np.where(given < 0.0, state.car[:, BRAKING, learners], state.car[:, DRIVING, learners])
     running = ~state.ended[:, np.newaxis]
     state.wanted[:, learners] = np.where(running, given * capacity, state.wanted[:, learners])
@@ -353,73 +342,6 @@ def proposals(rules: Rules, actions: Floats, n: int) -> Floats:
     for row in actions[(size > LARGEST_ACTION).any(axis=1)]:
         _check_actions(rules, np.where(np.isnan(row), 0.0, row))
     return np.clip(actions, -1.0, 1.0)
-
-
-def begin(script: Any, alert: State, body: int) -> Any:
-    """Memory of a script for new episodes. Raises ``AgentFailed`` if the script fails."""
-    return _remembered(script, _called(script, "begin", alert, body), alert.n, body)
-
-
-def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-    """Commands of a script, [n] m/s2, and its new memory.
-
-    Raises ``AgentFailed`` if the script fails, or if its commands are not numbers or exceed a capacity.
-    """
-    name = getattr(script, "name", type(script).__name__)
-    answer = _called(script, "act", state, memory, body)
-    if not isinstance(answer, tuple) or len(answer) != 2:
-        raise AgentFailed(name, None, f"vehicle_{body}: act returned {answer!r:.60}; must return commands and memory")
-    given, memory = answer[0], _remembered(script, answer[1], state.n, body)
-    commands = np.asarray(given)
-    if commands.shape != (state.n,) or commands.dtype.kind not in "fiu":
-        raise AgentFailed(
-            name, None, f"vehicle_{body}: its commands are {given!r:.60}; must be numbers of the shape ({state.n},)"
-        )
-    low, high = -state.car[:, BRAKING, body], state.car[:, DRIVING, body]
-    good = (commands >= low) & (commands <= high)
-    if not good.all():
-        k = int(np.argmin(good))
-        number = int(state.clock[k, NUMBER])
-        raise AgentFailed(
-            name,
-            k if number < 0 else number,
-            f"vehicle_{body} at {state.time_s[k]:.2f} s: command {commands[k]:g} m/s2; must be in"
-            f" [{low[k]:g}, {high[k]:g}] m/s2",
-        )
-    return commands, memory
-
-
-def _remembered(script: Any, memory: Any, n: int, body: int) -> Any:
-    """Memory of a script. A user's memory is checked, and made read-only because simulations share it."""
-    if type(script).__module__.startswith("ethbrake_marl."):
-        return memory
-
-    def frozen(array: Any) -> Any:
-        if not isinstance(array, np.ndarray) or array.shape[:1] != (n,):
-            raise AgentFailed(
-                getattr(script, "name", type(script).__name__),
-                None,
-                f"vehicle_{body}: its memory is {array!r:.60}; must be None, an array with one row for each of the {n}"
-                " worlds, or a tuple or mapping of these",
-            )
-        view = array.view()
-        view.setflags(write=False)
-        return view
-
-    return mapped(frozen, memory)
-
-
-def _called(script: Any, method: str, state: State, *given: Any) -> Any:
-    """Call a method of a script. A user's script gets a read-only state, and its errors become ``AgentFailed``."""
-    if not type(script).__module__.startswith("ethbrake_marl."):
-        state = state.read_only()
-    try:
-        return getattr(script, method)(state, *given)
-    except EthBrakeError:
-        raise
-    except Exception as error:
-        name, body = getattr(script, "name", type(script).__name__), given[-1]
-        raise AgentFailed(name, None, f"vehicle_{body}: {method} fails: {describe_error(error)}") from error
 
 
 def _check_actions(rules: Rules, actions: Floats) -> None:

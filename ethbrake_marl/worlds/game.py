@@ -14,6 +14,7 @@ from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.episode.objectives import Declared, free_pairs, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
+from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.worlds.physics import PHYSICS
@@ -66,7 +67,7 @@ def game_of(
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))
-    game = Game(Pool(scenario), scenario.name, rules, rewarding, views, bodies, scripts)
+    game = Game(Pool(scenario), scenario.name, rules, rewarding, views, bodies, guard_scripts(scripts))
     for extension in (scenario.members or (scenario,))[0].v2x.extensions:  # members of a mixture have the same
         game = extension.game(game)
     if scenario.physics is not None:
