@@ -9,15 +9,14 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ethbrake_marl.episode.game import Game, Script, Shield
+from ethbrake_marl.episode.layer import MESSAGES, SENSORS
 from ethbrake_marl.episode.script_calls import ask_script, begin_script, guard_scripts
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
-# what an agent needs to know, from little to much
-SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
-MESSAGES = "messages"  # also the messages that the vehicle has received
+# what an agent needs to know, after `episode.layer.SENSORS` and `MESSAGES`
 ESTIMATED = "estimated model"  # also what the scenario says about all worlds: ranges of values, scripts, physics
 STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehicles, whether received or not
 MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs

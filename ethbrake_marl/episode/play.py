@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ethbrake_marl.episode.counts import Count, amount_so_far, other_count, weights_of
-from ethbrake_marl.episode.state import ENDED, PHYSICS, STEPS, State, check_exact
+from ethbrake_marl.episode.state import ENDED, STEPS, State, check_exact
 from ethbrake_marl.episode.step import advance, command, note_motion
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.drive import FAILED, drive
@@ -77,7 +77,7 @@ def played(
     look at the state, ``PhysicsError`` is raised. ``donate``: the arrays of ``state`` may be overwritten.
     """
     most = np.full(len(plans), most)
-    if game.scripts or PHYSICS in state.memories:
+    if game.scripts or game.physics is not None:
         rows = np.arange(len(plans))
         while (~state.ended & (state.harm(count) <= most)).any():
             now = np.minimum(state.steps, plans.shape[1] - 1)

@@ -68,10 +68,13 @@ def game_of(
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))
     game = Game(Pool(scenario), scenario.name, rules, rewarding, views, bodies, guard_scripts(scripts))
-    for extension in (scenario.members or (scenario,))[0].v2x.extensions:  # members of a mixture have the same
-        game = extension.game(game)
+    v2x = (scenario.members or (scenario,))[0].v2x  # members of a mixture have the same
+    if v2x.extensions:
+        layers = [extension.layer(v2x) for extension in v2x.extensions]
+        game = game.with_layers(sorted(layers, key=lambda layer: layer.stage))
     if scenario.physics is not None:
-        game = PHYSICS[scenario.physics].game(game)
+        physics = PHYSICS[scenario.physics]
+        game = game._replace(physics=physics, rewarding=physics.rewarding(game))
     return scenario, game
 
 

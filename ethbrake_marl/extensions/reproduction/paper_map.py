@@ -34,8 +34,8 @@ import numpy as np
 
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.reward import RewardParams
-from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, PHYSICS, STEPS, TIME, State
+from ethbrake_marl.episode.reward import Rewarding, RewardParams
+from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, TIME, State
 from ethbrake_marl.episode.step import COUNTED, HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
 from ethbrake_marl.episode.terms import pair_energies
 from ethbrake_marl.errors import InvalidInput
@@ -115,30 +115,49 @@ def collision(params: RewardParams, before: State, step: Step, after: State) -> 
     return penalty
 
 
-class MappedGame(Game):
-    __slots__ = ()
+class PaperMap:
+    """The physics ``paper-map`` (``episode.game.Physics``)."""
 
-    def first_decision(self, alert: State) -> State:
-        """Return the episodes at the first decision.
+    def check(self, scenario: Scenario) -> None:
+        """Raise an error for an obstacle, and for brakes that build up."""
+        right = "is not known to physics: paper-map; leave one of the two out"
+        for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
+            require(key not in scenario.sources, (key,), UNSHOWN, right)
+
+    def rewarding(self, game: Game) -> Rewarding:
+        """The rewards, with the paper's own r_collision. Raises ``InvalidInput`` if they need exact impacts."""
+        counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
+        if game.rules.counting[2:].any() or counted:
+            what = f"the term {counted[0]}" if counted else "harm_count honest"
+            raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
+        terms = tuple(
+            (name, weight, partial(collision, game.rewarding.params) if name == "collision" else function)
+            for name, weight, function in game.rewarding.terms
+        )
+        return game.rewarding._replace(terms=terms)
+
+    def first_decision(self, game: Game, alert: State) -> State:
+        """The episodes at the first decision.
 
         Raises ``InvalidInput`` for worlds with an impact before it, and for worlds of a scenario with exact impacts.
         """
-        if PHYSICS not in alert.memories:
+        if alert.is_exact:
             raise InvalidInput(
-                f"scenario {self.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
+                f"scenario {game.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
                 " a scenario that has physics: paper-map"
             )
-        rules = self.rules
-        state = one_step.first_decision(alert, self.deciders, rules.time_step_s, rules.horizon_s, rules.most_steps)
+        rules = game.rules
+        state = one_step.first_decision(alert, game.deciders, rules.time_step_s, rules.horizon_s, rules.most_steps)
         if state.collided.any():
             raise InvalidInput(
-                f"scenario {self.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
+                f"scenario {game.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
                 " which physics: paper-map does not know; early_impacts: reject draws such worlds again"
             )
         return state
 
-    def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        before, rules = one_step.decided(self.rules, self.scripts, state, actions), self.rules
+    def follow(self, game: Game, state: State, actions: Floats | None) -> tuple[State, Step]:
+        rules = game.rules
+        before = one_step.decided(rules, game.scripts, state, actions)
         after, over = sample(before, rules.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
         np.copyto(after.clock, before.clock, where=over[:, np.newaxis])
@@ -154,26 +173,6 @@ class MappedGame(Game):
         shared = rules.terminal * out[SAFE_END] - rules.harm * out[COUNTED]
         reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)
         return after, Step(reward, out, rules.time_step_s)
-
-
-class PaperMap:
-    def check(self, scenario: Scenario) -> None:
-        """Raise an error for an obstacle, and for brakes that build up."""
-        right = "is not known to physics: paper-map; leave one of the two out"
-        for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
-            require(key not in scenario.sources, (key,), UNSHOWN, right)
-
-    def game(self, game: Game) -> Game:
-        """Return the game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
-        counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
-        if game.rules.counting[2:].any() or counted:
-            what = f"the term {counted[0]}" if counted else "harm_count honest"
-            raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
-        terms = tuple(
-            (name, weight, partial(collision, game.rewarding.params) if name == "collision" else function)
-            for name, weight, function in game.rewarding.terms
-        )
-        return MappedGame(*game._replace(rewarding=game.rewarding._replace(terms=terms)))
 
 
 PAPER_MAP = PaperMap()
