@@ -33,7 +33,24 @@ class Script(Protocol):
 
 
 class Shield(Protocol):
-    """Decides which proposed actions are applied, and which are replaced."""
+    """Decides which proposed actions are applied, and which are replaced.
+
+    >>> import numpy as np
+    >>> import ethbrake_marl as eb
+    >>> class NeverDrives:
+    ...     def begin(self, game, alert, state):
+    ...         return None
+    ...     def decide(self, game, state, proposed, *, donate):
+    ...         return np.minimum(proposed, 0.0), None
+    ...     def infos(self, game, state):
+    ...         return {}
+    >>> scenario, game = eb.open_game("paper-random")
+    >>> game = game._replace(shield=NeverDrives())
+    >>> state, step = game.step(game.reset(scenario.sample(1, seed=7)), np.ones((1, 1)))
+    >>> state.commands_mps2[:, 1]
+    array([0.])
+
+    """
 
     def begin(self, game: Game, alert: State, state: State) -> Any:
         """Memory of the shield for new episodes: their worlds at the ``alert``, and at the first decision ``state``."""
@@ -50,7 +67,26 @@ class Shield(Protocol):
 
 
 class Physics(Protocol):
-    """How vehicles move and collide in a game, instead of the exact physics."""
+    """How vehicles move and collide in a game, instead of the exact physics.
+
+    >>> import numpy as np
+    >>> import ethbrake_marl as eb
+    >>> class Ice:
+    ...     def check(self, scenario):
+    ...         pass
+    ...     def rewarding(self, game):
+    ...         return game.rewarding
+    ...     def first_decision(self, game, alert):
+    ...         return game._replace(physics=None).first_decision(alert)
+    ...     def follow(self, game, state, actions):  # learners brake half as hard
+    ...         return game._replace(physics=None).follow(state, 0.5 * actions)
+    >>> scenario, game = eb.open_game("paper-random")
+    >>> game = game._replace(physics=Ice())
+    >>> state, step = game.step(game.reset(scenario.sample(1, seed=7)), -np.ones((1, 1)))
+    >>> state.commands_mps2[:, 1]
+    array([-3.5])
+
+    """
 
     def check(self, scenario: Any) -> None:
         """Refuse (``files.model.refuse``) a scenario that this physics cannot simulate."""

@@ -29,16 +29,18 @@ class Layer:
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.episode.layer import Layer
+    >>> from ethbrake_marl.motion.layout import GAP
     >>> class Fog(Layer):
     ...     def seen(self, state, body):
     ...         line = state.line.copy()
     ...         line[:, GAP, 1:-1] *= 1.1
     ...         return state._replace(line=line)
-    >>> from ethbrake_marl.motion.layout import GAP
     >>> scenario, game = eb.open_game("paper-random", observation=["front_1.gap"])
     >>> state, foggy = game.reset(scenario.sample(1, seed=7)), game.with_layers([Fog()])
-    >>> float(foggy.observe_alike(state, [2])[0, 0, 0] / game.observe_alike(state, [2])[0, 0, 0])
+    >>> round(float(foggy.seen(state, 2).gaps_m[0, 0] / state.gaps_m[0, 0]), 3)
     1.1
+    >>> bool(foggy.observe_alike(state, [2]) > game.observe_alike(state, [2]))
+    True
 
     """
 
