@@ -10,14 +10,14 @@ import numpy as np
 
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game, Script, Shield
+from ethbrake_marl.episode.layer import MESSAGES, SENSORS
+from ethbrake_marl.episode.script_calls import ask_script, begin_script, guard_scripts
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step, asked, begin
+from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Floats
 
-# what an agent needs to know, from little to much
-SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
-MESSAGES = "messages"  # also the messages that the vehicle has received
+# what an agent needs to know, after `episode.layer.SENSORS` and `MESSAGES`
 ESTIMATED = "estimated model"  # also what the scenario says about all worlds: ranges of values, scripts, physics
 STATE = "true state"  # also gaps, speeds, capacities and latencies of all vehicles, whether received or not
 MODEL = "true model"  # also masses, restitution and scripts: everything that an exact simulation needs
@@ -127,8 +127,8 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     """
     game = team.game(game)
     if game.shield is None:
-        state, agents, actions = game.reset(alert), game.agents(team.drivers), np.zeros((alert.n, 0))
-        memories = {body: begin(agent, alert, body) for body, agent in agents.items()}
+        state, agents, actions = game.reset(alert), game.agents(guard_scripts(team.drivers)), np.zeros((alert.n, 0))
+        memories = {body: begin_script(agent, alert, body) for body, agent in agents.items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.
         game = game._replace(scripts={**game.scripts, **agents}, settings=game.settings._replace(learners=NOBODY))
@@ -154,6 +154,6 @@ def propose(drivers: Mapping[int, Agent], state: State, memories: Mapping[int, A
     """
     actions, after = np.empty((state.n, len(drivers))), dict(memories)
     for column, (body, agent) in enumerate(drivers.items()):
-        commands, after[body] = asked(agent, state, memories[body], body)
+        commands, after[body] = ask_script(agent, state, memories[body], body)
         actions[:, column] = actions_of(state, body, commands)
     return actions, after

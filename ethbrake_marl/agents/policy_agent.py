@@ -6,14 +6,13 @@ import math
 import os
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.drive import MESSAGES
 from ethbrake_marl.agents.foreign import (
     Ask,
     ask_function,
@@ -26,6 +25,7 @@ from ethbrake_marl.agents.foreign import (
 from ethbrake_marl.episode.commands import LARGEST_ACTION, commands_of
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import MESSAGES, Layer, view_through
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import NUMBER, State, mapped
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
@@ -78,6 +78,10 @@ class LearnedAgent:
                 stacklevel=2,
             )
 
+    def through(self, layers: tuple[Layer, ...]) -> LearnedAgent:
+        """The agent that observes through ``layers``."""
+        return replace(self, observation=view_through(layers, self.observation or self.policy.observation))
+
     def begin(self, alert: State, body: int) -> None:
         """No memory."""
 
@@ -111,6 +115,10 @@ class PolicyAgent:
                 f" {game.name!r} does not observe the usual ones; pass observation=[...] to policy_agent, or scenario="
                 " for the scenario of its training"
             )
+
+    def through(self, layers: tuple[Layer, ...]) -> PolicyAgent:
+        """The agent that observes through ``layers``."""
+        return replace(self, observation=view_through(layers, self.observation))
 
     def begin(self, alert: State, body: int) -> Any:
         return None if self.initial_state is None else self._own(self.initial_state(alert.n), alert.n)

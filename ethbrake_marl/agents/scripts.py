@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from ethbrake_marl.agents.drive import SENSORS
+from ethbrake_marl.episode.layer import SENSORS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part

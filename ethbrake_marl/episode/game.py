@@ -10,8 +10,10 @@ import numpy as np
 
 from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import proposal_array
+from ethbrake_marl.episode.layer import Layer, agent_through, script_through, view_through
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.reward import Rewarding
+from ethbrake_marl.episode.script_calls import ask_script, begin_script
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Step, StepSettings
 from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
@@ -32,7 +34,24 @@ class Script(Protocol):
 
 
 class Shield(Protocol):
-    """Decides which proposed actions are applied, and which are replaced."""
+    """Decides which proposed actions are applied, and which are replaced.
+
+    >>> import numpy as np
+    >>> import ethbrake_marl as eb
+    >>> class NeverDrives:
+    ...     def begin(self, game, alert, state):
+    ...         return None
+    ...     def decide(self, game, state, proposed, *, donate):
+    ...         return np.minimum(proposed, 0.0), None
+    ...     def infos(self, game, state):
+    ...         return {}
+    >>> scenario, game = eb.open_game("paper-random")
+    >>> game = game._replace(shield=NeverDrives())
+    >>> state, step = game.step(game.reset(scenario.sample(1, seed=7)), np.ones((1, 1)))
+    >>> state.commands_mps2[:, 1]
+    array([0.])
+
+    """
 
     def begin(self, game: Game, alert: State, state: State) -> Any:
         """Memory of the shield for new episodes: their worlds at the ``alert``, and at the first decision ``state``."""
@@ -48,8 +67,43 @@ class Shield(Protocol):
         """Values for the infos: name -> [n] or [n, N]."""
 
 
+class Physics(Protocol):
+    """How vehicles move and collide in a game, instead of the exact physics.
+
+    >>> import numpy as np
+    >>> import ethbrake_marl as eb
+    >>> class Ice:
+    ...     def check(self, scenario):
+    ...         pass
+    ...     def rewarding(self, game):
+    ...         return game.rewarding
+    ...     def first_decision(self, game, alert):
+    ...         return game._replace(physics=None).first_decision(alert)
+    ...     def follow(self, game, state, actions):  # learners brake half as hard
+    ...         return game._replace(physics=None).follow(state, 0.5 * actions)
+    >>> scenario, game = eb.open_game("paper-random")
+    >>> game = game._replace(physics=Ice())
+    >>> state, step = game.step(game.reset(scenario.sample(1, seed=7)), -np.ones((1, 1)))
+    >>> state.commands_mps2[:, 1]
+    array([-3.5])
+
+    """
+
+    def check(self, scenario: Any) -> None:
+        """Refuse (``files.model.refuse``) a scenario that this physics cannot simulate."""
+
+    def rewarding(self, game: Game) -> Rewarding:
+        """The rewards of a game that has this physics. Raises ``InvalidInput`` for terms that it cannot compute."""
+
+    def first_decision(self, game: Game, alert: State) -> State:
+        """Episodes at their first decision, as ``Game.first_decision``."""
+
+    def follow(self, game: Game, state: State, actions: Floats | None) -> tuple[State, Step]:
+        """State after one step and what happened in it, as ``Game.follow``."""
+
+
 class Game(NamedTuple):
-    """Worlds to draw, settings, scripts, observations, rewards, and perhaps a shield.
+    """Worlds to draw, settings, scripts, observations, rewards, and perhaps layers, another physics and a shield.
 
     ``draw`` returns worlds at the alert; ``reset`` moves them to the first decision, and ``step`` to the next one.
     Environments, evaluation, search and shields all use this ``step``.
@@ -73,6 +127,15 @@ class Game(NamedTuple):
     # body -> script that looks at the state; a vehicle that is neither here nor a learner holds its first command
     scripts: Mapping[int, Script] = MappingProxyType({})
     shield: Shield | None = None
+    layers: tuple[Layer, ...] = ()  # what vehicles see goes through them; `with_layers` sets them
+    physics: Physics | None = None  # None: exact impacts
+
+    def with_layers(self, layers: Sequence[Layer]) -> Game:
+        """A game without layers, now with ``layers``: its views and scripts see what all of them let through."""
+        layers = tuple(layers)
+        views = tuple(view_through(layers, view) for view in self.views)
+        scripts = {body: script_through(layers, script) for body, script in self.scripts.items()}
+        return self._replace(views=views, scripts=scripts, layers=layers)
 
     def reset(self, alert: State) -> State:
         """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert."""
@@ -80,8 +143,8 @@ class Game(NamedTuple):
         if self.scripts:
             wanted = wanted.copy()
             for body, script in self.scripts.items():
-                memory = one_step.begin(script, alert, body)
-                wanted[:, body], memories[body] = one_step.asked(script, alert, memory, body)
+                memory = begin_script(script, alert, body)
+                wanted[:, body], memories[body] = ask_script(script, alert, memory, body)
         state = self.first_decision(alert._replace(wanted=wanted, memories=memories))
         memories = dict(state.memories)
         if self.rewarding.shaping is not None:
@@ -123,26 +186,51 @@ class Game(NamedTuple):
 
         Raises ``InvalidInput`` for worlds of another physics.
         """
+        if self.physics is not None:
+            return self.physics.first_decision(self, alert)
         check_exact(alert, f"scenario {self.name!r}")
-        return one_step.first_decision(alert, self.deciders, self.settings)
+        state = one_step.first_decision(alert, self.deciders, self.settings)
+        for layer in self.layers:
+            state = layer.first_decision(self, alert, state)
+        return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """``step`` (same arguments) without the shield, and without reward terms other than harm and terminal."""
-        return one_step.step(self.settings, self.scripts, state, actions, donate=donate)
+        if self.physics is not None:
+            return self.physics.follow(self, state, actions)
+        after, step = one_step.step(self.settings, self.scripts, state, actions, donate=donate and not self.layers)
+        for layer in self.layers:
+            after = layer.after(self, state, after)
+        return after, step
+
+    def seen(self, state: State, body: int, before: Layer | None = None) -> State:
+        """The state as vehicle ``body`` sees it through all layers, or through those before the layer ``before``."""
+        for layer in self.layers:
+            if layer is before:
+                break
+            state = layer.seen(state, body)
+        return state
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
-        """The agents, body -> agent, each limited to what its vehicle may know. Here they see everything."""
-        return drivers
+        """The agents, body -> agent, each limited to what its vehicle may know."""
+        if not self.layers:
+            return drivers
+        return {body: agent_through(self.layers, agent) for body, agent in drivers.items()}
 
     def hides(self, alert: State, body: int) -> Bools:
         """Whether something about each body is hidden from vehicle ``body`` at its first decision, [n, N + 1]."""
-        return alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
+        hidden: Bools = alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
+        for layer in self.layers:
+            hidden = hidden | layer.hides(alert, body)
+        return hidden
 
     def own_infos(self, state: State) -> dict[str, Any]:
-        """Infos of this game's shield: name -> [n] or [n, N]."""
-        if self.shield is None:
-            return {}
-        return {f"shield_{name}": value for name, value in self.shield.infos(self, state).items()}
+        """Infos of this game's shield and layers: name -> [n] or [n, N]."""
+        values = {} if self.shield is None else self.shield.infos(self, state)
+        infos = {f"shield_{name}": value for name, value in values.items()}
+        for layer in self.layers:
+            infos |= layer.infos(state)
+        return infos
 
     def observe(self, state: State, bodies: Ints) -> list[Observations]:
         """Observations of each body: a list of arrays [n, F], with the F features that this body observes."""

@@ -89,6 +89,10 @@ class View:
     def __repr__(self) -> str:
         return f"View({list(self.names)})"
 
+    def part(self, names: Sequence[str]) -> View:
+        """The same view of some of its features."""
+        return View(names)
+
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
         """Observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
         plan = self.plan
@@ -142,6 +146,12 @@ def knows(state: State, body: int, other: int) -> NDArray[np.bool_]:
     return np.asarray(state.time_s >= state.know[:, body, other])
 
 
+def has_unknown(state: State, body: int) -> NDArray[np.bool_]:
+    """Whether a quantity of a body is unknown (NaN) in this state, [n]."""
+    parts = (state.line[:, :, body], state.car[:, :, body], state.wanted[:, [body]])
+    return np.asarray(np.isnan(np.concatenate(parts, axis=1)).any(axis=1))
+
+
 def scaling_of(features: Sequence[Feature]) -> Floats:
     """1 / scale, low and high of features, [3, F]."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
@@ -163,7 +173,10 @@ def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[n
     else:
         given = (state.read_only(), body, body + offset) if offset else (state.read_only(), body)
         value = called(what, own.function, given, (state.n,))
-        value = np.where(known, value, own.unknown) if offset else value
+        if offset:
+            lost = np.isnan(value)  # a layer shows what a vehicle does not know as NaN
+            known = known & ~(lost & has_unknown(state, body + offset)) if lost.any() else known
+            value = np.where(known, value, own.unknown)
     check_finite(what, value, state.time_s)
     return scaled(value, scaling_of([own.feature])[:, 0])
 

@@ -10,7 +10,7 @@ import numpy as np
 from ethbrake_marl.episode.commands import write_commands
 from ethbrake_marl.episode.counts import Count, amount_so_far, weights_of
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import ENDED, PHYSICS, STEPS, TIME, State
+from ethbrake_marl.episode.state import ENDED, STEPS, TIME, State
 from ethbrake_marl.episode.step import advance
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.interval import FAILED
@@ -44,7 +44,7 @@ def played(
     look at the state, ``PhysicsError`` is raised. ``donate``: the arrays of ``state`` may be overwritten.
     """
     most = np.full(len(plans), most)
-    if game.scripts or PHYSICS in state.memories:
+    if game.scripts or game.physics is not None:
         rows = np.arange(len(plans))
         while (~state.ended & (state.harm(count) <= most)).any():
             now = np.minimum(state.steps, plans.shape[1] - 1)

@@ -39,7 +39,7 @@ END = 6  # time at which the last step ends (s): the horizon, or earlier after `
 LISTED = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
 CLOCK_COLUMNS = 7
 
-PHYSICS = "physics"  # a memory of this name marks worlds whose impacts are not exact (`worlds.physics`)
+PHYSICS = "physics"  # a memory of this name marks worlds whose impacts are not exact (`State.is_exact`)
 
 
 class State(NamedTuple):
@@ -207,8 +207,13 @@ class State(NamedTuple):
         split_harm(pairs - unshared, self.car[:, MASS], out)
         return out + unshared[:, :-1]
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether these worlds have exact impacts, and not another physics (key ``physics`` of a scenario)."""
+        return PHYSICS not in self.memories
+
     def _check_count(self, count: Count) -> None:
-        if PHYSICS not in self.memories:
+        if self.is_exact:
             return
         _first_impacts, _all_impacts, *beside_harm = weights_of(count)
         if any(beside_harm):
@@ -220,7 +225,7 @@ def check_exact(state: State, what: str) -> None:
 
     ``what`` names the feature that needs exact impacts.
     """
-    if PHYSICS in state.memories:
+    if not state.is_exact:
         raise InvalidInput(
             f"{what} needs exact impacts, and these worlds have another physics (key physics of their scenario);"
             " physics=null has exact impacts"

@@ -10,24 +10,12 @@ import numpy as np
 
 from ethbrake_marl.episode.commands import LARGEST_ACTION, action_array, check_actions, write_commands
 from ethbrake_marl.episode.counts import COUNTS, OF_FIRST, OF_TOTAL, beside_harm
-from ethbrake_marl.episode.state import (
-    CLOCK_COLUMNS,
-    END,
-    ENDED,
-    FIRST_DECISION,
-    LAST,
-    NUMBER,
-    STEPS,
-    TIME,
-    State,
-    mapped,
-)
-from ethbrake_marl.errors import AgentFailed, EthBrakeError, PhysicsError, describe_error
+from ethbrake_marl.episode.script_calls import ask_scripts
+from ethbrake_marl.episode.state import CLOCK_COLUMNS, END, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State
+from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.interval import FAILED, MET, move_line, move_lines
 from ethbrake_marl.motion.layout import (
-    BRAKING,
-    DRIVING,
     FORCE,
     IMPACTS,
     LATENCY,
@@ -124,7 +112,7 @@ def step(
     ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
     actions = action_array(settings.learners, actions, state.n)
-    line, car, clock, know, wanted, memories = scripted(scripts, state) if scripts else state
+    line, car, clock, know, wanted, memories = ask_scripts(scripts, state) if scripts else state
     if not donate:
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
@@ -260,84 +248,6 @@ def advanced(state: State, until_s: Floats) -> State:
         raise failure(state, failed, state.time_s[failed], until_s[failed])
     clock[:, TIME] = until_s
     return state._replace(line=line, car=car, clock=clock, wanted=wanted)
-
-
-def scripted(scripts: Mapping[int, Any], state: State) -> State:
-    """State with new commands and memories of the ``scripts``; its commands are a new array."""
-    wanted, memories, commands = state.wanted.copy(), dict(state.memories), {}
-    for i, script in scripts.items():
-        commands[i], memories[i] = asked(script, state, memories[i], i)
-    running = ~state.ended  # nothing changes in an episode that has ended
-    for i, command_mps2 in commands.items():
-        np.copyto(wanted[:, i], command_mps2, where=running)
-    return state._replace(wanted=wanted, memories=memories)
-
-
-def begin(script: Any, alert: State, body: int) -> Any:
-    """Memory of a script for new episodes. Raises ``AgentFailed`` if the script fails."""
-    return _remembered(script, _called(script, "begin", alert, body), alert.n, body)
-
-
-def asked(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-    """Commands of a script, [n] m/s2, and its new memory.
-
-    Raises ``AgentFailed`` if the script fails, or if its commands are not numbers or exceed a capacity.
-    """
-    name = getattr(script, "name", type(script).__name__)
-    answer = _called(script, "act", state, memory, body)
-    if not isinstance(answer, tuple) or len(answer) != 2:
-        raise AgentFailed(name, None, f"vehicle_{body}: act returned {answer!r:.60}; must return commands and memory")
-    given, memory = answer[0], _remembered(script, answer[1], state.n, body)
-    commands = np.asarray(given)
-    if commands.shape != (state.n,) or commands.dtype.kind not in "fiu":
-        raise AgentFailed(
-            name, None, f"vehicle_{body}: its commands are {given!r:.60}; must be numbers of the shape ({state.n},)"
-        )
-    low, high = -state.car[:, BRAKING, body], state.car[:, DRIVING, body]
-    good = (commands >= low) & (commands <= high)
-    if not good.all():
-        k = int(np.argmin(good))
-        number = int(state.clock[k, NUMBER])
-        raise AgentFailed(
-            name,
-            k if number < 0 else number,
-            f"vehicle_{body} at {state.time_s[k]:.2f} s: command {commands[k]:g} m/s2; must be in"
-            f" [{low[k]:g}, {high[k]:g}] m/s2",
-        )
-    return commands, memory
-
-
-def _remembered(script: Any, memory: Any, n: int, body: int) -> Any:
-    """Memory of a script. A user's memory is checked, and made read-only because simulations share it."""
-    if type(script).__module__.startswith("ethbrake_marl."):
-        return memory
-
-    def frozen(array: Any) -> Any:
-        if not isinstance(array, np.ndarray) or array.shape[:1] != (n,):
-            raise AgentFailed(
-                getattr(script, "name", type(script).__name__),
-                None,
-                f"vehicle_{body}: its memory is {array!r:.60}; must be None, an array with one row for each of the {n}"
-                " worlds, or a tuple or mapping of these",
-            )
-        view = array.view()
-        view.setflags(write=False)
-        return view
-
-    return mapped(frozen, memory)
-
-
-def _called(script: Any, method: str, state: State, *given: Any) -> Any:
-    """Call a method of a script. A user's script gets a read-only state, and its errors become ``AgentFailed``."""
-    if not type(script).__module__.startswith("ethbrake_marl."):
-        state = state.read_only()
-    try:
-        return getattr(script, method)(state, *given)
-    except EthBrakeError:
-        raise
-    except Exception as error:
-        name, body = getattr(script, "name", type(script).__name__), given[-1]
-        raise AgentFailed(name, None, f"vehicle_{body}: {method} fails: {describe_error(error)}") from error
 
 
 def failure(state: State, row: int, start_s: float, until_s: float) -> PhysicsError:

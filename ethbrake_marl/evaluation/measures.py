@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import PHYSICS, State
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.motion.layout import FIRST, IMPACTS
@@ -122,7 +122,7 @@ def harm(count: str, game: Game, alert: State, last: State) -> Given:
 
     None for the honest cost if impacts are not exact.
     """
-    if count == "honest" and PHYSICS in last.memories:
+    if count == "honest" and not last.is_exact:
         return None
     borne = {f"{i + 1}": column for i, column in enumerate(last.borne_harm(count).T)}
     return {"": last.harm(count), **borne}

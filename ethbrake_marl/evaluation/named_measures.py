@@ -18,7 +18,7 @@ from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, name_of, objectives_of
 from ethbrake_marl.episode.reward import RewardParams
-from ethbrake_marl.episode.state import PHYSICS, State
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision, drove, jerk, push, risk
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
@@ -183,7 +183,7 @@ def _intervention(before: State, step: Step, after: State) -> Floats:
 
 def _objective(name: str, game: Game, alert: State, last: State) -> Given:
     objectives = objectives_of(name, last.vehicles)
-    counts = [count for count in COUNTS if count != "honest" or PHYSICS not in last.memories]
+    counts = [count for count in COUNTS if count != "honest" or last.is_exact]
     values = {count: amounts(objectives, None, last, count) for count in counts}
     return values if objectives[0].differs else {count: value[:, 0] for count, value in values.items()}
 

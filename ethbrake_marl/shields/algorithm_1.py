@@ -18,8 +18,8 @@ from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import price
+from ethbrake_marl.episode.script_calls import begin_script
 from ethbrake_marl.episode.state import END, State
-from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
@@ -69,7 +69,7 @@ class EpisodeShield:
         """Memory at the first decision ``state``: which driver gets each episode."""
         check_learners(game, self.drivers)
         ((body, agent),) = self.drivers.items()
-        remembered = begin(game.agents({body: agent})[body], alert, body)
+        remembered = begin_script(game.agents({body: agent})[body], alert, body)
         known = alert._replace(wanted=state.wanted)
         choice = coupled(known, body, self.count, state.clock[:, END]) if self.coupled else pairwise(known, body)
         backup = actions_of(alert, body, -choice.deceleration_mps2)[:, np.newaxis]

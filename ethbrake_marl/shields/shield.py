@@ -12,6 +12,7 @@ import numpy as np
 from ethbrake_marl.agents.drive import Agent, Team, check_agent
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game, Shield
+from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput
@@ -73,7 +74,7 @@ class NamedShield(NamedTuple):
 def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
     for body, agent in (drivers or {}).items():
         check_agent(agent, f"shield: policy of vehicle_{body} = {agent!r:.60}")
-    return dict(sorted((drivers or {}).items()))
+    return guard_scripts(dict(sorted((drivers or {}).items())))
 
 
 def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:

@@ -40,8 +40,8 @@ import numpy as np
 from ethbrake_marl.agents.drive import MODEL, Agent, propose
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import played
+from ethbrake_marl.episode.script_calls import begin_script
 from ethbrake_marl.episode.state import State, take
-from ethbrake_marl.episode.step import begin
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import FORCE, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
@@ -147,7 +147,7 @@ class StepShield:
         return self.first_memory(game, alert, state, state, self.agents_at(game, alert))
 
     def agents_at(self, game: Game, alert: State) -> dict[int, Any]:
-        return {body: begin(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
+        return {body: begin_script(agent, alert, body) for body, agent in game.agents(self.drivers).items()}
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
         return first_plans(game, alert, state, self.count)

@@ -11,7 +11,7 @@ from ethbrake_marl.agents.drive import CHUNK, Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
-from ethbrake_marl.episode.state import PHYSICS, State
+from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.policies.policy import Policy
@@ -46,7 +46,7 @@ def measure_on_list(training: Training) -> Evaluate:
 def metrics_of(training: Training, last: State) -> dict[str, float]:
     reward, scenario = training.recipe.reward, training.scenario
     counts = sorted(COLUMN, key=lambda count: count != reward.harm_count)  # what is counted comes first
-    known = [count for count in counts if count != "honest" or PHYSICS not in last.memories]
+    known = [count for count in counts if count != "honest" or last.is_exact]
     metrics = {COLUMN[count]: mean(last.harm(count)) for count in known}
     metrics["collision_rate"] = float(last.collided.mean())
     metrics["horizon_rate"] = float(last.moving.mean())

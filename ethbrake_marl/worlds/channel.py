@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -38,6 +38,7 @@ from pydantic import (
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, Wording, read_model, require, suggestion
 from ethbrake_marl.files.yaml import Document
@@ -47,7 +48,6 @@ from ethbrake_marl.worlds.counters import Numbers
 from ethbrake_marl.worlds.quantity import Part, ordered
 
 if TYPE_CHECKING:
-    from ethbrake_marl.episode.game import Game
     from ethbrake_marl.worlds.scenario import Scenario
 
 PER_LINK = 4  # uniform numbers of a link: wait, burst, loss, hop
@@ -82,32 +82,45 @@ def burst_periods(u: Floats, loss_begins: float, loss_ends: float) -> Ints:
     return periods
 
 
-class Extension(Protocol):
-    """What an extension adds to the V2X channel, declared by keys of ``v2x``."""
+class Extension:
+    """What an extension adds to the V2X channel, declared by keys of ``v2x``. Override the methods that differ.
+
+    >>> from ethbrake_marl.episode.layer import Layer
+    >>> from ethbrake_marl.worlds.channel import Extension
+    >>> class Fog(Extension):
+    ...     name = "fog"
+    ...     schemas = {"fog_m": {"description": "largest gap that sensors see", "type": "number"}}
+    ...     def layer(self, v2x):
+    ...         return Layer()  # here one that limits the gaps to v2x.fog_m
+    """
 
     name: str  # of its memory in `State.memories`
     schemas: Mapping[str, JsonSchemaValue]  # JSON schema of each key, with a description
 
     def read(self, key: str, value: Any) -> Any:
         """Value of a key as plain data. Refuses a bad value (``files.model.refuse``)."""
+        return value
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
         """Keys about messages that have an effect with this extension. Keys without any effect are refused."""
+        return ()
 
     def is_random(self, v2x: V2X) -> bool:
         """Whether the extension draws random numbers of its own."""
+        return False
 
     def check(self, scenario: Scenario) -> None:
         """Refuse a scenario that cannot have these keys."""
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
-        """Memory of this extension for n worlds at the alert.
+        """Memory of this extension for n worlds at the alert: None, an array with one row per world, or a tuple.
 
         ``numbers`` draws random numbers (``counters.numbers_of``); ``unheard``: as in ``V2X.heard_and_seen``.
         """
 
-    def game(self, game: Game) -> Game:
-        """The game, changed by this extension."""
+    def layer(self, v2x: V2X) -> Layer:
+        """The layer through which vehicles see the state."""
+        raise NotImplementedError
 
 
 def register_v2x_extension(key: str, extension: Extension) -> None:
@@ -199,8 +212,9 @@ class V2X(Part):
     def _check(self) -> None:
         """Refuse keys without effect, and a channel by which a vehicle may never learn anything."""
         extended = {EXTENSIONS[key]: key for key in self.model_extra or ()}
-        right = "belong to different extensions, whose games would replace each other; leave one out"
-        require(len(extended) < 2, (), UNSHOWN, f"{' and '.join(extended.values())} {right}")
+        right = "belong to different extensions, whose memories have the same name; leave one out"
+        names = {extension.name for extension in extended}
+        require(len(names) == len(extended), (), UNSHOWN, f"{' and '.join(extended.values())} {right}")
         used = [key for extension in self.extensions for key in extension.uses(self)]
         unused = [key for key in OF_MESSAGES if key not in used]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)
@@ -230,7 +244,9 @@ class V2X(Part):
 
     @property
     def extensions(self) -> tuple[Extension, ...]:
-        return tuple(dict.fromkeys(EXTENSIONS[key] for key in self.model_extra or ()))
+        """Extensions that the keys switch on, sorted by name, so that the order of the keys has no effect."""
+        extensions = {EXTENSIONS[key] for key in self.model_extra or ()}
+        return tuple(sorted(extensions, key=lambda extension: extension.name))
 
     @property
     def timing(self) -> Literal["latency", "fixed", "messages"]:
@@ -250,7 +266,7 @@ class V2X(Part):
         heard = self.hears != "none" and (self.timing == "messages" or 0.0 < self.lost < 1.0)
         seen = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
         own = any(extension.is_random(self) for extension in self.extensions)
-        return self.by_link and (heard or seen or own)
+        return own or (self.by_link and (heard or seen))
 
     def first_message_s(self, u: Floats) -> Floats:
         """Delay tau of each link's first message (s), for uniform numbers ``u`` [..., PER_LINK]; infinite: none."""

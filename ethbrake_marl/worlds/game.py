@@ -14,6 +14,7 @@ from ethbrake_marl.episode.game import Game, Script
 from ethbrake_marl.episode.objectives import Declared, free_pairs, objectives_of
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.reward import Reward, Rewarding
+from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import FreeImpacts
 from ethbrake_marl.worlds.physics import PHYSICS
@@ -66,11 +67,14 @@ def game_of(
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))
-    game = Game(Pool(scenario), scenario.name, settings, rewarding, views, bodies, scripts)
-    for extension in (scenario.members or (scenario,))[0].v2x.extensions:  # members of a mixture have the same
-        game = extension.game(game)
+    game = Game(Pool(scenario), scenario.name, settings, rewarding, views, bodies, guard_scripts(scripts))
+    v2x = (scenario.members or (scenario,))[0].v2x  # members of a mixture have the same
+    if v2x.extensions:
+        layers = [extension.layer(v2x) for extension in v2x.extensions]
+        game = game.with_layers(sorted(layers, key=lambda layer: layer.stage))
     if scenario.physics is not None:
-        game = PHYSICS[scenario.physics].game(game)
+        physics = PHYSICS[scenario.physics]
+        game = game._replace(physics=physics, rewarding=physics.rewarding(game))
     return scenario, game
 
 

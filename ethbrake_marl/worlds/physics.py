@@ -2,23 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
-
-from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.game import Physics
 from ethbrake_marl.registry import Registry
-
-if TYPE_CHECKING:
-    from ethbrake_marl.worlds.scenario import Scenario
-
-
-class Physics(Protocol):
-    """How vehicles move and collide in a game, instead of the exact physics."""
-
-    def check(self, scenario: Scenario) -> None:
-        """Refuse (``files.model.refuse``) a scenario that this physics cannot simulate."""
-
-    def game(self, game: Game) -> Game:
-        """The game with this physics: a subclass of ``Game`` with its own ``follow``."""
 
 
 def register_physics(name: str, physics: Physics) -> None:

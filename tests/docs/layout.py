@@ -50,7 +50,7 @@ evaluation/door.py      evaluate; worlds/sampling.py, draw: the fixed list of wo
 evaluation/evaluate.py  evaluate, _driven
 agents/drive.py         play, and in each step:
 episode/game.py           Game.step
-episode/step.py           step; asked: agents/policy_agent.py, policies/actor.py
+episode/step.py           step; script_calls.py, ask_script: agents/policy_agent.py, policies/actor.py
 motion/interval.py        move_line; motion/impact.py, resolve_impacts: the harm
 evaluation/measures.py  harm: episode/state.py, State.harm
 evaluation/summary.py   summarise; statistics.py, mean

@@ -12,6 +12,7 @@ import pytest
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import descend, hold
 from ethbrake_marl.episode.play import price
+from ethbrake_marl.episode.script_calls import guard_scripts
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
@@ -170,7 +171,7 @@ class Eases(Counts):
 
 def test_script__commands_from_the_alert_on() -> None:
     _, game = open_game("paper-random")
-    state = game._replace(scripts={1: Eases()}).reset(game.draw(2, 7, 0))
+    state = game._replace(scripts=guard_scripts({1: Eases()})).reset(game.draw(2, 7, 0))
     assert (state.wanted[:, 1] == -3.0).all()
     assert state.speeds_mps[:, 0] == pytest.approx(game.draw(2, 7, 0).speeds_mps[:, 0] - 3.0 * state.time_s)
 
@@ -178,4 +179,4 @@ def test_script__commands_from_the_alert_on() -> None:
 def test_memory_of_a_script__cannot_be_changed_in_place_because_plays_share_it() -> None:
     _, game = open_game("paper-random")
     with pytest.raises(AgentFailed, match="vehicle_3: act fails: ValueError: output array is read-only"):
-        game._replace(scripts={3: Counts()}).reset(game.draw(2, 7, 0))
+        game._replace(scripts=guard_scripts({3: Counts()})).reset(game.draw(2, 7, 0))

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.errors import EthBrakeError
 from ethbrake_marl.faces.rendering import Renderer, register_renderer
 from ethbrake_marl.names import register_agent
 from ethbrake_marl.worlds.channel import register_v2x_extension
 from tests.contract.interfaces import BARE, PAPER, STEP, Vector, actions
-from tests.fixtures.layer import Layer
+from tests.fixtures.layer import UsersExtension
 
 
 class NextStep(Vector):
@@ -77,12 +77,10 @@ class Picture(Renderer):
     stepped = began
 
 
-class Reporting(Game):
-    __slots__ = ()
-
-    def own_infos(self, state: eb.State) -> dict[str, Any]:
+class Reporting(Layer):
+    def infos(self, state: eb.State) -> dict[str, Any]:
         TRAP.spring()
-        return {**super().own_infos(state), "mine": state.time_s}
+        return {"mine": state.time_s}
 
 
 def feature(state: eb.State, body: int) -> Any:
@@ -118,7 +116,7 @@ def shown() -> tuple[eb.Scenario, dict[str, Any]]:
 
 
 def layered() -> tuple[eb.Scenario, dict[str, Any]]:
-    register_v2x_extension("mine", Layer("mine", Reporting))  # type: ignore[arg-type]
+    register_v2x_extension("mine", UsersExtension("mine", Reporting()))
     return SHORT.replace(v2x={"mine": 1}), {}
 
 

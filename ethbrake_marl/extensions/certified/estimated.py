@@ -275,6 +275,9 @@ def check_predictable(scenario: Scenario, body: int) -> None:
     if scenario.members:
         names = ", ".join(member.name for member in scenario.members)
         raise InvalidInput(f"{where} the ranges of one scenario, but this is a mixture; give one of {names}")
+    false = [extension.name for extension in scenario.v2x.extensions if extension.name != NAME]
+    if false:
+        raise InvalidInput(f"{where} messages without errors; leave {', '.join(false)} out of v2x, or use shield step")
     for other, (name, role) in enumerate(scenario.roles.items(), 1):
         if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
             raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
@@ -288,7 +291,7 @@ def without_channel(game: Game, median: State) -> tuple[Game, State]:
     car = median.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
     memories = {name: memory for name, memory in median.memories.items() if name != NAME}
-    return Game._make(game), median._replace(car=car, know=np.zeros_like(median.know), memories=memories)
+    return game._replace(layers=()), median._replace(car=car, know=np.zeros_like(median.know), memories=memories)
 
 
 def in_order(place: Floats, known: Bools) -> Floats:

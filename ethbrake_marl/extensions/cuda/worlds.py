@@ -206,10 +206,10 @@ def check_runs(game: Game) -> None:
             f"{what}: vehicle_{body} is driven by {name!r}, which looks at the state; scripts that hold one command run"
             " there, such as full_brake and coast (--set roles.NAME=full_brake)"
         )
-    if type(game) is not Game:
+    if game.layers or game.physics is not None:
+        other = [type(part).__name__ for part in (*game.layers, game.physics) if part is not None]
         raise InvalidInput(
-            f"{what}: its worlds are those of {type(game).__module__}.{type(game).__name__}; messages with content and"
-            " another physics run on a processor only"
+            f"{what}: has {', '.join(other)}; messages with content and another physics run on a processor only"
         )
     if game.shield is not None:
         raise InvalidInput(f"{what}: has a shield, which runs on a processor only; train without it, then shield")

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MESSAGES
 from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import MESSAGES
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from ethbrake_marl.agents.drive import MESSAGES
 from ethbrake_marl.agents.trained import make_trained
+from ethbrake_marl.episode.layer import MESSAGES
 from ethbrake_marl.files.model import FileModel, refuse
 from ethbrake_marl.policies.network import Activation, NetworkSpec
 from ethbrake_marl.registry import Part

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.game import Game
-from ethbrake_marl.extensions.messages.game import GameWithMessages
+from ethbrake_marl.episode.layer import Layer
+from ethbrake_marl.extensions.messages.game import MESSAGES_LAYER
 from ethbrake_marl.extensions.messages.links import (
     CHANNEL_COLUMNS,
     DELAY,
@@ -23,7 +23,7 @@ from ethbrake_marl.extensions.messages.links import (
 )
 from ethbrake_marl.files.model import UNSHOWN, require, suggestion
 from ethbrake_marl.motion.layout import Bools, Floats
-from ethbrake_marl.worlds.channel import PER_LINK, V2X
+from ethbrake_marl.worlds.channel import PER_LINK, V2X, Extension
 from ethbrake_marl.worlds.counters import Numbers
 from ethbrake_marl.worlds.quantities import NEWS, OF_WORLD
 from ethbrake_marl.worlds.scenario import Scenario
@@ -34,7 +34,7 @@ USUAL = PIECES[:-1]  # what a message contains unless the scenario says otherwis
 _LISTED = {"type": "array", "items": {"enum": list(PIECES)}, "uniqueItems": True}
 
 
-class Messages:
+class Messages(Extension):
     """Extension that the keys ``persistence`` and ``tells`` of ``v2x`` switch on."""
 
     name = "messages"
@@ -105,8 +105,8 @@ class Messages:
             channel[:, KEY] = numbers(OF_WORLD, LATER_LOSSES)[:, 0] * 2.0**53
         return silent(_contents(scenario), heard, seen, channel, _kept(scenario))
 
-    def game(self, game: Game) -> Game:
-        return GameWithMessages.of(game)
+    def layer(self, v2x: V2X) -> Layer:
+        return MESSAGES_LAYER
 
 
 def _value(v2x: V2X, key: str) -> Any:

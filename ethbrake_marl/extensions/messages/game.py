@@ -1,21 +1,17 @@
-"""A game with messages: vehicles observe what they believe, and scripts act on it."""
+"""The layer of messages: vehicles observe what they believe, and scripts act on it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from functools import cache, cached_property
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MESSAGES, SENSORS
-from ethbrake_marl.agents.policy_agent import LearnedAgent, PolicyAgent
-from ethbrake_marl.episode.features import GROUPS, Own, side_of
-from ethbrake_marl.episode.game import Game, Script
-from ethbrake_marl.episode.observe import Observations, Plan, View
+from ethbrake_marl.episode.features import GROUPS, side_of
+from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import Layer, LayeredScript, LayeredView
+from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import Step
 from ethbrake_marl.extensions.messages.belief import ages_s, believed, believed_whole, known_pieces, require_pieces
 from ethbrake_marl.extensions.messages.links import (
     NAME,
@@ -45,28 +41,24 @@ NEEDS = {  # feature of a neighbour -> pieces without which it reads 0
 }
 
 
-class GameWithMessages(Game):
-    """A game whose states contain the ``Memory`` of messages."""
+class MessagesLayer(Layer):
+    """Lets a vehicle see what it believes, according to the ``Memory`` of messages in the state."""
 
-    __slots__ = ()
+    stage = 1
 
-    @classmethod
-    def of(cls, game: Game) -> GameWithMessages:
-        views = tuple(believed_view(view) for view in game.views)
-        return cls(*game._replace(views=views, scripts={i: Believer(script) for i, script in game.scripts.items()}))
-
-    def first_decision(self, alert: State) -> State:
-        state = super().first_decision(alert)
-        if not state.memories[NAME].is_periodic:
+    def first_decision(self, game: Game, alert: State, state: State) -> State:
+        if not alert.memories[NAME].is_periodic:
             return state
-        return _remembering(state, begin(alert, state.time_s, self.settings.time_step_s))
+        sent = partial(game.seen, body=0, before=self)
+        return _remembering(state, begin(alert, state.time_s, game.settings.time_step_s, sent))
 
-    def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        after, step = super().follow(state, actions)
-        return believed_after(state, after), step
+    def after(self, game: Game, before: State, state: State) -> State:
+        if not before.memories[NAME].is_periodic:
+            return state
+        return _remembering(state, after_step(before, state, partial(game.seen, body=0, before=self)))
 
-    def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
-        return {body: believing(agent) for body, agent in drivers.items()}
+    def seen(self, state: State, body: int) -> State:
+        return believed(state, body)
 
     def hides(self, alert: State, body: int) -> Bools:
         """Bodies (0: obstacle) that vehicle ``body`` does not fully know at its first decision, [n, N + 1]."""
@@ -74,15 +66,15 @@ class GameWithMessages(Game):
         unseen = memory.seen_s[:, body] > alert.car[:, LATENCY, body, np.newaxis]
         lacks = ~memory.contents[:, :, [P_BRAKING, P_LATENCY, P_MASS]].all(axis=2)
         old = memory.is_periodic | ~memory.contents[:, :, [P_PLACE, P_SPEED, P_ACCELERATION]].all(axis=2)
-        return np.asarray(super().hides(alert, body) | lacks | (old & unseen))
+        return np.asarray(lacks | (old & unseen))
 
-    def own_infos(self, state: State) -> dict[str, Any]:
-        """Infos of messages, and those of the shield: name -> [n, N], one value for each vehicle that acts.
+    def infos(self, state: State) -> dict[str, Any]:
+        """Infos of messages: name -> [n, N], one value for each vehicle that acts.
 
         ``known_from_s_vehicle_2``: time from which a vehicle acts on news of Vehicle 2 (s; infinite: never).
         ``age_s_vehicle_2``: age of its newest sample of Vehicle 2, with periodic messages (s; infinite: none).
         """
-        infos = super().own_infos(state)
+        infos: dict[str, Any] = {}
         reports = {"known_from_s": state.know}
         if state.memories[NAME].is_periodic:
             reports["age_s"] = ages_s(state)
@@ -90,44 +82,33 @@ class GameWithMessages(Game):
             infos |= {f"{name}_vehicle_{j}": values[:, 1:, j] for j in range(1, values.shape[2])}
         return infos
 
+    def view(self, view: View) -> View:
+        return BelievedView(self, view)
 
-def believed_after(before: State, after: State) -> State:
-    return _remembering(after, after_step(before, after)) if before.memories[NAME].is_periodic else after
+    def script(self, script: Any) -> Any:
+        return Believer(self, script)
+
+
+MESSAGES_LAYER = MessagesLayer()
 
 
 def _remembering(state: State, memory: Memory) -> State:
     return state._replace(memories={**state.memories, NAME: memory})
 
 
-def believing(agent: Any) -> Any:
-    """Agent that acts on what its vehicle estimates, if ``agent`` uses only sensors and messages.
-
-    Any other agent is returned unchanged.
-    """
-    view = agent.policy.observation if isinstance(agent, LearnedAgent) else getattr(agent, "observation", None)
-    if isinstance(agent, LearnedAgent | PolicyAgent):
-        return replace(agent, observation=believed_view(view))
-    return Believer(agent) if getattr(agent, "knows", None) in (SENSORS, MESSAGES) else agent
-
-
-@cache
-def believed_view(view: View) -> BelievedView:
-    return BelievedView(view)
-
-
-class BelievedView(View):
+class BelievedView(LayeredView):
     """A view of what the observer estimates. A feature is 0 if it needs a quantity that the observer does not know.
 
     Feature groups of other packages show a vehicle only if the observer knows all of its quantities but the intent.
     """
 
-    def __init__(self, view: View) -> None:
-        super().__init__(view.names)
+    def __init__(self, layer: Layer, view: View) -> None:
+        super().__init__(layer, view)
         columns = np.arange(len(self.names))
         far = np.array([name.partition(".")[0] in GROUPS for name in self.names])
         self.parts = [
-            (kind([self.names[c] for c in columns[rows]]), columns[rows], belief)
-            for kind, rows, belief in ((PieceView, ~far, believed), (View, far, believed_whole))
+            (view.part([self.names[c] for c in columns[rows]]), columns[rows], belief)
+            for rows, belief in ((~far, believed), (far, believed_whole))
             if rows.any()
         ]
         split = [name.partition(".") for name in self.names]
@@ -149,53 +130,23 @@ class BelievedView(View):
         return seen
 
 
-class PieceView(View):
-    """A view that replaces NaN, for a quantity not received, by the feature's value for an unknown neighbour."""
-
-    @cached_property
-    def plan(self) -> Plan:
-        plan = View(self.names).plan
-        return plan._replace(own=tuple((column, _or_unknown(own), offset) for column, own, offset in plan.own))
-
-
-def _or_unknown(own: Own) -> Own:
-    def function(state: State, body: int, other: int) -> Floats:
-        value = np.asarray(own.function(state, body, other))
-        return np.where(np.isnan(value) & _is_partly_known(state, other), own.unknown, value)
-
-    return own if own.of == "own" else own._replace(function=function)
-
-
-def _is_partly_known(state: State, other: int) -> Bools:
-    parts = (state.line[:, :, other], state.car[:, :, other], state.wanted[:, [other]])
-    return np.asarray(np.isnan(np.concatenate(parts, axis=1)).any(axis=1))
-
-
-class Believer:
-    def __init__(self, script: Script) -> None:
-        self.script = script
-
-    @property
-    def name(self) -> str:
-        return str(getattr(self.script, "name", type(self.script).__name__))
-
+class Believer(LayeredScript):
     def begin(self, alert: State, body: int) -> Any:
         """Memory of the script at the alert. Raises ``InvalidInput`` if it will not know what it needs.
 
         A script may have ``needs_ahead``: quantities of the vehicle ahead that messages must contain until it is in
         sight.
         """
-        needs = getattr(self.script, "needs_ahead", ())
-        if needs and body > 1 and np.isinf(alert.memories[NAME].seen_s[:, body, body - 1]).any():
-            require_pieces(alert, [body], f"agent {self.name!r}", needs, [body - 1])
-        return self.script.begin(believed(alert, body), body)
+        if self.needs_ahead and body > 1 and np.isinf(alert.memories[NAME].seen_s[:, body, body - 1]).any():
+            require_pieces(alert, [body], f"agent {self.name!r}", self.needs_ahead, [body - 1])
+        return super().begin(alert, body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
         """Commands of the script, [n] m/s2, and its new memory; it acts on what vehicle ``body`` knows.
 
         Raises ``InvalidInput`` for a script that needs more.
         """
-        commands, memory = self.script.act(believed(state, body), memory, body)
+        commands, memory = super().act(state, memory, body)
         if not np.isfinite(commands).all():
             require_pieces(state, [body], f"script of vehicle_{body}", PIECES[:-1])
         return commands, memory

@@ -9,6 +9,7 @@ with probability r. What is sent over a bad link is lost. A neighbour in sight i
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -120,10 +121,10 @@ def present(state: State) -> Floats:
     return sample
 
 
-def begin(alert: State, start_s: Floats, time_step_s: float) -> Memory:
+def begin(alert: State, start_s: Floats, time_step_s: float, sent: Callable[[State], State]) -> Memory:
     """Memory at the first decision, ``start_s`` [n], with what has been received since the alert.
 
-    Until then vehicles execute ``alert.wanted``.
+    Until then vehicles execute ``alert.wanted``. ``sent``: the state that vehicles send and measure, from the true one.
     """
     memory, line = _own(alert.memories[NAME]), alert.line.copy()
     force = np.where(alert.car[:, LATENCY] <= 0.0, alert.wanted, 0.0)
@@ -131,19 +132,20 @@ def begin(alert: State, start_s: Floats, time_step_s: float) -> Memory:
     line[:, FORCE] = np.where(np.isinf(rate), force, line[:, FORCE])
     memory.samples[:, 0, PLACE, 0] = line[:, GAP, 0]
     state = alert._replace(line=line)
-    _sample(memory, state, np.zeros(alert.n), np.ones(alert.n, np.bool_))
+    _sample(memory, sent(state), np.zeros(alert.n), np.ones(alert.n, np.bool_))
     steps = np.ceil(start_s / time_step_s - 1e-6)
     for left in range(int(steps.max()) - 1, -1, -1):
         rows = steps > left
         state, way = _advanced(state, np.where(rows, start_s - left * time_step_s, state.time_s))
-        _sample(memory, state, way, rows)
+        _sample(memory, sent(state), way, rows)
     return memory
 
 
-def after_step(before: State, after: State) -> Memory:
+def after_step(before: State, after: State, sent: Callable[[State], State]) -> Memory:
+    """Return the memory after a step, with what has been received in it; ``sent``: as for ``begin``."""
     memory = _own(before.memories[NAME])
     _, way = _advanced(before._replace(wanted=after.wanted), after.time_s)
-    _sample(memory, after, way, after.time_s > before.time_s)
+    _sample(memory, sent(after), way, after.time_s > before.time_s)
     return memory
 
 

@@ -12,5 +12,5 @@ PARTS = {
         "mass_known": "features:KNOWN.mass",
         "intent_known": "features:KNOWN.intent",
     },
-    "v2x_extensions": {"persistence": "declared:MESSAGES", "tells": "declared:MESSAGES"},
+    "v2x_extensions": {"persistence": "declared:MESSAGES", "tells": "declared:MESSAGES", "reports": "reports:REPORTS"},
 }

@@ -36,8 +36,9 @@ from ethbrake_marl.episode import step as one_step
 from ethbrake_marl.episode.commands import check_actions, commands_of, proposal_array
 from ethbrake_marl.episode.counts import OF_FIRST, OF_PASSED, OF_TOTAL
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.reward import RewardParams
-from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, PHYSICS, STEPS, TIME, State
+from ethbrake_marl.episode.reward import Rewarding, RewardParams
+from ethbrake_marl.episode.script_calls import ask_scripts
+from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, TIME, State
 from ethbrake_marl.episode.step import COST, HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
 from ethbrake_marl.episode.terms import pair_energies
 from ethbrake_marl.errors import InvalidInput
@@ -117,29 +118,47 @@ def collision(params: RewardParams, before: State, step: Step, after: State) -> 
     return penalty
 
 
-class MappedGame(Game):
-    __slots__ = ()
+class PaperMap:
+    """The physics ``paper-map`` (``episode.game.Physics``)."""
 
-    def first_decision(self, alert: State) -> State:
+    def check(self, scenario: Scenario) -> None:
+        """Raise an error for an obstacle, and for brakes that build up."""
+        right = "is not known to physics: paper-map; leave one of the two out"
+        for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
+            require(key not in scenario.sources, (key,), UNSHOWN, right)
+
+    def rewarding(self, game: Game) -> Rewarding:
+        """Rewards with the paper's own r_collision. Raises ``InvalidInput`` if they need exact impacts."""
+        counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
+        if game.settings.weights[OF_PASSED:].any() or counted:
+            what = f"the term {counted[0]}" if counted else "harm_count honest"
+            raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
+        terms = tuple(
+            (name, weight, partial(collision, game.rewarding.params) if name == "collision" else function)
+            for name, weight, function in game.rewarding.terms
+        )
+        return game.rewarding._replace(terms=terms)
+
+    def first_decision(self, game: Game, alert: State) -> State:
         """Episodes at the first decision.
 
         Raises ``InvalidInput`` for worlds with an impact before it, and for worlds of a scenario with exact impacts.
         """
-        if PHYSICS not in alert.memories:
+        if alert.is_exact:
             raise InvalidInput(
-                f"scenario {self.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
+                f"scenario {game.name!r}: these worlds belong to a scenario with exact impacts; draw or read them with"
                 " a scenario that has physics: paper-map"
             )
-        state = one_step.first_decision(alert, self.deciders, self.settings)
+        state = one_step.first_decision(alert, game.deciders, game.settings)
         if state.collided.any():
             raise InvalidInput(
-                f"scenario {self.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
+                f"scenario {game.name!r}: row {np.argmax(state.collided)} has an impact before the first decision,"
                 " which physics: paper-map does not know; early_impacts: reject draws such worlds again"
             )
         return state
 
-    def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        before, settings = decided(self, state, actions), self.settings
+    def follow(self, game: Game, state: State, actions: Floats | None) -> tuple[State, Step]:
+        before, settings = decided(game, state, actions), game.settings
         after, over = sample(before, settings.time_step_s), state.ended
         np.copyto(after.line, before.line, where=over[:, np.newaxis, np.newaxis])
         np.copyto(after.clock, before.clock, where=over[:, np.newaxis])
@@ -163,30 +182,10 @@ def decided(game: Game, state: State, actions: Floats | None) -> State:
     given = proposal_array(learners, actions, state.n)
     if np.isnan(given).any():
         check_actions(learners, given[np.isnan(given).any(axis=1).argmax()])
-    state = one_step.scripted(game.scripts, state)
+    state = ask_scripts(game.scripts, state)
     commands = commands_of(state, learners, given)
     state.wanted[:, learners] = np.where(state.ended[:, np.newaxis], state.wanted[:, learners], commands)
     return state
-
-
-class PaperMap:
-    def check(self, scenario: Scenario) -> None:
-        """Raise an error for an obstacle, and for brakes that build up."""
-        right = "is not known to physics: paper-map; leave one of the two out"
-        for key in ("obstacle_gap_m", "obstacle_margin_m", "brake_rate_mps3", "release_rate_mps3"):
-            require(key not in scenario.sources, (key,), UNSHOWN, right)
-
-    def game(self, game: Game) -> Game:
-        """Game with this physics. Raises ``InvalidInput`` for a reward that needs exact impacts."""
-        counted = [name for name in game.rewarding.reported if name in EXACT_ALONE]
-        if game.settings.weights[OF_PASSED:].any() or counted:
-            what = f"the term {counted[0]}" if counted else "harm_count honest"
-            raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
-        terms = tuple(
-            (name, weight, partial(collision, game.rewarding.params) if name == "collision" else function)
-            for name, weight, function in game.rewarding.terms
-        )
-        return MappedGame(*game._replace(rewarding=game.rewarding._replace(terms=terms)))
 
 
 PAPER_MAP = PaperMap()

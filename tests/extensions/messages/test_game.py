@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.features import FEATURES, register_feature
-from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.belief import believed, require_pieces
-from ethbrake_marl.extensions.messages.game import GameWithMessages
+from ethbrake_marl.extensions.messages.game import MESSAGES_LAYER
 from ethbrake_marl.extensions.messages.links import NAME
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.motion.layout import Floats
@@ -127,7 +126,7 @@ def test_usual_contents__written_out_change_no_bit_of_an_observation() -> None:
         assert [array.tobytes() for array in one[:5]] == [array.tobytes() for array in other[:5]]
 
 
-def test_without_messages__there_is_no_memory_and_no_other_game() -> None:
+def test_without_messages__there_is_no_memory_and_no_layer() -> None:
     game, state = played("nominal")
-    assert type(game) is Game and type(played(PERIODIC)[0]) is GameWithMessages
+    assert game.layers == () and played(PERIODIC)[0].layers == (MESSAGES_LAYER,)
     assert NAME not in stepped(game, state, 0.0).memories and game.own_infos(state) == {}

@@ -1,37 +1,61 @@
-"""Extensions of ``v2x`` and physics in one scenario: each would replace the game of the other, so one line refuses."""
+"""Several extensions of ``v2x`` in one scenario all act; what cannot act together is refused in one line."""
 
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.episode.game import Game
+from ethbrake_marl.episode.layer import Layer
+from ethbrake_marl.motion.layout import SPEED
+from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.channel import register_preset, register_v2x_extension
 from ethbrake_marl.worlds.physics import register_physics
 from tests.contract.interfaces import PAPER
-from tests.fixtures.layer import Layer
+from tests.fixtures.layer import SamePhysics, UsersExtension
 from tests.refused import refused
 
 
-class Mine(Game):
-    __slots__ = ()
+class Mine(Layer):
+    """Reports the time."""
 
-    def own_infos(self, state: eb.State) -> dict[str, Any]:
-        return {**super().own_infos(state), "mine": state.time_s}
+    def infos(self, state: eb.State) -> dict[str, Any]:
+        return {"mine": state.time_s}
+
+
+class Faster(Layer):
+    """Vehicles seem ``more`` m/s faster, then ``times`` as fast; remembers how often it was asked after a step."""
+
+    def __init__(self, name: str, more: float, times: float, stage: int = 0) -> None:
+        self.name, self.more, self.times, self.stage = name, more, times, stage
+
+    def after(self, game: Any, before: eb.State, state: eb.State) -> eb.State:
+        return state._replace(memories={**state.memories, self.name: before.memories[self.name] + 1.0})
+
+    def seen(self, state: eb.State, body: int) -> eb.State:
+        line = state.line.copy()
+        line[:, SPEED, 1:] = (line[:, SPEED, 1:] + self.more) * self.times
+        return state._replace(line=line)
+
+    def infos(self, state: eb.State) -> dict[str, Any]:
+        return {self.name: state.memories[self.name]}
 
 
 @pytest.fixture(autouse=True)
 def _registered() -> None:
-    mine = Layer("mine", Mine)
-    for key, layer in {
+    mine = UsersExtension("mine", Mine())
+    extensions = {
         "mine": mine,
         "also_mine": mine,
-        "other": Layer("other", Mine),
-        "news": Layer("messages", Mine),
-    }.items():
-        register_v2x_extension(key, layer)  # type: ignore[arg-type]
-    register_physics("sliding", Layer("sliding", Mine))
+        "more": UsersExtension("more", Faster("more", 2.0, 1.0)),
+        "twice": UsersExtension("twice", Faster("twice", 0.0, 2.0)),
+        "early_twice": UsersExtension("early", Faster("early", 0.0, 2.0, stage=-1)),
+        "news": UsersExtension("messages", Mine()),
+    }
+    for key, extension in extensions.items():
+        register_v2x_extension(key, extension)
+    register_physics("sliding", SamePhysics())
 
 
 def changed(v2x: dict[str, Any], **beside: Any) -> eb.Scenario:
@@ -40,31 +64,31 @@ def changed(v2x: dict[str, Any], **beside: Any) -> eb.Scenario:
 
 def of_preset() -> eb.Scenario:
     register_preset("frank", {"preset": "nominal", "tells": ["speed"]})
-    return PAPER.replace(v2x={"preset": "frank", "mine": 1})
+    return PAPER.replace(v2x={"preset": "frank", "news": 1})
 
 
-ACTS = "belong to different extensions, whose games would replace each other; leave one out"
+ACTS = "belong to different extensions, whose memories have the same name; leave one out"
 REFUSED: dict[str, Callable[[], Any]] = {
-    f"v2x: tells and mine {ACTS}": lambda: changed({"tells": ["speed"], "mine": 1}),
-    f"v2x: tells and mine {ACTS} ": of_preset,
-    f"mixture[0].scenario: scenario 'paper-random': v2x: tells and mine {ACTS}": lambda: eb.load_scenario(
-        {"name": "two", "mixture": [{"scenario": "paper-random"}], "v2x": {"preset": "nominal", "tells": [], "mine": 1}}
+    f"v2x: tells and news {ACTS}": lambda: changed({"tells": ["speed"], "news": 1}),
+    f"v2x: tells and news {ACTS} ": of_preset,
+    f"mixture[0].scenario: scenario 'paper-random': v2x: tells and news {ACTS}": lambda: eb.load_scenario(
+        {"name": "two", "mixture": [{"scenario": "paper-random"}], "v2x": {"preset": "nominal", "tells": [], "news": 1}}
     ),
     "v2x: is not known to physics: sliding; leave one of the two out": lambda: changed(
         {"persistence": "periodic"}, physics="sliding"
     ),
     "v2x: is not known to physics: sliding; leave one": lambda: changed({"mine": 1}, physics="sliding"),
     "key 'kept' of v2x: the name of its memory, 'shield', is in use; choose": lambda: register_v2x_extension(
-        "kept", Layer("shield", Mine)  # type: ignore[arg-type]
+        "kept", UsersExtension("shield", Mine())
     ),
     "key 'kept' of v2x: the name of its memory, 'physics', is in use": lambda: register_v2x_extension(
-        "kept", Layer("physics", Mine)  # type: ignore[arg-type]
+        "kept", UsersExtension("physics", Mine())
     ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("message", REFUSED)
-def test_layer__that_would_replace_another_is_refused(message: str) -> None:
+def test_extension__that_cannot_act_beside_another_is_refused(message: str) -> None:
     with refused(message.rstrip()) as error:
         REFUSED[message]()
     assert "\n" not in str(error.value)
@@ -76,11 +100,42 @@ def test_layer__that_would_replace_another_is_refused(message: str) -> None:
         ({"tells": ["place", "speed"], "persistence": "periodic"}, ["age_s_vehicle_1", "known_from_s_vehicle_1"]),
         ({"persistence": "first"}, ["known_from_s_vehicle_1"]),
         ({"mine": 1, "also_mine": 2}, ["mine"]),
+        ({"mine": 1, "persistence": "periodic"}, ["mine", "age_s_vehicle_1"]),
     ],
     ids=str,
 )
-def test_keys__of_one_extension_act_together(v2x: dict[str, Any], infos: list[str]) -> None:
+def test_keys__of_all_extensions_act_together(v2x: dict[str, Any], infos: list[str]) -> None:
     env = eb.parallel_env(changed(v2x))
     assert env.reset(seed=7)[1]["vehicle_2"].keys() >= {*infos}
     assert env.step({"vehicle_2": [-0.5]})[4]["vehicle_2"].keys() >= {*infos}
     eb.parallel_env(PAPER.replace(v2x="nominal", physics="sliding"))
+
+
+@pytest.mark.parametrize(
+    ("v2x", "seen_mps"),
+    [
+        ({"more": 1, "twice": 1}, 44.0),  # (20 + 2) * 2: in the order of their names
+        ({"twice": 1, "more": 1}, 44.0),  # whatever the order of the keys
+        ({"more": 1, "early_twice": 1}, 42.0),  # 20 * 2 + 2: the lower stage first
+        ({"more": 1, "twice": 1, "persistence": "first"}, 44.0),  # messages report what was measured
+        ({"more": 1, "twice": 1, "persistence": "periodic"}, 44.0),
+    ],
+    ids=str,
+)
+def test_layers__compose_in_the_order_of_their_stages_each_with_its_memory(
+    v2x: dict[str, Any], seen_mps: float
+) -> None:
+    scenario = PAPER.replace(
+        v2x={"preset": "nominal", "link_latency_s": 0.0, **v2x}, speeds_mps=[20.0, 20.0, 20.0], gaps_m=200.0,
+        roles={"vehicle_1": "coast", "vehicle_2": "learner", "vehicle_3": "coast"}, early_impacts="keep",
+    )  # fmt: skip
+    _, game = open_game(scenario, observation=["own.speed", "front_1.closing_speed"])
+    state = game.reset(scenario.sample(2, 7))
+    for _ in range(3):
+        state, _ = game.step(state, np.zeros((2, 1)))
+    assert game.seen(state, 2).speeds_mps[:, 0] == pytest.approx(seen_mps)
+    assert state.speeds_mps[:, 0] == pytest.approx(20.0)
+    for layer in game.layers:
+        if isinstance(layer, Faster):
+            assert state.memories[layer.name].tolist() == [3.0, 3.0]
+            assert game.own_infos(state)[layer.name].tolist() == [3.0, 3.0]

@@ -1,0 +1,134 @@
+"""Layers between the true state and what vehicles see of it, such as messages or noisy reports."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ethbrake_marl.episode.observe import Observations, View
+from ethbrake_marl.episode.script_calls import UserScript, name_of
+from ethbrake_marl.episode.state import State
+from ethbrake_marl.motion.layout import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from ethbrake_marl.episode.game import Game
+
+# what agents need to know that act on what their vehicle sees (all texts: `agents.drive.KNOWLEDGE`)
+SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
+MESSAGES = "messages"  # also the messages that the vehicle has received
+
+
+class Layer:
+    """Something between the true state and what a vehicle sees of it. Override the methods that differ.
+
+    Each layer of a game sees what the layers before it let through. A layer has no state of its own: what it remembers
+    is in ``State.memories``. Physics, rewards and shields use the true state.
+
+    >>> import ethbrake_marl as eb
+    >>> from ethbrake_marl.episode.layer import Layer
+    >>> from ethbrake_marl.motion.layout import GAP
+    >>> class Fog(Layer):
+    ...     def seen(self, state, body):
+    ...         line = state.line.copy()
+    ...         line[:, GAP, 1:-1] *= 1.1
+    ...         return state._replace(line=line)
+    >>> scenario, game = eb.open_game("paper-random", observation=["front_1.gap"])
+    >>> state, foggy = game.reset(scenario.sample(1, seed=7)), game.with_layers([Fog()])
+    >>> round(float(foggy.seen(state, 2).gaps_m[0, 0] / state.gaps_m[0, 0]), 3)
+    1.1
+    >>> bool(foggy.observe_alike(state, [2]) > game.observe_alike(state, [2]))
+    True
+
+    """
+
+    stage = 0  # layers of a lower stage come first: 0 changes what is sent or measured, 1 what of it arrives
+
+    def first_decision(self, game: Game, alert: State, state: State) -> State:
+        """The first decision ``state``, with this layer's memory of what has happened since the ``alert``."""
+        return state
+
+    def after(self, game: Game, before: State, state: State) -> State:
+        """The state after one step from ``before``, with this layer's new memory."""
+        return state
+
+    def seen(self, state: State, body: int) -> State:
+        """The state as vehicle ``body`` sees it (0: as somebody sees it who is in no vehicle).
+
+        ``state`` is what the layers before this one let through; it must not be changed in place.
+        """
+        return state
+
+    def hides(self, alert: State, body: int) -> Bools:
+        """Whether this layer hides something about each body from vehicle ``body``, [n, N + 1]."""
+        return np.zeros((alert.n, alert.vehicles + 1), np.bool_)
+
+    def infos(self, state: State) -> dict[str, Any]:
+        """Values for the infos: name -> [n] or [n, N]."""
+        return {}
+
+    def view(self, view: View) -> View:
+        """The observations of ``view`` through this layer."""
+        return LayeredView(self, view)
+
+    def script(self, script: Any) -> Any:
+        """A script like ``script`` that acts on what its vehicle sees through this layer."""
+        return LayeredScript(self, script)
+
+
+class LayeredView(View):
+    """A view of the state that a layer lets through."""
+
+    def __init__(self, layer: Layer, view: View) -> None:
+        super().__init__(view.names)
+        self.layer, self.inner = layer, view
+
+    def part(self, names: Sequence[str]) -> View:
+        return type(self)(self.layer, self.inner.part(names))
+
+    def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
+        columns = [
+            self.inner.observe(self.layer.seen(state, body), np.array([body]), time_step_s)
+            for body in observers.tolist()
+        ]
+        return np.concatenate(columns, axis=1)
+
+
+class LayeredScript:
+    """A script that acts on the state that a layer lets through."""
+
+    def __init__(self, layer: Layer, script: Any) -> None:
+        self.layer, self.inner, self.name = layer, script, name_of(script)
+        self.needs_ahead = getattr(script, "needs_ahead", ())
+
+    def begin(self, alert: State, body: int) -> Any:
+        return self.inner.begin(self.layer.seen(alert, body), body)
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
+        answer: tuple[Floats, Any] = self.inner.act(self.layer.seen(state, body), memory, body)
+        return answer
+
+
+@cache
+def view_through(layers: tuple[Layer, ...], view: View) -> View:
+    """The observations of ``view`` through all layers; the first layer is the nearest to the true state."""
+    for layer in reversed(layers):
+        view = layer.view(view)
+    return view
+
+
+def script_through(layers: tuple[Layer, ...], script: Any) -> Any:
+    for layer in reversed(layers):
+        script = layer.script(script)
+    return script
+
+
+def agent_through(layers: tuple[Layer, ...], agent: Any) -> Any:
+    """The agent through all layers, if it uses only sensors and messages; any other agent sees the true state."""
+    if isinstance(agent, UserScript):
+        return UserScript(agent_through(layers, agent.script))
+    if hasattr(agent, "through"):  # it observes by a view
+        return agent.through(layers)
+    return script_through(layers, agent) if getattr(agent, "knows", None) in (SENSORS, MESSAGES) else agent

@@ -1,0 +1,113 @@
+"""Calls of scripts: their memories and commands, and a guard around the scripts of users."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ethbrake_marl.episode.state import NUMBER, State, mapped
+from ethbrake_marl.errors import AgentFailed, EthBrakeError, describe_error
+from ethbrake_marl.motion.forces import capacities
+from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
+
+
+class UserScript:
+    """A script from outside this package: it gets read-only states, and its memories are checked and made read-only.
+
+    Simulations share states and memories, so a script must change neither.
+    """
+
+    def __init__(self, script: Any) -> None:
+        self.script, self.name = script, name_of(script)
+        self.knows, self.needs_ahead = getattr(script, "knows", None), getattr(script, "needs_ahead", ())
+
+    def begin(self, alert: State, body: int) -> Any:
+        return self._read_only(self.script.begin(alert.read_only(), body), alert.n, body)
+
+    def act(self, state: State, memory: Any, body: int) -> tuple[Any, Any]:
+        answer = self.script.act(state.read_only(), memory, body)
+        if not isinstance(answer, tuple) or len(answer) != 2:
+            right = "must return commands and memory"
+            raise AgentFailed(self.name, None, f"vehicle_{body}: act returned {answer!r:.60}; {right}")
+        return answer[0], self._read_only(answer[1], state.n, body)
+
+    def _read_only(self, memory: Any, n: int, body: int) -> Any:
+        def view_of(array: Any) -> Any:
+            if not isinstance(array, np.ndarray) or array.shape[:1] != (n,):
+                raise AgentFailed(
+                    self.name,
+                    None,
+                    f"vehicle_{body}: its memory is {array!r:.60}; must be None, an array with one row for each of the"
+                    f" {n} worlds, or a tuple or mapping of these",
+                )
+            view = array.view()
+            view.setflags(write=False)
+            return view
+
+        return mapped(view_of, memory)
+
+
+def guard_scripts(scripts: Mapping[int, Any]) -> dict[int, Any]:
+    """The scripts, body -> script, those of users each in a ``UserScript``. Scripts of this package are trusted."""
+    return {
+        body: script if type(script).__module__.startswith("ethbrake_marl.") else UserScript(script)
+        for body, script in scripts.items()
+    }
+
+
+def name_of(script: Any) -> str:
+    return str(getattr(script, "name", type(script).__name__))
+
+
+def begin_script(script: Any, alert: State, body: int) -> Any:
+    """Memory of a script for new episodes. Raises ``AgentFailed`` if the script fails."""
+    return _call(script, "begin", alert, body)
+
+
+def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
+    """Commands of a script, [n] m/s2, and its new memory.
+
+    Raises ``AgentFailed`` if the script fails, or if its commands are not numbers or exceed a capacity.
+    """
+    answer, memory = _call(script, "act", state, memory, body)
+    commands = np.asarray(answer)
+    if commands.shape != (state.n,) or commands.dtype.kind not in "fiu":
+        right = f"must be numbers of the shape ({state.n},)"
+        raise AgentFailed(name_of(script), None, f"vehicle_{body}: its commands are {answer!r:.60}; {right}")
+    low = -capacities(state.car, BRAKING, state.time_s)[:, body]
+    high = capacities(state.car, DRIVING, state.time_s)[:, body]
+    good = (commands >= low) & (commands <= high)
+    if not good.all():
+        k = int(np.argmin(good))
+        number = int(state.clock[k, NUMBER])
+        raise AgentFailed(
+            name_of(script),
+            k if number < 0 else number,
+            f"vehicle_{body} at {state.time_s[k]:.2f} s: command {commands[k]:g} m/s2; must be in"
+            f" [{low[k]:g}, {high[k]:g}] m/s2",
+        )
+    return commands, memory
+
+
+def ask_scripts(scripts: Mapping[int, Any], state: State) -> State:
+    """State with new commands and memories of the ``scripts``; its commands are a new array."""
+    wanted, memories, commands = state.wanted.copy(), dict(state.memories), {}
+    for i, script in scripts.items():
+        commands[i], memories[i] = ask_script(script, state, memories[i], i)
+    running = ~state.ended  # nothing changes in an episode that has ended
+    for i, command_mps2 in commands.items():
+        np.copyto(wanted[:, i], command_mps2, where=running)
+    return state._replace(wanted=wanted, memories=memories)
+
+
+def _call(script: Any, method: str, state: State, *arguments: Any) -> Any:
+    """Result of a script's method. Its errors become ``AgentFailed``."""
+    try:
+        return getattr(script, method)(state, *arguments)
+    except EthBrakeError:
+        raise
+    except Exception as error:
+        problem = f"vehicle_{arguments[-1]}: {method} fails: {describe_error(error)}"
+        raise AgentFailed(name_of(script), None, problem) from error
