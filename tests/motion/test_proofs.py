@@ -375,8 +375,7 @@ BUGS = {
         impact, "pool", "scratch[BLOCK_LOW, count] / whole", "scratch[BLOCK_LOW, count] / 2.0", energy
     ),
     "a plastic impact is not put in order": Bug(
-        impact, "resolve_cluster", "car[RESTITUTION, 0] if largest >= PLASTIC_MPS else 0.0", "car[RESTITUTION, 0]",
-        plastic,
+        impact, "restitution", "car[RESTITUTION, 0] if closing >= PLASTIC_MPS else 0.0", "car[RESTITUTION, 0]", plastic
     ),
     "the force furthest from zero": Bug(forces, "settle", "return low, low_jerk", "return high, low_jerk", settling),
 }  # fmt: skip
