@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.rendering.picture import COLOURS, vehicle_colour
+from ethbrake_marl.extensions.rendering.picture import PALETTE, vehicle_colour
 from ethbrake_marl.extensions.report.style import DASHES, GREY, finish, in_our_style, new_figure, write_picture
 
 FOLDER = Path(__file__).parent / "figures"
@@ -94,7 +94,7 @@ def draw_regimes() -> Figure:
         time = np.linspace(0.0, 4.0, 401)
         left = gap - (closing + pull * time / 2.0) * time
         met = int(np.argmax(left <= 0.0)) if (left <= 0.0).any() else len(time) - 1
-        axes.plot(time[: met + 1], np.maximum(left[: met + 1], 0.0), color=COLOURS[2], linewidth=2.0)
+        axes.plot(time[: met + 1], np.maximum(left[: met + 1], 0.0), color=PALETTE[2], linewidth=2.0)
         if (left <= 0.0).any():
             axes.plot(time[met], 0.0, "X", color="black", markersize=9, clip_on=False, zorder=5)
         axes.set_title(title, fontsize=9.5)

@@ -176,15 +176,15 @@ class AgentFailed(InvalidInput):
 
     @staticmethod
     @contextmanager
-    def naming(name: str, others: Collection[str] = ()) -> Iterator[None]:
+    def naming(name: str, other_agents: Collection[str] = ()) -> Iterator[None]:
         """Replace the agent's name by ``name`` in an ``AgentFailed`` that the block raises.
 
-        ``others`` are the names of other vehicles' agents, whose errors stay unchanged.
+        ``other_agents`` are the names of other vehicles' agents, whose errors stay unchanged.
         """
         try:
             yield
         except AgentFailed as error:
-            if error.agent in others:
+            if error.agent in other_agents:
                 raise
             raise AgentFailed(name, error.row, error.reason) from error
 
@@ -208,16 +208,16 @@ def unknown_name(kind: str, name: object, known: Iterable[str], *, may_be_own: b
     """
     names = sorted({*known})
     close = get_close_matches(name, names, n=1) if isinstance(name, str) else []
-    own = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
-    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{own}"
+    advice = f"; your own {kind} must be registered or installed first (docs/extend.md)" if may_be_own else ""
+    hint = f"did you mean {close[0]!r}?" if close else f"known: {', '.join(names) or 'none'}{advice}"
     hint = new_name(name) or hint
     return UnknownName(f"unknown {kind} {name!r}; {hint}")
 
 
 def check_whole_number(what: str, value: object, least: int, most: int | None = None) -> None:
     """Raise ``InvalidInput`` unless ``value`` is a whole number in [``least``, ``most``]; ``what`` is its name."""
-    whole = isinstance(value, Integral) and not isinstance(value, bool)
-    if not (whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
+    is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not (is_whole and least <= value and (most is None or value <= most)):  # type: ignore[operator]  # whole
         right = f", at least {least}" if most is None else f" in {least}..{most}"
         raise InvalidInput(f"{what} = {value!r}: must be a whole number{right}")
 

@@ -34,7 +34,7 @@ def cache_folder() -> Path | None:
     return Path(home) / "ethbrake_marl"
 
 
-def load(name: str, read: Callable[[bytes], Any]) -> Any:
+def load_data(name: str, read: Callable[[bytes], Any]) -> Any:
     """``read(data)`` of the data that are stored under a name; None if there are none.
 
     If they are damaged, or ``read`` raises an error, warns, deletes them and returns None.
@@ -51,7 +51,7 @@ def load(name: str, read: Callable[[bytes], Any]) -> Any:
     return content
 
 
-def save(name: str, data: bytes) -> None:
+def save_data(name: str, data: bytes) -> None:
     """Store data under a name, which must contain all that decides the data. Warns if this is impossible."""
     try:
         path = _trusted_folder() / f"{name}{SUFFIX}"
@@ -84,7 +84,7 @@ def on_first_compilation(tell: Callable[[bool], None]) -> None:
     _tellers.append(tell)
 
 
-def tell_compilation() -> None:
+def announce_compilation() -> None:
     while _tellers:
         _tellers.pop()(not _stored_files())
 

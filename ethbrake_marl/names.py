@@ -32,7 +32,7 @@ from ethbrake_marl.worlds.game import AnyScenario, game_of
 from ethbrake_marl.worlds.roles import HELD, LEARNER, check_role
 from ethbrake_marl.worlds.scenario import Scenario
 
-NAME = re.compile(r"[a-z][a-z0-9_-]*(\.[a-z0-9_-]+)*")
+NAME_PATTERN = re.compile(r"[a-z][a-z0-9_-]*(\.[a-z0-9_-]+)*")
 IN_FILE = re.compile(r"(?P<file>.+?\.py):(?P<name>[A-Za-z_]\w*)(:(?P<argument>[^@]+))?(@(?P<policy>.+))?")
 PLAIN = re.compile(r"(?P<name>[^:@+]*)(:(?P<argument>[^@]*))?(@(?P<policy>.*))?")
 
@@ -68,7 +68,7 @@ class AgentSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class AgentEntry:
     make: Callable[..., Any]  # (argument, settings) -> agent or team; of a wrapper: (team, argument, settings) -> team
     about: str
     knows: str
@@ -115,17 +115,19 @@ def register_shield(
     _add(WRAPPERS, name, make, about, knows, form)
 
 
-def _add(table: Registry[Entry], name: str, make: Any, about: str, knows: str, form: str | None) -> None:
-    if not isinstance(name, str) or NAME.fullmatch(name) is None:
+def _add(table: Registry[AgentEntry], name: str, make: Any, about: str, knows: str, form: str | None) -> None:
+    if not isinstance(name, str) or NAME_PATTERN.fullmatch(name) is None:
         raise InvalidInput(
             f"{table.kind} {name!r:.80}: the name must have the characters a-z, 0-9, _ and -, beginning with a letter"
         )
     check_knows(knows, f"{table.kind} {name!r}")
-    table.add(name, Entry(make, about, knows, form or f"{name}[:ARGUMENT]"), lambda other: other.make == make)
+    table.add(
+        name, AgentEntry(make, about, knows, form or f"{name}[:ARGUMENT]"), lambda registered: registered.make == make
+    )
 
 
-AGENTS: Registry[Entry] = Registry("agent", "agents", register_agent)
-WRAPPERS: Registry[Entry] = Registry("shield or search", "shields", register_shield)
+AGENTS: Registry[AgentEntry] = Registry("agent", "agents", register_agent)
+WRAPPERS: Registry[AgentEntry] = Registry("shield or search", "shields", register_shield)
 
 
 def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: str = "first") -> Driver:
@@ -150,15 +152,15 @@ def make_agent(spec: str, *, scenario: AnyScenario | None = None, harm_count: st
     driver = _make(core, settings)
     for wrapper in wrappers:
         settings = replace(settings, spec=f"{settings.spec}+{wrapper}")
-        driver = wrapped(team_of(driver, settings.needed_scenario()), wrapper, settings)
+        driver = wrap_team(team_of(driver, settings.needed_scenario()), wrapper, settings)
     return driver
 
 
-def wrapped(team: Team, wrapper: str, settings: AgentSettings) -> Team:
+def wrap_team(team: Team, wrapper: str, settings: AgentSettings) -> Team:
     """Team inside the shield or search ``wrapper``, such as ``episode:pairwise``."""
     entry, argument = _look_up(WRAPPERS, *wrapper.partition(":")[::2])
-    around: Team = _called(settings.spec, entry.make, team, argument, settings)
-    return around._replace(name=settings.spec)
+    result: Team = _call_maker(settings.spec, entry.make, team, argument, settings)
+    return result._replace(name=settings.spec)
 
 
 def team_of(driver: Driver, scenario: Scenario) -> Team:
@@ -174,8 +176,8 @@ def make_teams(specs: str | Iterable[str], scenario: Scenario, *, harm_count: st
     Raises the errors of ``make_agent``, and ``InvalidInput`` for a repeated spec.
     """
     teams: dict[str, Team] = {}
-    for each in split_specs(specs) if isinstance(specs, str) else specs:
-        for spec in group(each) or [each]:
+    for name in split_specs(specs) if isinstance(specs, str) else specs:
+        for spec in group(name) or [name]:
             if spec in teams:
                 raise InvalidInput(f"agent {spec!r} is listed twice; list each agent once")
             teams[spec] = team_of(make_agent(spec, scenario=scenario, harm_count=harm_count), scenario)
@@ -196,32 +198,32 @@ def teams_of(agents: Any, scenario: Scenario, *, harm_count: str = "first") -> d
             f"agents = {agents!r:.80}: must be names, such as 'ppo,full_brake', or a mapping, such as {{'mine': agent}}"
         )
     teams = {}
-    for name, given in agents.items():
+    for name, description in agents.items():
         if not isinstance(name, str) or not name or not name.isprintable():
             raise InvalidInput(
                 f"agents: the name {name!r:.60} must be a text without line breaks and control characters"
             )
-        if isinstance(given, Mapping):
-            drivers = {vehicle: _driver(each, scenario, harm_count) for vehicle, each in given.items()}
+        if isinstance(description, Mapping):
+            drivers = {vehicle: _driver(entry, scenario, harm_count) for vehicle, entry in description.items()}
             teams[name] = Team.of(drivers, name)
         else:
-            driver = _driver(given, scenario, harm_count)
+            driver = _driver(description, scenario, harm_count)
             if not isinstance(driver, Team):
                 check_agent(driver, f"agent {name!r} = {driver!r:.60}")
             teams[name] = team_of(driver, scenario)._replace(name=name)
     return teams
 
 
-def _driver(given: Any, scenario: Scenario, harm_count: str) -> Any:
-    return make_agent(given, scenario=scenario, harm_count=harm_count) if isinstance(given, str) else given
+def _driver(agent: Any, scenario: Scenario, harm_count: str) -> Any:
+    return make_agent(agent, scenario=scenario, harm_count=harm_count) if isinstance(agent, str) else agent
 
 
 def group(name: str) -> list[str]:
     """Specs of a group: those of the entry ``NAME``, then of all ``NAME.MORE``; [] for any other name."""
     if name not in AGENTS or callable(AGENTS[name].make):
         return []
-    listed: list[Any] = [AGENTS[each].make for each in AGENTS if each == name or each.startswith(f"{name}.")]
-    return [spec for specs in listed for spec in specs]
+    spec_lists: list[Any] = [AGENTS[entry].make for entry in AGENTS if entry == name or entry.startswith(f"{name}.")]
+    return [spec for specs in spec_lists for spec in specs]
 
 
 def split_specs(text: str) -> list[str]:
@@ -260,13 +262,15 @@ def _make(core: str, settings: AgentSettings) -> Driver:
         make = entry.make
         if not callable(make):
             raise InvalidInput(f"agent {core!r}: is the name of a group of agents; write the name of one agent")
-    driver: Driver = _called(core, make, argument or None, settings)
+    driver: Driver = _call_maker(core, make, argument or None, settings)
     if not isinstance(driver, Team):
         check_agent(driver, f"agent {core!r} = {driver!r:.60}")
     return driver
 
 
-def _look_up(table: Registry[Entry], name: str, argument: str, policy: str | None = None) -> tuple[Entry, str | None]:
+def _look_up(
+    table: Registry[AgentEntry], name: str, argument: str, policy: str | None = None
+) -> tuple[AgentEntry, str | None]:
     rest, _, last = argument.rpartition(":")
     if argument and f"{name}.{last}" in table:
         return table[f"{name}.{last}"], rest or None
@@ -299,10 +303,10 @@ def _in_file(match: re.Match[str], settings: AgentSettings) -> Callable[..., Any
     return function  # type: ignore[no-any-return]  # checked by its call
 
 
-def _called(spec: str, make: Callable[..., Any], *given: Any) -> Any:
+def _call_maker(spec: str, make: Callable[..., Any], *arguments: Any) -> Any:
     """Call the user's function that makes an agent; any error becomes an ``InvalidInput``."""
     try:
-        return make(*given)
+        return make(*arguments)
     except EthBrakeError:
         raise
     except Exception as error:
@@ -327,7 +331,7 @@ def open_game(
     return game_of(loaded, scripts_of(loaded), reward, observation, reward_vector, report)
 
 
-def check_learners(scenario: Scenario) -> None:
+def require_learner(scenario: Scenario) -> None:
     if not scenario.learners:
         raise InvalidInput(
             f"scenario {scenario.name!r} has no learner that the agents could drive; choose the scenario that the"
@@ -357,7 +361,7 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
     return scripts
 
 
-def listed_agents() -> list[Entry]:
+def listed_agents() -> list[AgentEntry]:
     """Entries of all agents and wrappers that can be loaded, without groups. A wrapper's form has its +."""
     agents = [entry for entry in AGENTS.usable().values() if callable(entry.make)]
     return agents + [replace(entry, form=f"+{entry.form}") for entry in WRAPPERS.usable().values()]

@@ -45,14 +45,14 @@ class Progress:
         return ", ".join(parts[:1])
 
     @staticmethod
-    def listener(told: Told) -> OnProgress | None:
+    def listener(on_progress: Told) -> OnProgress | None:
         """Function to call with each ``Progress``, or None.
 
-        ``told`` is a function; or ``"show"``: print progress on stderr (if there is one); or None.
+        ``on_progress`` is a function; or ``"show"``: print progress on stderr (if there is one); or None.
         """
-        if told == "show":
+        if on_progress == "show":
             return None if sys.stderr is None else ShownProgress()
-        return told
+        return on_progress
 
 
 OnProgress = Callable[[Progress], None]

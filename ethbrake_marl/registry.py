@@ -31,7 +31,7 @@ from ethbrake_marl.errors import (
     unknown_name,
 )
 
-OURS = "ethbrake-marl"  # name of this distribution
+DISTRIBUTION = "ethbrake-marl"  # name of this distribution
 _LOCK = RLock()  # one thread at a time loads parts; their modules may look up others
 _VERSIONS: dict[str, str] = {}  # distribution -> version of the other packages whose parts this process has loaded
 
@@ -50,16 +50,16 @@ class Part:
     >>> part = eb.Part(closing, unit="m/s")
     """
 
-    def __init__(self, *given: Any, **settings: Any) -> None:
-        self.given, self.settings = given, settings
+    def __init__(self, *arguments: Any, **settings: Any) -> None:
+        self.given, self.settings = arguments, settings
 
 
 @cache
 def points(group: str) -> dict[str, list[EntryPoint]]:
     """Name -> entry points of a group such as ``agents``, this package's first; several may have one name."""
     by_name: dict[str, list[EntryPoint]] = {}
-    others = [point for point in entry_points(group=f"ethbrake_marl.{group}") if giver(point) != OURS]
-    for point in (*sorted(own_points(group), key=by_its_name), *sorted(others, key=by_its_name)):
+    foreign_points = [point for point in entry_points(group=f"ethbrake_marl.{group}") if giver(point) != DISTRIBUTION]
+    for point in (*sorted(own_points(group), key=by_its_name), *sorted(foreign_points, key=by_its_name)):
         by_name.setdefault(point.name, []).append(point)
     return by_name
 
@@ -68,12 +68,12 @@ def own_points(group: str) -> list[EntryPoint]:
     """Parts of a group in the tables ``parts.py`` of this package."""
     package = __name__.rpartition(".")[0]
     folder = files(package) / "extensions"
-    extensions = [each.name for each in folder.iterdir() if (each / "parts.py").is_file()] if folder.is_dir() else []
-    found = []
+    extensions = [path.name for path in folder.iterdir() if (path / "parts.py").is_file()] if folder.is_dir() else []
+    part_points = []
     for place in (package, *(f"{package}.extensions.{name}" for name in extensions)):
         table = import_module(f"{place}.parts").PARTS.get(group, {})
-        found += [EntryPoint(name, f"{place}.{value}", group) for name, value in table.items()]
-    return found
+        part_points += [EntryPoint(name, f"{place}.{value}", group) for name, value in table.items()]
+    return part_points
 
 
 def by_its_name(point: EntryPoint) -> str:
@@ -82,7 +82,7 @@ def by_its_name(point: EntryPoint) -> str:
 
 def giver(point: EntryPoint) -> str:
     """Name of the package that defines an entry point."""
-    return OURS if point.dist is None else point.dist.name
+    return DISTRIBUTION if point.dist is None else point.dist.name
 
 
 def versions_used() -> dict[str, str]:
@@ -138,7 +138,7 @@ class Registry(Mapping[str, T]):
         """
         candidates = points(self.group).get(name, [])
         if (name in self._built_in) + len(candidates) > 1:
-            givers = [OURS] * (name in self._built_in) + [giver(point) for point in candidates]
+            givers = [DISTRIBUTION] * (name in self._built_in) + [giver(point) for point in candidates]
             raise InvalidInput(
                 f"{self.kind} {name!r} is defined by several installed packages, {' and '.join(givers)};"
                 " uninstall all but one of them"
@@ -166,12 +166,12 @@ class Registry(Mapping[str, T]):
         try:
             # An entry point that defines several parts is a dictionary of them.
             parts = value if isinstance(value, dict) else {name: value}
-            for each, part in parts.items():
+            for part_name, part in parts.items():
                 arguments, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
-                self._register(each, *arguments, **settings)
+                self._register(part_name, *arguments, **settings)
         except (EthBrakeError, TypeError) as error:
             raise InvalidInput(f"{where}: {error}") from error
-        if point.dist is not None and giver(point) != OURS:
+        if point.dist is not None and giver(point) != DISTRIBUTION:
             _VERSIONS[giver(point)] = point.dist.version
         return list(parts)
 
@@ -184,7 +184,9 @@ class Registry(Mapping[str, T]):
         if name not in self.loaded and name in self and name not in self._loading:
             names_others = name not in self.load(name)
         if names_others or not is_same(self.loaded.setdefault(name, part)):
-            package = next((giver(point) for point in points(self.group).get(name, ()) if giver(point) != OURS), None)
+            package = next(
+                (giver(point) for point in points(self.group).get(name, ()) if giver(point) != DISTRIBUTION), None
+            )
             raise AlreadyExists(
                 f"{self.kind} {name!r} is registered already; give another name"
                 + f", or leave the registration to the entry point of the package {package}" * (package is not None)

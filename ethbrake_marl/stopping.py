@@ -19,14 +19,14 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
     A second Ctrl-C has its usual effect. Outside the main thread, where Python receives no signals, the function always
     returns False.
     """
-    asked = threading.Event()
+    arrival = threading.Event()
     if not _in_main_thread():
-        yield asked.is_set
+        yield arrival.is_set
         return
     before = {number: signal.getsignal(number) for number in _SIGNALS}
 
     def listen(number: int, frame: FrameType | None) -> None:
-        asked.set()
+        arrival.set()
         restore()
 
     def restore() -> None:
@@ -36,7 +36,7 @@ def stop_on_signal() -> Iterator[Callable[[], bool]]:
     try:
         for number in _SIGNALS:
             signal.signal(number, listen)
-        yield asked.is_set
+        yield arrival.is_set
     finally:
         restore()
 

@@ -5,7 +5,7 @@ import pickle
 import pytest
 from rich.text import Text
 
-from ethbrake_marl.cli.command import Out, say
+from ethbrake_marl.cli.command import Out, print_note
 from ethbrake_marl.errors import (
     LINE_LIMIT,
     AlreadyExists,
@@ -21,7 +21,7 @@ from ethbrake_marl.errors import (
 
 def test_control_characters__are_shown_not_sent(capsys: pytest.CaptureFixture[str]) -> None:
     assert plain_text("a\tb\nc\r", keep="\n\t") == "a\tb\nc\\r"
-    say("runs/\x1b[2J\nx")
+    print_note("runs/\x1b[2J\nx")
     assert capsys.readouterr().err == "runs/\\x1b[2J\\nx\n"
     Out().show("# \u202egnp\n", Text("[/] ppo@\x1b[31m :smile:"), "6\N{NO-BREAK SPACE}m/s²")
     assert capsys.readouterr().out == "# \\u202egnp\n\n[/] ppo@\\x1b[31m :smile:\n6\N{NO-BREAK SPACE}m/s²\n"

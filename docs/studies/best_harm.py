@@ -26,9 +26,9 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, PhysicsError
 from ethbrake_marl.extensions.proofs.measures import avoidable, proven_harm
-from ethbrake_marl.extensions.search.best_harm import BUDGET, search_list
+from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, search_list
 from ethbrake_marl.extensions.search.pricing import best_of, problem_of
-from ethbrake_marl.extensions.search.tables import SHIPPED, BestHarmTable, outdated_tables, shipped_tables
+from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable, outdated_tables, shipped_tables
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.files.store import check_target
 from ethbrake_marl.motion.digest import physics_digest
@@ -55,7 +55,7 @@ def main(words: list[str]) -> None:
         help="count to minimise; default: those of --start, or both harms. Other counts of --start stay as they are",
     )
     add("--vehicles", metavar="A,B,...", help="vehicles to control together; default: the learners")
-    add("--budget", type=int, default=BUDGET, help="candidate profiles per world and count")
+    add("--budget", type=int, default=SEARCH_BUDGET, help="candidate profiles per world and count")
     add("--search-seed", type=int, default=0)
     add("--threads", type=int, help="worlds searched at the same time; changes no result")
     add("--start", type=Path, metavar="FILE.npz", help="a table to start from; no world gets more harm")
@@ -70,7 +70,7 @@ def main(words: list[str]) -> None:
     )
     given = parser.parse_args(words)
     if given.restamp:
-        sys.exit(0 if restamp(SHIPPED) else 1)
+        sys.exit(0 if restamp(TABLE_FOLDER) else 1)
     if given.shipped:
         if outdated := outdated_tables():
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
@@ -109,7 +109,7 @@ def search(given: argparse.Namespace, command: str) -> BestHarmTable:
     teams = [make_teams(given.agents, scenario, harm_count=count) if given.agents else {} for count in counts]
     table = search_list(
         game, alert, chunks=None if given.output is None else parts_beside(given.output), counts=counts,
-        budget=given.budget, seed=given.search_seed, threads=given.threads, known=known,
+        budget=given.budget, seed=given.search_seed, threads=given.threads, known_table=known,
         teams=[team for each in teams for team in each.values()],
     )  # fmt: skip
     header = {**table.header, "episodes": given.episodes, "list_seed": given.seed, "command": command}

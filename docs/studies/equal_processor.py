@@ -16,7 +16,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import HARM
-from ethbrake_marl.extensions.report.figures import Curve, curves_figure
+from ethbrake_marl.extensions.report.figures import EstimateCurve, curves_figure
 from ethbrake_marl.extensions.report.style import write_picture
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Estimate
@@ -46,7 +46,7 @@ def job_of(test: str, count: str, name: str, seconds: int, folder: Path) -> Job:
     return Job(Training.of(recipe, test), folder / test / name)
 
 
-def curve_of(run: RunFolder, count: str) -> Curve:
+def curve_of(run: RunFolder, count: str) -> EstimateCurve:
     """Return harm against the processor time of the training, without evaluations (s)."""
     evaluations = read_object(run.status)["evaluations"]
     return {each["cpu_s"]: Estimate(float(each[HARM[count]]), None) for each in evaluations}

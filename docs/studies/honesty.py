@@ -22,7 +22,7 @@ from ethbrake_marl.extensions.report.style import finish, in_our_style, new_pane
 from ethbrake_marl.extensions.search.best_harm import e_v2x_bm_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of
 from ethbrake_marl.extensions.search.search import search_profiles
-from ethbrake_marl.extensions.search.tables import best_known
+from ethbrake_marl.extensions.search.tables import best_stored
 from ethbrake_marl.motion.layout import DROVE, PUSHED
 
 TESTS = {"paper-random": "Main test", "paper-random-obstacle": "Obstacle test"}
@@ -65,7 +65,7 @@ def costs_of(test: str) -> list[Cost]:
     scenario, game = eb.open_game(test)
     alert = scenario.sample(WORLDS, SEED)
     asked = problem_of(game, alert, count="total")
-    shipped = {price: best_known(asked, count)[1] for price, count in SHIPPED.items()}
+    shipped = {price: best_stored(asked, count)[1] for price, count in SHIPPED.items()}
     found = [Cost.of("full_brake", 0.0, asked.follow(asked.constant(asked.bounds[:, np.newaxis, :, 0])))]
     for price in PRICES:
         problem = with_price(asked, price)

@@ -24,7 +24,7 @@ import numpy as np
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.cooperation import mean_over_seeds
-from ethbrake_marl.extensions.messages.declared import USUAL
+from ethbrake_marl.extensions.messages.declared import DEFAULT_CONTENT
 from ethbrake_marl.files.sheet import Column
 from ethbrake_marl.motion.layout import Floats
 
@@ -35,9 +35,12 @@ LINES = {  # line of vehicles -> scenario, channel
 }
 ALL = "the usual pieces"
 CONTENTS: dict[str, tuple[str, ...]] = {
-    ALL: USUAL,
-    **{f"without {one.replace('_', ' ')}": tuple(each for each in USUAL if each != one) for one in USUAL},
-    "with intent": (*USUAL, "intent"),
+    ALL: DEFAULT_CONTENT,
+    **{
+        f"without {one.replace('_', ' ')}": tuple(each for each in DEFAULT_CONTENT if each != one)
+        for one in DEFAULT_CONTENT
+    },
+    "with intent": (*DEFAULT_CONTENT, "intent"),
     "the alert alone": (),
 }
 SEEN = ["own", "front_1", "rear_1", "role", "front_1.intent", "rear_1.intent"]

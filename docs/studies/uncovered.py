@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.certified.robust import RobustShield, opened
+from ethbrake_marl.extensions.certified.robust import RobustShield, reset_without_shield
 
 BATCH, BOXES = 50_000, 20  # worlds inside a box that are simulated together; number of boxes
 
@@ -38,7 +38,7 @@ def between(intervals: str, draws: int) -> str:
     plans = np.where(np.isnan(applied), memory.plan, applied)
     sizes = [min(BATCH, draws - first) for first in range(0, draws, BATCH)]
     for k, n in product(range(BOXES), sizes):
-        truth = opened(game, shield.uncertainty.draw(nominal.take(np.full(n, k)), rng))
+        truth = reset_without_shield(game, shield.uncertainty.draw(nominal.take(np.full(n, k)), rng))
         over = eb.price(game, truth, plans[k : k + 1].repeat(n, axis=0), "first") - memory.first[k]
         above, excess = above + int((over > 1e-9).sum()), max(excess, over.max())
     worlds = BOXES * draws

@@ -24,7 +24,7 @@ MODEL = "true model"  # also masses, restitution and scripts: everything that an
 KNOWLEDGE = (SENSORS, MESSAGES, ESTIMATED, STATE, MODEL)
 UNSTATED = "not stated"
 
-NOBODY = np.zeros(0, np.int64)
+NO_BODIES = np.zeros(0, np.int64)
 CHUNK = 2_500  # worlds of a list that are driven together, to limit memory
 
 
@@ -131,7 +131,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
         memories = {body: begin_script(agent, alert, body) for body, agent in agents.items()}
         state = state._replace(memories={**state.memories, **memories})
         # From the first decision on, the learners' agents decide as scripts do.
-        game = game._replace(scripts={**game.scripts, **agents}, settings=game.settings._replace(learners=NOBODY))
+        game = game._replace(scripts={**game.scripts, **agents}, settings=game.settings._replace(learners=NO_BODIES))
     else:
         state, actions = game.reset(alert), None
     yield None, state

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, NOBODY, STATE
-from ethbrake_marl.agents.pairwise import Choice, closed_form, pairwise
+from ethbrake_marl.agents.drive import MODEL, NO_BODIES, STATE
+from ethbrake_marl.agents.pairwise import ConstantDeceleration, closed_form, pairwise
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import StepSettings, failure, first_decision, step
@@ -25,13 +25,13 @@ from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.roles import HELD, LEARNER
 
 FIRST_PARTS = 64  # number of cells into which the range of decelerations is divided first
-PARTS = 8  # number of cells into which a cell is divided
+SUBCELLS = 8  # number of cells into which a cell is divided
 NARROWEST_MPS2 = 1e-5  # narrower cells are not divided
-SMALL = 1e-3  # a gain in harm (m2/s2) too small to search for
-TIE = 1e-9  # harms (m2/s2) closer than this count as equal
+LEAST_GAIN = 1e-3  # a gain in harm (m2/s2) too small to search for
+TIE_MARGIN = 1e-9  # harms (m2/s2) closer than this count as equal
 
 
-def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Floats = 8.0) -> Choice:
+def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Floats = 8.0) -> ConstantDeceleration:
     """Constant deceleration of vehicle ``body`` with the least simulated harm in every world, and this harm.
 
     All other vehicles hold ``alert.wanted``. ``count`` is the harm to minimise (``episode.counts``). If the closed
@@ -46,11 +46,11 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
     harm = harms(alert, body, best[:, np.newaxis], count, until_s)[:, :, 0]
     rows = np.flatnonzero(harm.any(axis=0))
     if len(rows):
-        best[rows], harm[0, rows], _ = search(alert.take(rows), body, count, until_s[rows]).T
+        best[rows], harm[0, rows], _ = search_deceleration(alert.take(rows), body, count, until_s[rows]).T
     failed = np.flatnonzero(np.isinf(harm[0]))  # for every deceleration
     if len(failed):
         raise failure(alert, failed[0], alert.time_s[failed[0]], until_s[failed[0]])
-    return Choice(best, harm[0])
+    return ConstantDeceleration(best, harm[0])
 
 
 def harms(alert: State, body: int, tried: Floats, count: str, until_s: Floats) -> Floats:
@@ -61,7 +61,7 @@ def harms(alert: State, body: int, tried: Floats, count: str, until_s: Floats) -
     return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], until_s, count)
 
 
-def search(alert: State, body: int, count: str, until_s: Floats) -> Floats:
+def search_deceleration(alert: State, body: int, count: str, until_s: Floats) -> Floats:
     """Best deceleration of each world and its harm, in ``count`` and in the count that breaks ties: [n, 3].
 
     It divides all decelerations into ``FIRST_PARTS`` equal cells, and then repeatedly those cells that may contain a
@@ -76,8 +76,8 @@ def search(alert: State, body: int, count: str, until_s: Floats) -> Floats:
         cells = np.empty((2, at.size), np.int64)
         row, part = cells[:, : find_cells(rows, at, harm, step, best, cells)]
         left, right = harm[:, row, part, np.newaxis], harm[:, row, part + 1, np.newaxis]
-        rows, step = rows[row], step / PARTS
-        at = at[row, part, np.newaxis] + step[rows, np.newaxis] * np.arange(PARTS + 1)
+        rows, step = rows[row], step / SUBCELLS
+        at = at[row, part, np.newaxis] + step[rows, np.newaxis] * np.arange(SUBCELLS + 1)
         inside = harms(alert.take(rows), body, at[:, 1:-1], count, until_s[rows])
         harm = np.concatenate([left, inside, right], axis=2)
     return best
@@ -96,7 +96,7 @@ def find_cells(rows, at, harm, step, best, cells):
     for j in range(at.shape[0]):
         known, better = best[rows[j]], False
         for c in range(last + 1):
-            if compare(harm[:, j, c], known) < 0:
+            if compare_harm(harm[:, j, c], known) < 0:
                 known[1], known[2], better = harm[0, j, c], harm[1, j, c], True
         if better:
             take_middle(at[j], harm[:, j], known)
@@ -107,7 +107,7 @@ def find_cells(rows, at, harm, step, best, cells):
             change = 0.0
             for beside in range(max(c - 1, 0), min(c + 2, last)):
                 change = max(change, abs(harm[0, j, beside + 1] - harm[0, j, beside]))
-            if min(harm[0, j, c], harm[0, j, c + 1]) - change < best[rows[j], 1] - SMALL:
+            if min(harm[0, j, c], harm[0, j, c + 1]) - change < best[rows[j], 1] - LEAST_GAIN:
                 cells[0, count], cells[1, count] = j, c
                 count += 1
     return count
@@ -121,24 +121,24 @@ def take_middle(at, harm, known):
     """
     ties = 0
     for c in range(len(at)):
-        ties += 1 if compare(harm[:, c], known) == 0 else 0
+        ties += 1 if compare_harm(harm[:, c], known) == 0 else 0
     for c in range(len(at)):
-        ties -= 2 if compare(harm[:, c], known) == 0 else 0
+        ties -= 2 if compare_harm(harm[:, c], known) == 0 else 0
         if ties <= 0:
             known[0] = at[c]
             return
 
 
 @kernel
-def compare(harm, known):
+def compare_harm(harm, known):
     """-1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more (``known`` as in ``take_middle``)."""
     for count in range(2):  # the other count decides ties
-        if abs(harm[count] - known[count + 1]) > TIE:
+        if abs(harm[count] - known[count + 1]) > TIE_MARGIN:
             return -1 if harm[count] < known[count + 1] else 1
     return 0
 
 
-class Memory(NamedTuple):
+class BaselineMemory(NamedTuple):
     command: Floats  # [n] m/s2
     predicted_harm: Floats  # [n] m2/s2
 
@@ -162,7 +162,7 @@ class EV2XBM:
     ) -> None:
         self.settings, self.agents, self.count = settings, dict(agents), count
 
-    def begin(self, alert: State, body: int) -> Memory:
+    def begin(self, alert: State, body: int) -> BaselineMemory:
         """Choose the deceleration. Raises ``InvalidInput`` if another vehicle is driven by an agent."""
         for other, role in self.agents.items():
             if other != body:
@@ -175,9 +175,9 @@ class EV2XBM:
         alert = alert._replace(wanted=wanted)
         command = -coupled(alert, body, self.count, self.settings.horizon_s).deceleration_mps2
         wanted[:, body] = command
-        return Memory(command, last_if_held(alert, self.settings).harm(self.count))
+        return BaselineMemory(command, last_if_held(alert, self.settings).harm(self.count))
 
-    def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
+    def act(self, state: State, memory: BaselineMemory, body: int) -> tuple[Floats, BaselineMemory]:
         return memory.command, memory
 
 
@@ -186,18 +186,18 @@ class EV2XBMPairwise:
 
     name, knows = "e_v2x_bm:pairwise", STATE
 
-    def begin(self, alert: State, body: int) -> Memory:
+    def begin(self, alert: State, body: int) -> BaselineMemory:
         """Choose the deceleration. Raises ``InvalidInput`` where the closed form does not hold (see ``pairwise``)."""
         deceleration, harm = pairwise(alert, body)
-        return Memory(-deceleration, harm)
+        return BaselineMemory(-deceleration, harm)
 
-    def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
+    def act(self, state: State, memory: BaselineMemory, body: int) -> tuple[Floats, BaselineMemory]:
         return memory.command, memory
 
 
 def last_if_held(alert: State, settings: StepSettings) -> State:
     state = first_decision(alert, settings.learners, settings)
-    settings, nothing = settings._replace(learners=NOBODY), np.zeros((alert.n, 0))
+    settings, nothing = settings._replace(learners=NO_BODIES), np.zeros((alert.n, 0))
     while not state.ended.all():
         state, _ = step(settings, {}, state, nothing, donate=True)
     return state

@@ -32,7 +32,7 @@ HARMLESS = {
     ),
     "supersuit": ("SB3VecEnvWrapper", "ConcatVecEnv", "MarkovVectorEnv"),
 }  # fmt: skip
-INSIDE = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes that hold what is wrapped
+WRAPPED_ATTRIBUTES = ("venv", "envs", "vec_envs", "par_env", "aec_env", "env")  # attributes that hold what is wrapped
 
 
 def ask_of(policy: Any, who: str) -> Ask:
@@ -175,7 +175,7 @@ def check_wrappers(policy: Any, who: str) -> None:
     Also if it was trained with ``VecNormalize``, whose statistics its file lacks.
     """
     env, statistics = getattr(policy, "get_env", lambda: None)(), statistics_of(policy)
-    for layer in [] if env is None else layers_of(env):
+    for layer in [] if env is None else wrappers_of(env):
         kind, library = type(layer), type(layer).__module__.partition(".")[0]
         if library != "ethbrake_marl" and kind.__name__ not in HARMLESS.get(library, ()):
             name = vars(layer).get("modifier_class", kind).__name__  # of SuperSuit
@@ -192,13 +192,13 @@ def check_wrappers(policy: Any, who: str) -> None:
         )
 
 
-def layers_of(env: Any) -> Iterator[Any]:
+def wrappers_of(env: Any) -> Iterator[Any]:
     yield env
-    for name in INSIDE:
+    for name in WRAPPED_ATTRIBUTES:
         inside = getattr(env, "__dict__", {}).get(name, ())  # its own: wrappers forward attributes
         for each in inside if isinstance(inside, list | tuple) else (inside,):
             if hasattr(each, "step") or hasattr(each, "step_wait"):
-                yield from layers_of(each)
+                yield from wrappers_of(each)
 
 
 def _was_normalised(model: Any) -> bool:

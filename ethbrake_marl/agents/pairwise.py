@@ -25,11 +25,11 @@ from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.impact import TOUCH_MPS
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, GAP, LATENCY, RELEASE_RATE, SPEED, Floats
 
-CANDIDATES = 9
-TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
+CLOSED_FORM_CANDIDATES = 9
+RELATIVE_TIE = 1e-12  # harms closer than this, relative to 1 + harm, count as equal
 
 
-class Choice(NamedTuple):
+class ConstantDeceleration(NamedTuple):
     """The best constant deceleration of one vehicle in each of n worlds."""
 
     deceleration_mps2: Floats  # [n] from 0 to the braking capacity
@@ -79,10 +79,10 @@ def meet(gap, front, front_braking, front_onset, rear, rear_braking, rear_onset,
 
 
 @large
-def predicted_harm(line, braking, wait, body, a):
+def harm_of_deceleration(line, braking, wait, body, a):
     """H (m2/s2) in one world if vehicle ``body`` decelerates with ``a`` (m/s2).
 
-    Other arguments as in ``choose``, without the axis of worlds.
+    Other arguments as in ``choose_decelerations``, without the axis of worlds.
     """
     gap, speed, harm = line[GAP], line[SPEED], 0.0
     if body > 1:
@@ -96,11 +96,11 @@ def predicted_harm(line, braking, wait, body, a):
 
 @large
 def find_candidates(line, braking, wait, body, at):
-    """Write to ``at`` [CANDIDATES] the decelerations (m/s2) of vehicle ``body`` where H may be least, in one world.
+    """Write to ``at`` [C] the decelerations (m/s2) of vehicle ``body`` where H may be least, in one world.
 
-    Other arguments as in ``choose``, without the axis of worlds. The formulas use the state at the vehicle's onset: gap
-    d, its speed v, the neighbour's speed u, closing speed w, and the time s for which the neighbour still coasts before
-    it brakes with b. A candidate may be invalid: outside [0, capacity], or not a number.
+    Other arguments as in ``choose_decelerations``, without the axis of worlds. The formulas use the state at the
+    vehicle's onset: gap d, its speed v, the neighbour's speed u, closing speed w, and the time s for which the
+    neighbour still coasts before it brakes with b. A candidate may be invalid: outside [0, capacity], or not a number.
     """
     gap, speed, onset = line[GAP], line[SPEED], wait[body]
     at[:] = 0.0
@@ -125,43 +125,45 @@ def find_candidates(line, braking, wait, body, at):
 
 
 @large
-def choose(line, braking, wait, body, at, harm, best, least):
+def choose_decelerations(line, braking, wait, body, at, harm, best, least):
     """Write the best deceleration of vehicle ``body`` in each world to ``best`` [n] (m/s2), and its H to ``least`` [n].
 
     ``line`` is the array of a ``State``, ``braking`` [n, N + 1] each vehicle's braking capacity or present deceleration
-    (m/s2), ``wait`` [n, N + 1] the time until it may begin to brake (s); ``at`` and ``harm`` [CANDIDATES] are working
+    (m/s2), ``wait`` [n, N + 1] the time until it may begin to brake (s); ``at`` and ``harm`` [C] are working
     memory. If several candidates are equally good, the result is the middle of the outer two, provided that H is as
     small there.
     """
     for k in range(line.shape[0]):
         find_candidates(line[k], braking[k], wait[k], body, at)
         least[k], first, last = math.inf, math.inf, 0.0
-        for c in range(CANDIDATES):
+        for c in range(CLOSED_FORM_CANDIDATES):
             at[c] = at[c] if 0.0 <= at[c] <= braking[k, body] else 0.0
-            harm[c] = predicted_harm(line[k], braking[k], wait[k], body, at[c])
+            harm[c] = harm_of_deceleration(line[k], braking[k], wait[k], body, at[c])
             least[k] = min(least[k], harm[c])
-        tied = least[k] + TIE * (1.0 + least[k])
-        for c in range(CANDIDATES):
+        tied = least[k] + RELATIVE_TIE * (1.0 + least[k])
+        for c in range(CLOSED_FORM_CANDIDATES):
             if harm[c] <= tied:
                 first, last = min(first, at[c]), max(last, at[c])
         best[k] = 0.5 * (first + last)
-        least[k] = predicted_harm(line[k], braking[k], wait[k], body, best[k])
+        least[k] = harm_of_deceleration(line[k], braking[k], wait[k], body, best[k])
         if least[k] > tied:
-            best[k], least[k] = first, predicted_harm(line[k], braking[k], wait[k], body, first)
+            best[k], least[k] = first, harm_of_deceleration(line[k], braking[k], wait[k], body, first)
 
 
-def closed_form(alert: State, braking: Floats, body: int) -> Choice:
+def closed_form(alert: State, braking: Floats, body: int) -> ConstantDeceleration:
     """Best deceleration of vehicle ``body``, and H, if the others brake to rest as ``braking`` says.
 
     ``braking`` is [n, N + 1] m/s2.
     """
     wait = np.maximum(alert.car[:, LATENCY] - alert.time_s[:, np.newaxis], 0.0)
-    choice = Choice(np.empty(alert.n), np.empty(alert.n))
-    choose(alert.line, braking, wait, body, np.empty(CANDIDATES), np.empty(CANDIDATES), *choice)
+    choice = ConstantDeceleration(np.empty(alert.n), np.empty(alert.n))
+    choose_decelerations(
+        alert.line, braking, wait, body, np.empty(CLOSED_FORM_CANDIDATES), np.empty(CLOSED_FORM_CANDIDATES), *choice
+    )
     return choice
 
 
-def pairwise(alert: State, body: int) -> Choice:
+def pairwise(alert: State, body: int) -> ConstantDeceleration:
     """Deceleration of vehicle ``body`` (1: Vehicle 1) that minimises H, and H, in every world.
 
     Ties, such as all decelerations that avoid both impacts, give the middle one. The result depends on gaps, speeds,

@@ -31,7 +31,7 @@ from ethbrake_marl.episode.state import NUMBER, State, mapped
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.policies.manifest import PHYSICS
+from ethbrake_marl.policies.manifest import PHYSICS_KEY
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario, views_of
@@ -62,7 +62,7 @@ class LearnedAgent:
     def check(self, game: Game, body: int) -> None:
         """Warn (``Unfamiliar``) if the policy was trained with another physics or another time step."""
         manifest, step_s = self.policy.manifest, game.settings.time_step_s
-        then, now = manifest.versions.get(PHYSICS), physics_digest()
+        then, now = manifest.versions.get(PHYSICS_KEY), physics_digest()
         if then not in (None, now):
             warnings.warn(
                 f"{self.name}: was trained on other physics ({then!r:.20}) than this installation's ({now!r}), so it"

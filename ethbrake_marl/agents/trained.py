@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.bundle import load_drivers, load_policy, load_shipped, shipped_policies
 from ethbrake_marl.registry import Part
 
-ANY = ("policy", "team")  # names that stand for whatever algorithm has trained the policy
+ANY_ALGORITHM = ("policy", "team")  # names that stand for whatever algorithm has trained the policy
 
 
 def make_trained(argument: str | None, settings: Any) -> Agent | Team:
@@ -39,7 +39,7 @@ def make_trained(argument: str | None, settings: Any) -> Agent | Team:
     else:
         policy = load_policy(path)
         driver = LearnedAgent(policy, spec)
-    if name not in ANY and name != policy.manifest.algorithm:
+    if name not in ANY_ALGORITHM and name != policy.manifest.algorithm:
         by = policy.manifest.algorithm
         raise InvalidInput(f"agent {spec!r}: the policy was trained by {by}; write {by}@{path}")
     return driver

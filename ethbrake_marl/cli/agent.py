@@ -21,8 +21,10 @@ def agent_list(as_json: JsonOption = False) -> None:
 
         entries = listed_agents()
         out.result(
-            [{"agent": each.form, "about": each.about, "knows": each.knows} for each in entries],
-            Sheet("", ("Agent", "Method", "Knows"), [(each.form, each.about, each.knows) for each in entries], gap=2),
+            [{"agent": entry.form, "about": entry.about, "knows": entry.knows} for entry in entries],
+            Sheet(
+                "", ("Agent", "Method", "Knows"), [(entry.form, entry.about, entry.knows) for entry in entries], gap=2
+            ),
             f"ladder stands for {', '.join(group('ladder'))}. See docs/evaluate.md and docs/shield.md.",
         )
         for reason in why_not_listed():

@@ -25,7 +25,7 @@ from ethbrake_marl.cli import agent, doctor, evaluate, run, scenario, train
 from ethbrake_marl.cli.command import INTERRUPTED, Out, example
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, describe_error, naming_extras
 from ethbrake_marl.kernel_store import obstacle, on_first_compilation
-from ethbrake_marl.registry import OURS, Registry, giver, points
+from ethbrake_marl.registry import DISTRIBUTION, Registry, giver, points
 from ethbrake_marl.renamed import new_name
 
 app = typer.Typer(
@@ -37,19 +37,19 @@ app = typer.Typer(
 )
 _COMPLETE = "_ETHBRAKE_COMPLETE"  # variable with which a shell asks to complete a command line
 _NAMES = "Names that can be used in --set, recipes and scenarios: ethbrake scenario parts"
-for name, command, shown in (
-    ("run", run.run_command, "run --steps 200000 --seed 1"),
+for name, command, usage in (
+    ("run", run.experiment_command, "run --steps 200000 --seed 1"),
     ("train", train.train_command, "train --recipe sac --output runs/sac"),
     ("evaluate", evaluate.evaluate_command, "evaluate --agents full_brake,constant:3.5,e_v2x_bm --episodes 1000"),
     ("doctor", doctor.doctor_command, "doctor"),
 ):
-    app.command(name, epilog=example(shown) + (f"\n\n{_NAMES}" if name in ("train", "evaluate") else ""))(command)
+    app.command(name, epilog=example(usage) + (f"\n\n{_NAMES}" if name in ("train", "evaluate") else ""))(command)
 for name, group in (("scenario", scenario.scenario_group), ("agent", agent.agent_group)):
     app.add_typer(group, name=name)
 
 
-def _show_version(asked: bool) -> None:
-    if asked:
+def _show_version(wants_version: bool) -> None:
+    if wants_version:
         Out().show(f"ethbrake {__version__}")
         raise typer.Exit
 
@@ -138,8 +138,8 @@ def _shell_asks(environment: Mapping[str, str]) -> bool:
     """
     if environment.get(_COMPLETE) == "complete_bash":
         return "COMP_WORDS" in environment and environment.get("COMP_CWORD", "").isdecimal()
-    others = ("complete_zsh", "complete_fish", "complete_powershell", "complete_pwsh")
-    return environment.get(_COMPLETE) in others and "_TYPER_COMPLETE_ARGS" in environment
+    instructions = ("complete_zsh", "complete_fish", "complete_powershell", "complete_pwsh")
+    return environment.get(_COMPLETE) in instructions and "_TYPER_COMPLETE_ARGS" in environment
 
 
 def _refuse(reason: str) -> int:
@@ -163,19 +163,19 @@ def prepare_streams() -> None:
             buffering = 1 if sys.stdout.line_buffering else -1
             sys.stdout = os.fdopen(os.dup(1), "w", buffering, sys.stdout.encoding, "replace", closefd=False)
             os.dup2(2, 1)
-    shown = warnings.showwarning
+    default_hook = warnings.showwarning
 
     def show_warning(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
         if category.__module__ == EthBrakeError.__module__:
             Out().note(f"warning: {message}")
         else:
-            shown(message, category, *place, **more)
+            default_hook(message, category, *place, **more)
 
     warnings.showwarning = show_warning
-    on_first_compilation(tell_compilation)
+    on_first_compilation(print_compilation)
 
 
-def tell_compilation(is_empty: bool) -> None:
+def print_compilation(is_empty: bool) -> None:
     """Print that numba kernels are being compiled. ``is_empty``: none are stored yet."""
     part = "the physics for the first time, which takes a while" if is_empty else "parts of the physics"
     Out().note(f"compiling {part}{'' if obstacle() else '; later commands use the stored result'}")
@@ -204,12 +204,12 @@ def add_command(name: str, command: typer.Typer | Callable[..., Any], *, epilog:
         group = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
         group.command(epilog=epilog)(command)
     built = get_command(group)
-    COMMANDS.add(name, built, lambda other: other is built)
+    COMMANDS.add(name, built, lambda registered: registered is built)
 
 
 def _names() -> list[str]:
     return [
-        *(each.name or each.callback.__name__.replace("_", "-") for each in app.registered_commands if each.callback),
+        *(info.name or info.callback.__name__.replace("_", "-") for info in app.registered_commands if info.callback),
         *(str(group.name) for group in app.registered_groups),
     ]
 
@@ -228,7 +228,7 @@ class Installed(TyperCommand):
         givers = [giver(point) for point in points(COMMANDS.group)[entry]]
         packages = f"package{'s' if len(givers) > 1 else ''} {' and '.join(givers)}"
         super().__init__(entry.rpartition(".")[2], help=f"Command of the installed {packages}.", rich_markup_mode=None)
-        self.entry, self.is_ours = entry, givers == [OURS]
+        self.entry, self.is_ours = entry, givers == [DISTRIBUTION]
 
     def command(self) -> Any:
         command = COMMANDS[self.entry]
@@ -246,9 +246,9 @@ class Installed(TyperCommand):
 def with_installed(group: Any, name: str) -> Any:
     """Add the installed commands with entry points ``NAME.COMMAND`` to the command group ``name``; return the group."""
     for entry in points(COMMANDS.group):
-        of, _, own = entry.rpartition(".")
-        if of == name:
-            group.commands[own] = Installed(entry)
+        owner, _, command_name = entry.rpartition(".")
+        if owner == name:
+            group.commands[command_name] = Installed(entry)
     return group
 
 
@@ -258,11 +258,11 @@ def _built(*registered: object) -> Any:
     return get_command(app)
 
 
-def _apart(command: Any) -> Any:
+def _copy_command(command: Any) -> Any:
     """Copy of a command whose groups can get other commands."""
     copied = copy(command)
     if hasattr(command, "commands"):
-        copied.commands = {name: _apart(each) for name, each in command.commands.items()}
+        copied.commands = {name: _copy_command(subcommand) for name, subcommand in command.commands.items()}
     return copied
 
 
@@ -278,16 +278,16 @@ def whole_command() -> Any:
             raise AlreadyExists(
                 f"command {name!r} already exists; give your command another name: app.command('my-{name}')"
             )
-    groups = [each.typer_instance for each in app.registered_groups if each.typer_instance]
+    groups = [info.typer_instance for info in app.registered_groups if info.typer_instance]
     registered = [command for group in (app, *groups) for command in group.registered_commands]
-    whole: Any = _apart(_built(*registered, *app.registered_groups))
+    program: Any = _copy_command(_built(*registered, *app.registered_groups))
     for name in _OURS:
-        with_installed(whole.commands[name], name)
+        with_installed(program.commands[name], name)
     installed = [name for name in points(COMMANDS.group) if "." not in name]
-    whole.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
-    others = dict.fromkeys(entry.partition(".")[0] for entry in points(COMMANDS.group))
-    for name in (each for each in others if each not in whole.commands):
+    program.commands |= {name: COMMANDS.loaded.get(name) or Installed(name) for name in [*installed, *added]}
+    group_names = dict.fromkeys(entry.partition(".")[0] for entry in points(COMMANDS.group))
+    for name in (group_name for group_name in group_names if group_name not in program.commands):
         group = get_group(typer.Typer(name=name, help="Commands of installed packages.", add_completion=False))
-        whole.commands[name] = with_installed(group, name)
-    whole.commands["doctor"] = whole.commands.pop("doctor")  # the last one of the help
-    return whole
+        program.commands[name] = with_installed(group, name)
+    program.commands["doctor"] = program.commands.pop("doctor")  # the last one of the help
+    return program

@@ -20,7 +20,7 @@ from ethbrake_marl.faces.registration import register_environments
 from ethbrake_marl.progress import Progress, ShownProgress
 
 # special characters allowed in results; the no-break space is used between a number and its unit
-_KEPT = "\n\t\N{NO-BREAK SPACE}"
+_UNESCAPED = "\n\t\N{NO-BREAK SPACE}"
 
 INTERRUPTED = 130  # exit status after Ctrl-C: 128 + SIGINT, as shells expect
 
@@ -61,8 +61,8 @@ def schema_option(module: str, function: str, kind: str) -> Any:
     ``function`` in ``module`` returns the schema. The module is imported only when the option is used.
     """
 
-    def show_schema(asked: bool) -> None:
-        if asked:
+    def show_schema(wants_schema: bool) -> None:
+        if wants_schema:
             Out().print_json(getattr(import_module(module), function)())
             raise typer.Exit
 
@@ -75,7 +75,7 @@ def example(*lines: str) -> str:
     return "\n\n".join(f"Example: ethbrake {line}" for line in lines)
 
 
-def say(text: str) -> None:
+def print_note(text: str) -> None:
     with suppress(OSError):  # nobody can be told
         typer.echo(one_line(text), err=True)
 
@@ -110,37 +110,37 @@ class Out:
         if isinstance(error, SystemExit):
             raise InvalidInput(f"your own code ended the process: SystemExit: {error.code}") from error
 
-    def result(self, content: Any, *shown: RenderableType, end: str = "\n", kept: bool = False) -> None:
-        """Print the result: ``content`` as JSON if the user gave ``--json``, otherwise ``shown``.
+    def result(self, content: Any, *parts: RenderableType, end: str = "\n", in_file: bool = False) -> None:
+        """Print the result: ``content`` as JSON if the user gave ``--json``, otherwise ``parts``.
 
-        ``kept``: a file contains the result, so nothing is lost if standard output is closed.
+        ``in_file``: a file contains the result, so nothing is lost if standard output is closed.
         """
-        if kept and not self._stdout.writable():
+        if in_file and not self._stdout.writable():
             return
         if self.as_json:
             self.print_json(content)
         else:
-            self.show(*shown, end=end)
+            self.show(*parts, end=end)
 
     def print_json(self, content: Any) -> None:
         self.show_progress.end()
         typer.echo(json.dumps(content, indent=2, allow_nan=False), self._stdout)
 
-    def show(self, *shown: RenderableType, end: str = "\n") -> None:
+    def show(self, *parts: RenderableType, end: str = "\n") -> None:
         """Print texts, each followed by ``end``, and tables of the library rich.
 
         Control characters in texts are escaped, except line ends and tabs.
         """
         self.show_progress.end()
-        for each in shown:
-            if isinstance(each, str):
-                typer.echo(plain_text(each, keep=_KEPT) + end, self._stdout, nl=False)
+        for part in parts:
+            if isinstance(part, str):
+                typer.echo(plain_text(part, keep=_UNESCAPED) + end, self._stdout, nl=False)
             else:  # at the terminal's width, or 100 columns in a file
-                _PlainConsole(self._stdout, width=None if self._stdout.isatty() else 100).print(each)
+                _PlainConsole(self._stdout, width=None if self._stdout.isatty() else 100).print(part)
 
     def note(self, text: str) -> None:
         self.show_progress.end()
-        say(text)
+        print_note(text)
 
     def check(self, path: Path | None, *endings: str, what: str = "the file") -> None:
         """Raise an error, before any work, if a file cannot be written. ``path=None`` means no file.
@@ -168,8 +168,8 @@ class Out:
         self.note(text)
         raise typer.Exit(INTERRUPTED)
 
-    def progress(self, name: str, done: int, total: int) -> None:
-        self.show_progress(Progress(name, done, total))
+    def progress(self, name: str, count: int, total: int) -> None:
+        self.show_progress(Progress(name, count, total))
 
 
 class _PlainConsole(Console):
@@ -189,4 +189,4 @@ class _PlainConsole(Console):
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
         for piece in super().render(renderable, options):
-            yield piece if piece.control else Segment(plain_text(piece.text, keep=_KEPT), piece.style)
+            yield piece if piece.control else Segment(plain_text(piece.text, keep=_UNESCAPED), piece.style)

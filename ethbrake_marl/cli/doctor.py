@@ -90,9 +90,9 @@ def _dependencies() -> Iterator[Check]:
 
     from ethbrake_marl.faces.rendering import RENDERERS, why_not
 
-    wanted = [Requirement(line) for line in requires("ethbrake-marl") or []]
-    of = {extra: [r for r in wanted if r.marker and r.marker.evaluate({"extra": extra})] for extra in EXTRAS}
-    for extra, needed in {"": [r for r in wanted if r.marker is None], **of}.items():
+    requirements = [Requirement(line) for line in requires("ethbrake-marl") or []]
+    groups = {extra: [r for r in requirements if r.marker and r.marker.evaluate({"extra": extra})] for extra in EXTRAS}
+    for extra, needed in {"": [r for r in requirements if r.marker is None], **groups}.items():
         for requirement in needed:
             # The package pygame has a module of the same name, and the last one installed is there.
             is_checked = requirement.name == "pygame-ce" and "human" in RENDERERS and find_spec("pygame") is not None
@@ -116,9 +116,9 @@ def _processor() -> tuple[bool, str]:
 
 
 def _kernel_cache() -> tuple[bool, str]:
-    reason, (damaged, left) = obstacle(), delete_damaged()
-    notes = f"; damaged files: {damaged}, of which {damaged - left} are deleted now" if damaged else ""
-    return not left, (f"{reason}; {UNSTORED}" if reason else str(cache_folder())) + notes
+    reason, (damaged, remaining) = obstacle(), delete_damaged()
+    notes = f"; damaged files: {damaged}, of which {damaged - remaining} are deleted now" if damaged else ""
+    return not remaining, (f"{reason}; {UNSTORED}" if reason else str(cache_folder())) + notes
 
 
 def _scenarios() -> tuple[bool, str]:
@@ -161,8 +161,8 @@ def _golden_baseline() -> tuple[bool, str]:
     scenario = load_scenario("paper-distance").replace(gaps_m=7.0)
     best = pairwise(worlds_from_state(scenario, {}), 2)
     computed = f"{float(best.deceleration_mps2[0]):.6g} m/s2, harm {float(best.harm[0]):.6g}"
-    wanted = "5.17021 m/s2, harm 4.03447"
-    return computed == wanted, f"E-V2X-BM with gaps of 7 m and 7 m: {computed} (known result: {wanted})"
+    expected = "5.17021 m/s2, harm 4.03447"
+    return computed == expected, f"E-V2X-BM with gaps of 7 m and 7 m: {computed} (known result: {expected})"
 
 
 def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str]:
@@ -182,8 +182,8 @@ def compile_ahead(*, training: bool, run_alone: bool = False) -> tuple[bool, str
 
 
 def _call(arguments: tuple[str, ...], folder: str) -> str:
-    done = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
-    return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1] if done.returncode else ""
+    process = subprocess.run([sys.executable, *arguments], cwd=folder, capture_output=True, text=True, check=False)
+    return (process.stderr.strip().splitlines() or [f"status {process.returncode}"])[-1] if process.returncode else ""
 
 
 def doctor_command(

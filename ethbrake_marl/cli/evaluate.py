@@ -17,12 +17,12 @@ from ethbrake_marl.cli.command import (
     ScenarioOption,
     SettingsOption,
 )
-from ethbrake_marl.cli.pages import page_of
+from ethbrake_marl.cli.pages import page_function
 from ethbrake_marl.errors import InvalidInput, need
 from ethbrake_marl.files.store import check_folder
 
 if TYPE_CHECKING:
-    from ethbrake_marl.cli.settings import Settings
+    from ethbrake_marl.cli.settings import CommandSettings
     from ethbrake_marl.evaluation.compared import Compared
 
 GROUP_EPISODES = 2_000  # worlds of each scenario of a group, except the three tests
@@ -80,21 +80,21 @@ def evaluate_command(
             raise InvalidInput(
                 f"--report: records episodes, which needs exact impacts, and physics: {physics} has none; leave it out"
             )
-        every = {}
+        comparisons = {}
         for name in names or [scenario]:
             usual = GROUP_EPISODES if names and name not in THREE_TESTS else 10_000
             count = usual if episodes is None else episodes
-            every[name] = _compared(out, name, chosen, agents, count, seed, jobs)
+            comparisons[name] = _compare(out, name, chosen, agents, count, seed, jobs)
         if report and output is not None:
-            write = page_of("evaluation", "--report")
+            write = page_function("evaluation", "--report")
             output.mkdir(parents=True, exist_ok=True)
-            write(output / REPORT, every[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
+            write(output / REPORT, comparisons[scenario], "ethbrake " + " ".join(sys.argv[1:]), force=force)
             out.note(f"report: {output / REPORT}")
-        _show(out, every, output, per_world, REPORT if report else "")
+        _show(out, comparisons, output, per_world, REPORT if report else "")
 
 
-def _compared(
-    out: Out, scenario: str, chosen: Settings, agents: str, episodes: int, seed: int, jobs: int | None
+def _compare(
+    out: Out, scenario: str, chosen: CommandSettings, agents: str, episodes: int, seed: int, jobs: int | None
 ) -> Compared:
     from ethbrake_marl.evaluation.compared import Compared
     from ethbrake_marl.names import teams_of
@@ -105,16 +105,16 @@ def _compared(
     loaded = chosen.change_scenario(scenario)
     return Compared.of(
         loaded, teams_of(agents, loaded, harm_count=harm_count), episodes=episodes, seed=seed, harm_count=harm_count,
-        measures=measures, jobs=jobs or 1, on_done=lambda done: out.progress("worlds", done, episodes),
+        measures=measures, jobs=jobs or 1, on_done=lambda worlds: out.progress("worlds", worlds, episodes),
     )  # fmt: skip
 
 
-def _show(out: Out, every: dict[str, Compared], output: Path | None, per_world: Any, page: str) -> None:
+def _show(out: Out, comparisons: dict[str, Compared], output: Path | None, per_world: Any, page: str) -> None:
     from ethbrake_marl.evaluation.results import write_results
     from ethbrake_marl.evaluation.summary import summarise_lists
 
-    tables = {name: each.table for name, each in every.items()}
-    results = {name: each.result for name, each in every.items()}
+    tables = {name: comparison.table for name, comparison in comparisons.items()}
+    results = {name: comparison.result for name, comparison in comparisons.items()}
     if output is not None:
         output.mkdir(parents=True, exist_ok=True)
         for name in {*FILES} - {page}:
@@ -127,10 +127,10 @@ def _show(out: Out, every: dict[str, Compared], output: Path | None, per_world: 
         sheet = summarise_lists(tables, results)
         scenarios = (name for name, table in tables.items() for _ in table)
         rows = [{"scenario": name, **row} for name, row in zip(scenarios, sheet.json(), strict=True)]
-        out.result(rows, sheet, kept=output is not None)
+        out.result(rows, sheet, in_file=output is not None)
         return
     (table,) = tables.values()
-    out.result(table.to_json(), *table.tables(), kept=output is not None)
+    out.result(table.to_json(), *table.tables(), in_file=output is not None)
 
 
 def _check_outputs(out: Out, output: Path | None, per_world: str | None, *, report: bool) -> None:

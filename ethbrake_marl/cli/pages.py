@@ -19,16 +19,16 @@ def register_page(shows: str, write: Callable[..., None]) -> None:
             ``"run"`` (``ethbrake run``).
         write: for ``"evaluation"``, a function of the file's path, the results (``evaluation.compared``) and the
             command; for ``"worlds"``, of the file's path, the scenario, the number of worlds and the seed. For
-            ``"run"``, a function that returns a ``training.experiment.Report``; that class says what it does.
+            ``"run"``, a function that returns a ``training.experiment.ReportWriter``; that class says what it does.
 
     """
-    PAGES.add(shows, write, lambda other: other is write)
+    PAGES.add(shows, write, lambda registered: registered is write)
 
 
 PAGES: Registry[Callable[..., Any]] = Registry("page", "pages", register_page)
 
 
-def page_of(shows: str, option: str) -> Callable[..., None]:
+def page_function(shows: str, option: str) -> Callable[..., None]:
     """Function registered for a page. Raises ``InvalidInput`` without one; its message begins with ``option``."""
     if shows not in PAGES:
         raise InvalidInput(f"{option}: the extension that draws this page ({shows}) is not installed")

@@ -9,13 +9,20 @@ from rich.text import Text
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, ScenarioOption, SettingsOption, StepsOption
 from ethbrake_marl.cli.pages import PAGES
-from ethbrake_marl.cli.train import REMAINS, OutputOption, TrainingSeedOption, changed, run_folder, tell_end
+from ethbrake_marl.cli.train import (
+    AFTER_STOPPED_TRAINING,
+    OutputOption,
+    TrainingSeedOption,
+    change_recipe,
+    run_folder,
+    tell_end,
+)
 
 QUICKEST = ("quick", "ppo")  # trains the first of these recipes whose algorithm is installed
 QUICKEST_TEAM = ("cooperation", "cooperation-ppo")  # the same for scenarios with several learners
 
 
-def run_command(
+def experiment_command(
     scenario: ScenarioOption = "paper-random",
     steps: StepsOption = None,
     seed: TrainingSeedOption = None,
@@ -44,22 +51,22 @@ def run_command(
     first-impact harm, for which pushing is free. Ctrl-C ends the training early and evaluates the policy trained
     so far; a second Ctrl-C stops at once.
     """
-    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
+    with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
         # torch takes seconds to load, here and in the other commands that learn
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.episode.counts import IN_WORDS
-        from ethbrake_marl.names import check_learners
+        from ethbrake_marl.names import require_learner
         from ethbrake_marl.training.experiment import HYBRID, POLICY, SHIELDED, run_experiment
         from ethbrake_marl.training.recipe import load_recipe
 
         plan = load_recipe(recipe or quickest())
         changes = read_settings(settings, [*type(plan).model_fields])
         chosen = changes.change_scenario(scenario)
-        check_learners(chosen)
+        require_learner(chosen)
         if recipe is None and len(chosen.learners) > 1:
             plan = load_recipe(quickest(several=True))
             changes = read_settings(settings, [*type(plan).model_fields])
-        plan = changed(plan, changes.recipe, out)
+        plan = change_recipe(plan, changes.recipe, out)
         experiment, tables, where = run_experiment(
             plan,
             chosen,
@@ -74,15 +81,15 @@ def run_command(
             on_progress=out.show_progress,
         )
         trained = experiment.trained
-        own = trained.training.objective
+        objective = trained.training.objective
         single, harm = experiment.learned == POLICY, IN_WORDS[plan.reward.harm_count]
         headline = (
             f"Trained by recipe {plan.name}, seed {trained.training.recipe.seed}: {trained.steps:,} decisions in"
             f" {trained.wall_s:.0f} s ({trained.status}). {HYBRID if single else SHIELDED}: the"
             f" {experiment.learned}{'' if single else f' (scheme {trained.training.scheme})'} with a shield. All agents"
-            f" minimise {harm}{f', except that the {experiment.learned} minimises {own}' if own else ''}.\n"
+            f" minimise {harm}{f', except that the {experiment.learned} minimises {objective}' if objective else ''}.\n"
         )
-        out.result(experiment.compared.table.to_json(), Text(headline), *tables, kept=True)
+        out.result(experiment.compared.table.to_json(), Text(headline), *tables, in_file=True)
         out.note(where)
         tell_end(out, trained.status, trained.steps, trained.directory)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ethbrake_marl.cli.command import ForceOption, JsonOption, Out, SeedOption, SettingsOption, example
-from ethbrake_marl.cli.pages import page_of
+from ethbrake_marl.cli.pages import page_function
 from ethbrake_marl.files.sheet import Sheet
 
 if TYPE_CHECKING:
@@ -95,13 +95,13 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
     for name, column in _kinds(trial).items():
         counts = ", ".join(f"{kind or 'no type'} {count}" for kind, count in sorted(Counter(column.tolist()).items()))
         yield from _folded(f"{name}: {counts}", 2)
-    drawn = {name: each for name, each in ranges.items() if each["least"] != each["largest"]}
-    width = max(map(len, drawn), default=0)
-    if drawn:
+    varying = {name: extent for name, extent in ranges.items() if extent["least"] != extent["largest"]}
+    width = max(map(len, varying), default=0)
+    if varying:
         yield f"{'drawn':{width}} {'least':>8} {'median':>8} {'largest':>8}"
-    for name, each in drawn.items():
-        yield f"{name:{width}}" + "".join(f" {value:>8.4g}" for value in each.values())
-    same = [f"{name} {each['least']:g}" for name, each in ranges.items() if name not in drawn]
+    for name, extent in varying.items():
+        yield f"{name:{width}}" + "".join(f" {value:>8.4g}" for value in extent.values())
+    same = [f"{name} {extent['least']:g}" for name, extent in ranges.items() if name not in varying]
     yield from _folded(f"the same in all worlds: {'; '.join(same) or 'nothing'}", 20)
     rejected = trial.drawn.rejected
     yield (
@@ -114,9 +114,9 @@ def _trial_lines(scenario: Scenario, trial: Trial) -> Iterator[str]:
     yield f"at the horizon ({scenario.horizon_s:g} s) some vehicle still moves in {_share(trial.moving, n)}"
     if trial.moving:
         yield "  later impacts are not counted unless you raise horizon_s"
-    for learner, others in trial.known.items():
-        known = ", ".join(f"{name} in {100.0 * share:.1f} %" for name, share in others.items())
-        yield from _folded(f"{learner} knows when it can first act: {known} of the worlds", 4)
+    for learner, shares in trial.known.items():
+        knowledge = ", ".join(f"{name} in {100.0 * share:.1f} %" for name, share in shares.items())
+        yield from _folded(f"{learner} knows when it can first act: {knowledge} of the worlds", 4)
     for what, harm in trial.harm.items():
         yield f"mean harm, {what}: {harm['first']:.2f} (first impacts), {harm['total']:.2f} (all impacts)"
     for spec, why in trial.refused.items():
@@ -148,8 +148,8 @@ def _folded(text: str, most: int, width: int = 80) -> list[str]:
     return textwrap.wrap(text, width, max_lines=most, placeholder=" ...", break_on_hyphens=False)
 
 
-def _share(part: int, whole: int, things: str = "worlds") -> str:
-    return f"{part:,} of {whole:,} {things} ({100.0 * part / whole:.1f} %)"
+def _share(part: int, total: int, things: str = "worlds") -> str:
+    return f"{part:,} of {total:,} {things} ({100.0 * part / total:.1f} %)"
 
 
 @scenario_group.command("explain", epilog=example("scenario explain paper-random"))
@@ -163,8 +163,10 @@ def scenario_explain(scenario: NameArgument, as_json: JsonOption = False) -> Non
 
     with Out(as_json=as_json) as out:
         chosen = load_scenario(scenario)
-        told = list(sentences(chosen))
-        out.result({"name": chosen.name, "sentences": told}, *(line for each in told for line in _folded(each, 6, 100)))
+        texts = list(sentences(chosen))
+        out.result(
+            {"name": chosen.name, "sentences": texts}, *(line for text in texts for line in _folded(text, 6, 100))
+        )
 
 
 @scenario_group.command("new", epilog=example("scenario new my-scenario --based-on paper-distance"))
@@ -200,18 +202,18 @@ def scenario_parts(as_json: JsonOption = False) -> None:
     from ethbrake_marl.episode.features import FEATURES, GROUPS, WHOLE_GROUPS
     from ethbrake_marl.episode.objectives import OBJECTIVES
     from ethbrake_marl.episode.terms import BUILT_IN, TERMS
-    from ethbrake_marl.evaluation.named_measures import MEASURES, USUAL
+    from ethbrake_marl.evaluation.named_measures import DEFAULT_MEASURES, MEASURES
     from ethbrake_marl.training.recipe import ALGORITHMS, usable_recipes
     from ethbrake_marl.worlds.channel import PRESETS
 
     features = FEATURES.usable().items()
-    own = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
+    feature_names = [name if entry.of == "own" else f"front_K.{name}, rear_K.{name}" for name, entry in features]
     parts = {
-        "Observation": [*WHOLE_GROUPS, "front_K", "rear_K", *GROUPS, *own],
+        "Observation": [*WHOLE_GROUPS, "front_K", "rear_K", *GROUPS, *feature_names],
         "V2X presets": [*PRESETS],
         "Objectives": [kind.form for kind in OBJECTIVES.usable().values()],
         "Terms": [*BUILT_IN, *TERMS],
-        "Measures": [name for name in MEASURES if name not in USUAL],
+        "Measures": [name for name in MEASURES if name not in DEFAULT_MEASURES],
         "Algorithms": [*ALGORITHMS],
         "Recipes": [*usable_recipes()],
     }
@@ -266,20 +268,22 @@ def scenario_sample(
     with Out(as_json=as_json, force=force) as out:
         out.check(output, ".csv", ".png", ".svg", ".pdf", what="worlds")
         chosen = read_settings(settings).change_scenario(scenario)
-        pictured = None if output is None or output.suffix.lower() == ".csv" else output
-        usual = TABLE_WORLDS if pictured is None else PICTURE_WORLDS
+        picture_file = None if output is None or output.suffix.lower() == ".csv" else output
+        usual = TABLE_WORLDS if picture_file is None else PICTURE_WORLDS
         n = usual if episodes is None else episodes
-        drawn = chosen.draw(n, seed)
-        found, fixed = quantities_of(drawn.worlds, drawn.friction), fixed_columns(chosen)
-        columns = {name: column.tolist() for name, column in found.items() if name not in fixed}
+        draw = chosen.draw(n, seed)
+        quantities, fixed = quantities_of(draw.worlds, draw.friction), fixed_columns(chosen)
+        columns = {name: column.tolist() for name, column in quantities.items() if name not in fixed}
         states = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         states = [{name: None if value != value else value for name, value in row.items()} for row in states]
         cells = (("" if value is None else repr(value) for value in row.values()) for row in states)
         lines = [",".join(columns), *map(",".join, cells)]
-        if pictured is not None:
-            page_of("worlds", f"--output {pictured.name}")(pictured, chosen, n, seed=seed, force=out.force)
-            out.note(f"picture: {pictured}")
+        if picture_file is not None:
+            page_function("worlds", f"--output {picture_file.name}")(
+                picture_file, chosen, n, seed=seed, force=out.force
+            )
+            out.note(f"picture: {picture_file}")
         elif output is not None:
             out.write(output, "\n".join([*lines, ""]), what="worlds")
         if output is None or out.as_json:
-            out.result(states, *lines, kept=output is not None)
+            out.result(states, *lines, in_file=output is not None)

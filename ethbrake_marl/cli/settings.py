@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 NO_SETTING = {"name", "title", "description", "source"}  # words, which cannot be set
 
 
-class Settings(NamedTuple):
+class CommandSettings(NamedTuple):
     texts: tuple[str, ...]  # as written
     scenario: list[Override]
     recipe: list[Override]
@@ -37,53 +37,53 @@ class Settings(NamedTuple):
 
 def read_settings(
     texts: Sequence[str] | None, recipe_keys: Sequence[str] = (), of_command: Sequence[str] = ()
-) -> Settings:
+) -> CommandSettings:
     """Sort the settings ``KEY=VALUE`` of a command by what they change: scenario, recipe or the command itself.
 
     ``recipe_keys`` and ``of_command`` are the keys of the recipe and of the command. A key that scenario and recipe
     share is written ``scenario.KEY`` or ``recipe.KEY``. Raises ``UnknownName`` for an unknown key, and ``InvalidInput``
     for an ambiguous key or a bad value.
     """
-    known = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
-    known["command"] = {*of_command}
-    known["command"] |= {"rules"} if recipe_keys or "harm_count" in of_command else set()
-    found: dict[str, list[Override]] = {owner: [] for owner in known}
-    given = Override.parse(texts or ())
-    for override in given:
-        if override.key == "rules" and "rules" in known["command"]:
+    valid_keys = {"scenario": {*Scenario.model_fields} - NO_SETTING, "recipe": {*recipe_keys} - NO_SETTING}
+    valid_keys["command"] = {*of_command}
+    valid_keys["command"] |= {"rules"} if recipe_keys or "harm_count" in of_command else set()
+    by_owner: dict[str, list[Override]] = {owner: [] for owner in valid_keys}
+    overrides = Override.parse(texts or ())
+    for override in overrides:
+        if override.key == "rules" and "rules" in valid_keys["command"]:
             owner = "recipe" if recipe_keys else "command"
-            found[owner].append(_counted(override, given, owner))
+            by_owner[owner].append(_expand_rules(override, overrides, owner))
             continue
         named = override.top in ("scenario", "recipe") and len(override.path) > 1
         if named and override.top == "recipe" and not recipe_keys:
             raise InvalidInput(f"--set {override.key}: this command uses no recipe; remove this setting")
-        whose, inside = ([override.top], override.inside()) if named else ([*known], override)
-        owners = [owner for owner in whose if inside.top in known[owner]]
+        candidates, inside = ([override.top], override.inside()) if named else ([*valid_keys], override)
+        owners = [owner for owner in candidates if inside.top in valid_keys[owner]]
         if not owners:
-            raise unknown_name("setting", inside.top, {key for owner in whose for key in known[owner]})
+            raise unknown_name("setting", inside.top, {key for owner in candidates for key in valid_keys[owner]})
         if len(owners) > 1:
             raise InvalidInput(
                 f"--set {override.key}: both scenario and recipe have this key; write scenario.{override.key} or"
                 f" recipe.{override.key}"
             )
-        found[owners[0]].append(inside)
-    command = {each.top: each.value for each in found["command"]}
-    return Settings(tuple(texts or ()), found["scenario"], found["recipe"], command)
+        by_owner[owners[0]].append(inside)
+    command = {setting.top: setting.value for setting in by_owner["command"]}
+    return CommandSettings(tuple(texts or ()), by_owner["scenario"], by_owner["recipe"], command)
 
 
-def _counted(rules: Override, given: Sequence[Override], owner: str) -> Override:
+def _expand_rules(rules: Override, overrides: Sequence[Override], owner: str) -> Override:
     """Setting for which ``rules=NAME`` is short: ``reward.harm_count`` of a recipe, else ``harm_count``.
 
     ``owner`` is ``recipe`` or another owner of settings. Raises ``InvalidInput`` for an unknown NAME, and if one of the
-    settings ``given`` sets the same.
+    settings ``overrides`` sets the same.
     """
     name, path = rules.value, ("reward", "harm_count") if owner == "recipe" else ("harm_count",)
     if not isinstance(name, str) or name not in SHORT_NAMES:
         raise InvalidInput(f"--set rules={flow_text(name, 60)}: must be {' or '.join(SHORT_NAMES)}")
-    for other in given:
-        inside = other.path[1:] if owner == other.top == "recipe" else other.path
+    for override in overrides:
+        inside = override.path[1:] if owner == override.top == "recipe" else override.path
         if inside and inside == path[: len(inside)]:
             raise InvalidInput(
-                f"--set rules: sets {'.'.join(path)}, which --set {other.key} sets, too; leave one of them out"
+                f"--set rules: sets {'.'.join(path)}, which --set {override.key} sets, too; leave one of them out"
             )
     return Override(rules.text, path, SHORT_NAMES[name])

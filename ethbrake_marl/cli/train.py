@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ethbrake_marl.training.recipe import TrainingRecipe
     from ethbrake_marl.training.train import TrainResult
 
-REMAINS = (
+AFTER_STOPPED_TRAINING = (
     "if the training had begun, the last good policy is in the run's folder; ethbrake train --resume FOLDER continues"
     " an unfinished training"
 )
@@ -75,7 +75,7 @@ def train_command(
     and saves the policy. `ethbrake train --resume FOLDER` continues the training; the final policy is then the same,
     bit for bit, as without the interruption.
     """
-    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
+    with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_TRAINING) as out:
         # torch takes seconds to load
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.training.recipe import load_recipe
@@ -83,11 +83,11 @@ def train_command(
         from ethbrake_marl.training.training import Training
 
         if resume is not None:
-            asked = {
+            options = {
                 "--scenario": scenario, "--recipe": recipe, "--set": settings, "--steps": steps, "--seed": seed,
                 "--device": device, "--output": output, "--force": force or None,
             }  # fmt: skip
-            for option in (name for name, value in asked.items() if value is not None):
+            for option in (name for name, value in options.items() if value is not None):
                 raise InvalidInput(
                     f"{option}: cannot be combined with --resume, which uses the settings in the run's folder; leave"
                     " one of the two options out"
@@ -99,7 +99,7 @@ def train_command(
         plan = load_recipe(recipe or "ppo")
         changes = read_settings(settings, [*type(plan).model_fields])
         chosen = changes.change_scenario(scenario or "paper-random")
-        plan = changed(plan, changes.recipe, out)
+        plan = change_recipe(plan, changes.recipe, out)
         begun = [Training.of(plan, chosen).who_drives()]
 
         def tell(progress: Progress) -> None:
@@ -120,7 +120,7 @@ def run_folder(scenario: str, recipe: str, scheme: str | None, seed: int) -> Pat
     return Path("runs") / f"{scenario}-{plan}-seed{seed}"
 
 
-def changed(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
+def change_recipe(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
     """Recipe with the command line's settings.
 
     Print a note if they make the discount ``gamma`` and the discount of reward shaping differ.
@@ -131,12 +131,12 @@ def changed(plan: TrainingRecipe, overrides: Any, out: Out) -> TrainingRecipe:
         return plan
     new = plan.replace(**Override.put(plan.model_dump(mode="json"), overrides))
     together = {"gamma": new.gamma, "reward.shaping_discount": new.reward.shaping_discount}
-    set_here = [key for key in together if key in {each.key for each in overrides}]
+    set_here = [key for key in together if key in {override.key for override in overrides}]
     if len(set_here) == 1 and len({*together.values()}) > 1:
-        (key,), (other,) = set_here, together.keys() - set(set_here)
+        (key,), (second,) = set_here, together.keys() - set(set_here)
         out.note(
-            f"note: {key} = {together[key]:g} differs from {other} = {together[other]:g}. Reward shaping then changes"
-            f" which policy is best; make both equal (--set {other}={together[key]:g})"
+            f"note: {key} = {together[key]:g} differs from {second} = {together[second]:g}. Reward shaping then changes"
+            f" which policy is best; make both equal (--set {second}={together[key]:g})"
         )
     return new
 
@@ -152,7 +152,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
     from ethbrake_marl.files.plain import read_object
     from ethbrake_marl.names import open_game
-    from ethbrake_marl.training.fixed_list import OBJECTIVE, metrics_of
+    from ethbrake_marl.training.fixed_list import OBJECTIVE_METRIC, metrics_of
 
     training, plan = result.training, result.training.recipe
     loaded, game = open_game(training.scenario)
@@ -168,19 +168,21 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
         columns.append(Column(IN_WORDS[count].capitalize(), COLUMN[count]))
     measured = {"full_brake": metrics_of(training, drive(game, worlds, brake))}
     measured[result.agent] = dict(result.metrics or {})
-    if OBJECTIVE in measured["full_brake"]:
-        columns.append(Column("Objective", OBJECTIVE))
-    rows = [(agent, *(metrics.get(each.name) for each in columns[1:])) for agent, metrics in measured.items()]
+    if OBJECTIVE_METRIC in measured["full_brake"]:
+        columns.append(Column("Objective", OBJECTIVE_METRIC))
+    rows = [(agent, *(metrics.get(column.name) for column in columns[1:])) for agent, metrics in measured.items()]
     note = (
         f"Means per world; harm in m²/s². The means are over the {plan.evaluation.worlds:,} worlds of seed"
         f" {plan.evaluation.seed} with which the training selected its policy."
     )
     table = Sheet("", columns, rows, note)
     settings = read_object(result.directory / "config.json").get("settings", ())
-    own = [each for each in settings if read_settings([each], [*type(plan).model_fields]).scenario]
-    own += {"first": [], "honest": ["rules=honest"]}.get(count, [f"harm_count={count}"])
+    options = [setting for setting in settings if read_settings([setting], [*type(plan).model_fields]).scenario]
+    options += {"first": [], "honest": ["rules=honest"]}.get(count, [f"harm_count={count}"])
     words = ["--scenario", scenario or loaded.name, "--agents", f"full_brake,{result.agent}"]
-    command = shlex.join(["ethbrake", "evaluate", *words, *(word for each in own for word in ("--set", each))])
+    command = shlex.join(
+        ["ethbrake", "evaluate", *words, *(word for setting in options for word in ("--set", setting))]
+    )
     out.result(
         {
             "directory": str(result.directory),
@@ -195,7 +197,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
         },
         table,
         f"\nThe agent is {result.agent}. Evaluate it on other worlds:\n  {command}",
-        kept=True,
+        in_file=True,
     )
     tell_end(out, result.status, result.steps, result.directory)
 
@@ -203,6 +205,6 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
 def tell_end(out: Out, status: str, steps: int, directory: Path) -> None:
     """Print how the training ended, and the run's folder. Exit with status 130 if it was interrupted."""
     if status == "interrupted":
-        left = f"the policy so far is saved; continue with: ethbrake train --resume {shlex.quote(str(directory))}"
-        out.interrupted(f"interrupted after {steps:,} training steps; {left}")
+        hint = f"the policy so far is saved; continue with: ethbrake train --resume {shlex.quote(str(directory))}"
+        out.interrupted(f"interrupted after {steps:,} training steps; {hint}")
     out.note(f"{status} after {steps:,} training steps: {directory}")

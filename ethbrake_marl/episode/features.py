@@ -59,14 +59,14 @@ ROLE = (
     Feature("vehicles_ahead", "1", 1.0, 0.0, 2.0, "number of vehicles ahead in the line; 2 means 2 or more"),
     Feature("vehicles_behind", "1", 1.0, 0.0, 2.0, "number of vehicles behind in the line; 2 means 2 or more"),
 )
-OBSTACLE = (
+OBSTACLE_FEATURES = (
     Feature("known", "1", 1.0, 0.0, 1.0, "1 if there is an obstacle ahead of the line and this vehicle knows of it"),
     Feature("gap", "m", 10.0, 0.0, 10.0, "sum of the gaps from this vehicle to the obstacle"),
     Feature("hit", "1", 1.0, 0.0, 1.0, "1 once Vehicle 1 has had an impact with the obstacle"),
     Feature("stopping_margin", "m", 10.0, -15.0, 20.0, "distance to the obstacle at rest after full braking"),
     Feature("fitting_deceleration", "m/s2", 10.0, 0.0, 2.0, "own deceleration that stops exactly at the obstacle"),
 )
-WHOLE_GROUPS = {"own": OWN, "role": ROLE, "obstacle": OBSTACLE}  # and the neighbours front_K, rear_K
+WHOLE_GROUPS = {"own": OWN, "role": ROLE, "obstacle": OBSTACLE_FEATURES}  # and the neighbours front_K, rear_K
 LISTS = {  # a name for several features of different groups
     "paper": (
         *("own.speed", "own.acceleration", "front_1.gap", "front_1.closing_speed", "front_1.acceleration"),
@@ -136,7 +136,7 @@ def register_feature(
     ``InvalidInput`` for a bad argument.
 
     Args:
-        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. A list names a feature of a neighbour as ``front_1.NAME``.
+        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. A list names a neighbour's as ``front_1.NAME``.
         function: ``function(state, body)``, or ``function(state, body, other)`` for a neighbour, returns the value in
             every world, [n], in ``unit``. ``body`` 1 is the front vehicle.
         unit: unit of the value.

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ethbrake_marl.episode.features import NEIGHBOUR, OBSTACLE, OWN, Feature
+from ethbrake_marl.episode.features import NEIGHBOUR, OBSTACLE_FEATURES, OWN, Feature
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.motion.layout import GAP, HIT, LATENCY, OWN_LATENCY
 
 OF_PAIR = {feature.name: feature for feature in NEIGHBOUR if feature.name in ("gap", "hit")}
-OF_OBSTACLE = {feature.name: feature for feature in OBSTACLE if feature.name in ("gap", "hit")}
+OF_OBSTACLE = {feature.name: feature for feature in OBSTACLE_FEATURES if feature.name in ("gap", "hit")}
 OWN_VIEW = View(["own"])
 
 

@@ -44,7 +44,7 @@ def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *sha
     return value
 
 
-def check_finite(what: str, value: Floats, times_s: Floats) -> None:
+def check_finite_values(what: str, value: Floats, times_s: Floats) -> None:
     """Raise ``InvalidInput`` unless all of ``value``, [n] or [n, N], are finite.
 
     The message names ``what`` and the first bad row, with its time from ``times_s`` [n].

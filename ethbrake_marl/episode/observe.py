@@ -13,7 +13,7 @@ from ethbrake_marl.episode.features import (
     FEATURES,
     GROUPS,
     NEIGHBOUR,
-    OBSTACLE,
+    OBSTACLE_FEATURES,
     OWN,
     ROLE,
     Feature,
@@ -24,7 +24,7 @@ from ethbrake_marl.episode.features import (
     listed_features,
     side_of,
 )
-from ethbrake_marl.episode.functions import called, check_finite
+from ethbrake_marl.episode.functions import called, check_finite_values
 from ethbrake_marl.episode.state import TIME, State
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
@@ -53,11 +53,11 @@ OWN_SPEED, OWN_ACCELERATION, OWN_BRAKING, OWN_DRIVING, OWN_MASS, OWN_LATENCY_LEF
 ROLE_AHEAD, ROLE_BEHIND = range(len(ROLE))
 (
     OBSTACLE_KNOWN, OBSTACLE_GAP, OBSTACLE_HIT, OBSTACLE_STOPPING_MARGIN, OBSTACLE_FITTING_DECELERATION,
-) = range(len(OBSTACLE))  # fmt: skip
-N_OWN, N_NEIGHBOUR, N_ROLE, N_OBSTACLE = len(OWN), len(NEIGHBOUR), len(ROLE), len(OBSTACLE)
+) = range(len(OBSTACLE_FEATURES))  # fmt: skip
+N_OWN, N_NEIGHBOUR, N_ROLE, N_OBSTACLE = len(OWN), len(NEIGHBOUR), len(ROLE), len(OBSTACLE_FEATURES)
 
 
-class Plan(NamedTuple):
+class ObservationPlan(NamedTuple):
     offsets: Ints  # of the observed neighbours: -1 is the next vehicle ahead
     role: bool
     obstacle: bool
@@ -114,7 +114,7 @@ class View:
         return seen
 
     @cached_property
-    def plan(self) -> Plan:
+    def plan(self) -> ObservationPlan:
         listed = list(dict.fromkeys(name.partition(".")[0] for name in self.names if "." in name))
         offsets = [offset for name in listed if (offset := side_of(name)) is not None]
         inside = ["own", *(name for name in listed if side_of(name) is not None)]
@@ -133,7 +133,7 @@ class View:
             if self.names[column] not in place and side not in GROUPS
         ]
         places = [] if list(self.names) == known else [place.get(name, -1) for name in self.names]
-        return Plan(
+        return ObservationPlan(
             np.array(offsets, np.int64), "role" in listed, "obstacle" in listed, np.array(places, np.int64),
             tuple(groups), tuple(own), scaling_of(self.features),
         )  # fmt: skip
@@ -177,7 +177,7 @@ def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[n
             lost = np.isnan(value)  # a layer shows what a vehicle does not know as NaN
             known = known & ~(lost & has_unknown(state, body + offset)) if lost.any() else known
             value = np.where(known, value, own.unknown)
-    check_finite(what, value, state.time_s)
+    check_finite_values(what, value, state.time_s)
     return scaled(value, scaling_of([own.feature])[:, 0])
 
 

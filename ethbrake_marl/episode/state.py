@@ -70,7 +70,7 @@ class State(NamedTuple):
 
     def put(self, rows: Any, new: State, *, donate: bool = False) -> State:
         """The state with the episodes ``new`` in ``rows``. ``donate``: its arrays may be overwritten."""
-        state: State = put(self, rows, new, donate)
+        state: State = put_rows(self, rows, new, donate)
         return state
 
     @staticmethod
@@ -256,7 +256,7 @@ def take(memory: Any, rows: Any) -> Any:
     return mapped(lambda array: array.take(places, axis=0), memory)  # more than twice as fast as array[rows]
 
 
-def put(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
+def put_rows(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
     """A memory (``mapped``) with ``new`` in ``rows``: a copy, or with ``donate`` the same writable arrays."""
 
     def written(old: Any, part: Any) -> Any:

@@ -10,7 +10,7 @@ risk          minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + si
               d and ``TTC = max(d - d_safe, 0) / closing speed``; the first summand is 0 for a pair that does not close
 jerk          minus the squared rate of change of the vehicle's force
 terminal      1 at the end of an episode without any impact
-push          minus the closing speed that contacts of the line take up (``motion.push``)
+push          minus the closing speed that contacts of the line take up (``motion.add_push``)
 drove         minus the speed that the vehicle's engine alone gives (``motion.forces.driving``)
 still_moving  -1 for an end at the horizon with a vehicle in motion
 shaping       for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import ROWS, pair_amounts
-from ethbrake_marl.episode.functions import called, check_finite, described
+from ethbrake_marl.episode.functions import called, check_finite_values, described
 from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.state import END, State, check_exact
@@ -61,7 +61,7 @@ class Term(NamedTuple):
         value = called(what, self.function, given, (after.n,), (after.n, after.vehicles))
         running = ~before.ended
         value = np.where(running if value.ndim == 1 else running[:, np.newaxis], value, 0.0)
-        check_finite(what, value, after.time_s)
+        check_finite_values(what, value, after.time_s)
         return value
 
 
@@ -136,7 +136,7 @@ def risk(params: Any, before: State, step: Step, after: State) -> Floats:
 def push(before: State, step: Step, after: State) -> Floats:
     """Term push, [n]: minus the push (m/s) of all contacts in the step.
 
-    It includes the contact with the obstacle. Formula: ``motion.push``.
+    It includes the contact with the obstacle. Formula: ``motion.add_push``.
     """
     check_exact(before, "the term push")
     return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)

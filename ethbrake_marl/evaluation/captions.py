@@ -29,8 +29,8 @@ def ranges_of(worlds: Mapping[str, Any]) -> dict[str, Any]:
     ranges: dict[str, Any] = {}
     for key, rule in QUANTITIES.items():
         names = [name for i in range(len(worlds)) if (name := rule.column_of(i)) in worlds] if rule.column else []
-        here = [worlds[name] for name in dict.fromkeys(names) if not np.isnan(worlds[name]).all()]
-        ends = [[float(np.nanmin(each)), float(np.nanmax(each))] for each in here]
+        columns = [worlds[name] for name in dict.fromkeys(names) if not np.isnan(worlds[name]).all()]
+        ends = [[float(np.nanmin(column)), float(np.nanmax(column))] for column in columns]
         plain = [low if low == high else [low, high] for low, high in ends]
         if plain:
             ranges[key] = plain[0] if rule.per == "world" else plain

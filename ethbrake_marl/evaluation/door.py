@@ -8,18 +8,18 @@ from typing import Any
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, check_whole_number
-from ethbrake_marl.evaluation.evaluate import Result, evaluate as evaluate_teams
+from ethbrake_marl.evaluation.evaluate import Result, evaluate_teams as evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.named_measures import measures_called
-from ethbrake_marl.names import check_learners, open_game, teams_of
+from ethbrake_marl.names import open_game, require_learner, teams_of
 from ethbrake_marl.worlds.game import AnyScenario
-from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.sampling import DrawnWorlds
 
 EPISODES, SEED = 10_000, 7  # the evaluation list
 
 
 def evaluate(
-    worlds: AnyScenario | Drawn | State | None = None,
+    worlds: AnyScenario | DrawnWorlds | State | None = None,
     agents: Any = "full_brake,e_v2x_bm",
     *,
     scenario: AnyScenario | None = None,
@@ -57,27 +57,27 @@ def evaluate(
     array([33.79, 77.19,  0.  ])
 
     """
-    given = None
-    if isinstance(worlds, Drawn | State):
-        given = worlds
+    test_worlds = None
+    if isinstance(worlds, DrawnWorlds | State):
+        test_worlds = worlds
     elif worlds is not None:
         if scenario is not None:
             raise InvalidInput("evaluate: scenario: is given twice; leave one of the two out")
         scenario = worlds
     if scenario is None:
-        if given is not None:
+        if test_worlds is not None:
             raise InvalidInput("evaluate: worlds need their scenario, for instance scenario='paper-random'")
         scenario = "paper-random"
-    if given is not None and (episodes, seed) != (None, None):
+    if test_worlds is not None and (episodes, seed) != (None, None):
         raise InvalidInput("evaluate: episodes and seed choose worlds of a list; leave them out if worlds are given")
     episodes, seed = EPISODES if episodes is None else episodes, SEED if seed is None else seed
     check_count("evaluate: harm_count", harm_count)
     loaded, game = open_game(scenario)
-    check_learners(loaded)
-    about = about_scenario(loaded, None if given is not None else seed)
-    if given is None:
+    require_learner(loaded)
+    about = about_scenario(loaded, None if test_worlds is not None else seed)
+    if test_worlds is None:
         check_whole_number("episodes", episodes, 1)
-        given = loaded.draw(int(episodes), seed)
+        test_worlds = loaded.draw(int(episodes), seed)
     teams = teams_of(agents, loaded, harm_count=harm_count)
     about["agent_settings"] = {"harm_count": harm_count}
-    return evaluate_teams(given, teams, game, measures_called(measures or ()), jobs, about=about, on_done=on_done)
+    return evaluate_teams(test_worlds, teams, game, measures_called(measures or ()), jobs, about=about, on_done=on_done)

@@ -16,15 +16,15 @@ from ethbrake_marl.agents.drive import CHUNK, KNOWLEDGE, MODEL, UNSTATED, Team, 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
-from ethbrake_marl.evaluation.identity import policies_of, versions, worlds_sha256
-from ethbrake_marl.evaluation.measures import DEFAULT, Measure, Values, Watch, flat, naming
+from ethbrake_marl.evaluation.identity import policy_digests, versions, worlds_sha256
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, MeasureValues, Watch, measure_columns, naming
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import LATENCY, OWN_LATENCY, Bools
 from ethbrake_marl.parallel import run_each
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
-from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.sampling import DrawnWorlds
 
-Columns = dict[str, Values]
+Columns = dict[str, MeasureValues]
 
 
 @dataclass(frozen=True)
@@ -63,8 +63,10 @@ class Result:
         return f"Result({self.about['scenario']!r}, {count_of(self.n, 'world')}: {', '.join(self.columns):.200})"
 
     def measure_of(self, column: str) -> Measure:
-        mine = [each for each in self.measures if column == each.name or column.startswith(f"{each.name}_")]
-        return max(mine, key=lambda measure: len(measure.name))
+        candidates = [
+            measure for measure in self.measures if column == measure.name or column.startswith(f"{measure.name}_")
+        ]
+        return max(candidates, key=lambda measure: len(measure.name))
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.columns)
@@ -74,8 +76,11 @@ class Result:
 
     def take(self, rows: Any) -> Result:
         """Result restricted to some worlds: row numbers, or a mask [n]. Raises ``InvalidInput`` for none."""
-        columns = {team: {name: each[rows] for name, each in own.items()} for team, own in self.columns.items()}
-        worlds = {name: each[rows] for name, each in self.worlds.items()}
+        columns = {
+            team: {name: values[rows] for name, values in team_columns.items()}
+            for team, team_columns in self.columns.items()
+        }
+        worlds = {name: values[rows] for name, values in self.worlds.items()}
         if not len(worlds["world"]):
             raise InvalidInput("take: there is no world among these rows; choose at least one")
         about = {key: value for key, value in self.about.items() if key != "worlds_sha256"}
@@ -84,13 +89,13 @@ class Result:
 
     def arrays(self) -> Columns:
         """Table with one row per team and world: column name -> values. Missing numbers are NaN."""
-        names = list(dict.fromkeys(name for own in self.columns.values() for name in own))
+        names = list(dict.fromkeys(name for team_columns in self.columns.values() for name in team_columns))
         table: Columns = {"agent": np.repeat([*self.columns], self.n)}
-        table |= {name: np.tile(each, len(self.columns)) for name, each in self.worlds.items()}
+        table |= {name: np.tile(values, len(self.columns)) for name, values in self.worlds.items()}
         for name in names:
-            kinds = [own[name].dtype.kind for own in self.columns.values() if name in own]
+            kinds = [team_columns[name].dtype.kind for team_columns in self.columns.values() if name in team_columns]
             missing = np.full(self.n, "" if "U" in kinds else np.nan)
-            table[name] = np.concatenate([own.get(name, missing) for own in self.columns.values()])
+            table[name] = np.concatenate([team_columns.get(name, missing) for team_columns in self.columns.values()])
         return table | {"knows": np.repeat([self.knows[team] for team in self.columns], self.n)}
 
     def to_pandas(self) -> Any:
@@ -101,8 +106,8 @@ class Result:
         return DataFrame(self.arrays())
 
 
-def evaluate(
-    worlds: Drawn | State,
+def evaluate_teams(
+    worlds: DrawnWorlds | State,
     agents: Mapping[str, Team],
     game: Game,
     measures: Iterable[Measure] = (),
@@ -128,20 +133,20 @@ def evaluate(
     """
     if jobs is not None:
         check_whole_number("jobs", jobs, 1)
-    drawn = worlds if isinstance(worlds, Drawn) else Drawn.given(worlds)
-    _check(drawn.worlds, agents, game)
+    draw = worlds if isinstance(worlds, DrawnWorlds) else DrawnWorlds.given(worlds)
+    _check(draw.worlds, agents, game)
     chosen = (*DEFAULT, *measures)
-    alert, n, of_worlds = drawn.worlds, drawn.worlds.n, columns_of(drawn)
+    alert, n, of_worlds = draw.worlds, draw.worlds.n, columns_of(draw)
     for measure in chosen:
         if measure.name in of_worlds:
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")
-    shown: dict[str, Measure] = {}
+    owners: dict[str, Measure] = {}
     for measure in chosen:
         for statistic in measure.shown:
-            other = shown.setdefault(statistic.key, measure)
-            if other != measure:
+            owner = owners.setdefault(statistic.key, measure)
+            if owner != measure:
                 raise InvalidInput(
-                    f"measures {other.name!r} and {measure.name!r}: both have the statistic {statistic.key!r}; give one"
+                    f"measures {owner.name!r} and {measure.name!r}: both have the statistic {statistic.key!r}; give one"
                     " of them another key"
                 )
     calls: Any = (
@@ -158,11 +163,11 @@ def evaluate(
     if (columns["world"] < 0).all():  # the user has made these worlds
         columns["world"] = np.arange(n)
     return Result(
-        {team: _joined([part[team] for part in parts]) for team in agents},
+        {team: _join_columns([part[team] for part in parts]) for team in agents},
         {**columns, "hidden": hidden_from(alert, game)},
         chosen,
         {name: known_by(team) for name, team in agents.items()},
-        {name: policies_of(team.drivers) for name, team in agents.items()},
+        {name: policy_digests(team.drivers) for name, team in agents.items()},
         {
             "scenario": game.name,
             "seed": None,
@@ -170,7 +175,7 @@ def evaluate(
             "controlled_vehicles": [f"vehicle_{body}" for body in learners],
             "time_step_s": game.settings.time_step_s,
             "horizon_s": game.settings.horizon_s,
-            "rejected_draws": drawn.rejected,
+            "rejected_draws": draw.rejected,
             **(about or {}),
             "worlds_sha256": worlds_sha256(alert),
             "physics_digest": physics_digest(),
@@ -182,15 +187,15 @@ def evaluate(
 def drive_chunk(
     alert: State, agents: Mapping[str, Team], game: Game, measures: Sequence[Measure]
 ) -> dict[str, Columns]:
-    return {name: _driven(alert, name, team, game, measures) for name, team in agents.items()}
+    return {name: _drive_team(alert, name, team, game, measures) for name, team in agents.items()}
 
 
-def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Columns:
-    whole, start = team.game(game), alert.read_only()
+def _drive_team(alert: State, name: str, team: Team, game: Game, measures: Sequence[Measure]) -> Columns:
+    full_game, start = team.game(game), alert.read_only()
     watches: list[tuple[Measure, Watch]] = []
     for measure in measures:
         with naming(measure):
-            watch = None if measure.watch is None else measure.watch(whole, start)
+            watch = None if measure.watch is None else measure.watch(full_game, start)
         if watch is not None:
             watches.append((measure, watch))
     before = alert
@@ -205,14 +210,14 @@ def _driven(alert: State, name: str, team: Team, game: Game, measures: Sequence[
     for measure in measures:
         with naming(measure):
             if measure.of is not None:
-                given = measure.of(whole, start, last)
+                value = measure.of(full_game, start, last)
             else:
-                given = watched[measure.name].result(last) if measure.name in watched else None
-        columns |= flat(measure, given, last)
+                value = watched[measure.name].result(last) if measure.name in watched else None
+        columns |= measure_columns(measure, value, last)
     return columns
 
 
-def _joined(parts: Sequence[Columns]) -> Columns:
+def _join_columns(parts: Sequence[Columns]) -> Columns:
     """Join the columns of all chunks. A column that a chunk lacks is left out."""
     return {
         name: np.concatenate([part[name] for part in parts]) for name in parts[0] if all(name in part for part in parts)
@@ -233,12 +238,12 @@ def hidden_from(alert: State, game: Game) -> Bools:
 
 def known_by(team: Team) -> str:
     """What a team needs to know, as one text such as ``messages + true model``."""
-    return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _known(team).values())
+    return " + ".join(word for word in (*KNOWLEDGE, UNSTATED) if word in _knowledge_of(team).values())
 
 
-def _known(team: Team) -> dict[str, str]:
-    each = {f"vehicle_{body}": getattr(agent, "knows", UNSTATED) for body, agent in team.drivers.items()}
-    return each if team.shield is None else {**each, "shield": getattr(team.shield, "knows", MODEL)}
+def _knowledge_of(team: Team) -> dict[str, str]:
+    knowledge = {f"vehicle_{body}": getattr(agent, "knows", UNSTATED) for body, agent in team.drivers.items()}
+    return knowledge if team.shield is None else {**knowledge, "shield": getattr(team.shield, "knows", MODEL)}
 
 
 def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:
@@ -255,5 +260,5 @@ def _check(alert: State, agents: Mapping[str, Team], game: Game) -> None:
         )
     for team in agents.values():
         team.game(game)
-        for who, knows in _known(team).items():
+        for who, knows in _knowledge_of(team).items():
             check_knows(knows, f"team {team.name!r}: {who}")

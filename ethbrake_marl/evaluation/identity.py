@@ -16,8 +16,8 @@ from ethbrake_marl.files.python_file import files_run
 from ethbrake_marl.motion.layout import PUSHED
 from ethbrake_marl.registry import versions_used
 
-PACKAGES = ("ethbrake-marl", "numba", "numpy")
-WORDS = ("name", "title", "description", "source")  # keys of a scenario that do not affect an episode
+EVALUATION_PACKAGES = ("ethbrake-marl", "numba", "numpy")
+KEYS_WITHOUT_EFFECT = ("name", "title", "description", "source")  # keys of a scenario that do not affect an episode
 
 
 def worlds_sha256(worlds: State) -> str:
@@ -31,7 +31,7 @@ def worlds_sha256(worlds: State) -> str:
 
 def about_scenario(scenario: Any, seed: int | None = None) -> dict[str, Any]:
     """Entries about a scenario, and the seed of its worlds, for ``evaluate(about=...)``."""
-    content = json.dumps(scenario.content(without=WORDS), sort_keys=True, separators=(",", ":"))
+    content = json.dumps(scenario.content(without=KEYS_WITHOUT_EFFECT), sort_keys=True, separators=(",", ":"))
     scripts = {name: role for name, role in scenario.roles.items() if role != "learner"}
     about = {"seed": seed, "scripts": scripts, "scenario_sha256": hashlib.sha256(content.encode()).hexdigest()}
     return about if scenario.physics is None else {**about, "physics": scenario.physics}
@@ -42,11 +42,11 @@ def versions() -> dict[str, str]:
 
     It also has the SHA-256 of each Python file of the user that this process ran.
     """
-    own = {"python": platform.python_version()} | {name: version(name) for name in PACKAGES}
-    return own | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
+    core_versions = {"python": platform.python_version()} | {name: version(name) for name in EVALUATION_PACKAGES}
+    return core_versions | versions_used() | {name: f"SHA-256 {sha256}" for name, sha256 in files_run().items()}
 
 
-def policies_of(drivers: Mapping[int, object]) -> dict[str, str]:
+def policy_digests(drivers: Mapping[int, object]) -> dict[str, str]:
     """Vehicle -> SHA-256 of its policy's manifest, for policies of this package; ``drivers``: body -> agent."""
     manifests = {body: getattr(getattr(agent, "policy", None), "manifest", None) for body, agent in drivers.items()}
-    return {f"vehicle_{body}": each.manifest_sha256 for body, each in manifests.items() if each is not None}
+    return {f"vehicle_{body}": manifest.manifest_sha256 for body, manifest in manifests.items() if manifest is not None}

@@ -45,8 +45,8 @@ from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.motion.layout import FIRST, IMPACTS
 
-Values = NDArray[Any]
-Given = Values | Mapping[str, Values] | None
+MeasureValues = NDArray[Any]
+Given = MeasureValues | Mapping[str, MeasureValues] | None
 
 AT_REST, HORIZON = "at_rest", "horizon"  # how an episode ended
 
@@ -84,18 +84,20 @@ class Measure(NamedTuple):
     watch: Callable[[Game, State], Watch | None] | None = None  # begins with (game, alert)
 
 
-def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
-    """Columns of a measure, name -> [n], from its value ``given``.
+def measure_columns(measure: Measure, measurement: Given, last: State) -> dict[str, MeasureValues]:
+    """Columns of a measure, name -> [n], from its value ``measurement``.
 
     Raises ``InvalidInput`` for a wrong shape or type.
     """
-    if given is None:
+    if measurement is None:
         return {}
-    parts: Mapping[str, Any] = given if isinstance(given, Mapping) else {"": given}
-    columns: dict[str, Values] = {}
+    parts: Mapping[str, Any] = measurement if isinstance(measurement, Mapping) else {"": measurement}
+    columns: dict[str, MeasureValues] = {}
     for ending, value in parts.items():
         name, values = "_".join(filter(None, (measure.name, ending))), np.asarray(value)
-        each = {f"{name}_{i + 1}": column for i, column in enumerate(values.T)} if values.ndim == 2 else {name: values}
+        named_columns = (
+            {f"{name}_{i + 1}": column for i, column in enumerate(values.T)} if values.ndim == 2 else {name: values}
+        )
         right = (last.n,), (last.n, last.vehicles)
         if values.shape not in right or values.dtype.kind not in "fiubU":
             raise InvalidInput(
@@ -105,7 +107,7 @@ def flat(measure: Measure, given: Given, last: State) -> dict[str, Values]:
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             row = np.argwhere(~np.isfinite(values))[0]
             raise InvalidInput(f"measure {name!r}: its value is {values[tuple(row)]} in row {row[0]}; must be finite")
-        columns |= each
+        columns |= named_columns
     return columns
 
 
@@ -165,8 +167,8 @@ def replaced(game: Game, alert: State, last: State) -> Given:
     return None
 
 
-def _built_in(of: Callable[[Game, State, State], Given], unit: str, *shown: Statistic) -> Measure:
-    return Measure(of.__name__, of, of.__doc__ or "", unit, shown)
+def _built_in(of: Callable[[Game, State, State], Given], unit: str, *statistics: Statistic) -> Measure:
+    return Measure(of.__name__, of, of.__doc__ or "", unit, statistics)
 
 
 DEFAULT = (

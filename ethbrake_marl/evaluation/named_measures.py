@@ -56,11 +56,11 @@ def register_measure(
     >>> eb.register_measure("rear_speed_mps", rear_speed, unit="m/s")
 
     """
-    measure = _checked(name, of, unit, shown, watch)
-    MEASURES.add(name, measure, lambda other: other == measure)
+    measure = _check_measure(name, of, unit, shown, watch)
+    MEASURES.add(name, measure, lambda registered: registered == measure)
 
 
-def _checked(
+def _check_measure(
     name: str,
     of: Callable[[Game, State, State], Given] | None = None,
     unit: str = "1",
@@ -79,12 +79,12 @@ def _checked(
             f"measure {name!r}: give one function, of(game, alert, last) or watch(game, alert), with a docstring that"
             " describes the measure"
         )
-    if name in (*USUAL, *TAKEN) or name in TERMS:
+    if name in (*DEFAULT_MEASURES, *TAKEN) or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
     return Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
 
 
-USUAL = tuple(measure.name for measure in DEFAULT)
+DEFAULT_MEASURES = tuple(measure.name for measure in DEFAULT)
 TAKEN = ("agent", "knows", "kind", "world", "scenario", "recording", "hidden", "exploits", "results_sha256")
 
 MEASURES: Registry[Measure] = Registry(
@@ -116,39 +116,43 @@ def measures_called(names: str | Iterable[str]) -> tuple[Measure, ...]:
         raise InvalidInput(f"measures = {names!r:.60}: must be names of measures, for instance 'pushed_mps,pushed_m'")
     called: list[tuple[str, Measure]] = []
     for name in dict.fromkeys(split_names(names) if isinstance(names, str) else names):
-        called += [(name, each) for each in _called(name) if each not in [measure for _, measure in called]]
+        called += [
+            (name, candidate)
+            for candidate in _measures_named(name)
+            if candidate not in [measure for _, measure in called]
+        ]
     count = Counter(measure.name for _, measure in called)
-    return tuple(_in_full(name, measure) if count[measure.name] > 1 else measure for name, measure in called)
+    return tuple(_qualify_measure(name, measure) if count[measure.name] > 1 else measure for name, measure in called)
 
 
-def _in_full(name: str, measure: Measure) -> Measure:
+def _qualify_measure(name: str, measure: Measure) -> Measure:
     file = name.removesuffix(f":{measure.name}")
     if file == name:
         return measure
-    shown = (
-        each._replace(
-            key=f"{file}:{each.key}",
-            heading=each.heading and f"{each.heading} ({file})",
-            short=each.short and f"{each.short}\n({file})",
+    statistics = (
+        statistic._replace(
+            key=f"{file}:{statistic.key}",
+            heading=statistic.heading and f"{statistic.heading} ({file})",
+            short=statistic.short and f"{statistic.short}\n({file})",
         )
-        for each in measure.shown
+        for statistic in measure.shown
     )
-    return measure._replace(name=name, shown=tuple(shown))
+    return measure._replace(name=name, shown=tuple(statistics))
 
 
-def _called(name: str) -> list[Measure]:
+def _measures_named(name: str) -> list[Measure]:
     if name in MEASURES and name in TERMS:
         raise AlreadyExists(f"measure {name!r}: a measure and a term of the reward have this name; rename one of them")
     if name in MEASURES:
-        return [MEASURES[each] for each in MEASURES.load(name)]
+        return [MEASURES[loaded_name] for loaded_name in MEASURES.load(name)]
     if name in _REWARDED:
-        return [_summed(name, _REWARDED[name], BUILT_IN[name][0])]
+        return [_sum_of_term(name, _REWARDED[name], BUILT_IN[name][0])]
     if name in TERMS:
         term = TERMS[name].value
-        return [_summed(name, _intervention if name == "intervention" else term, TERMS[name].unit)]
-    file, _, own = str(name).rpartition(":")
+        return [_sum_of_term(name, _intervention if name == "intervention" else term, TERMS[name].unit)]
+    file, _, measure_name = str(name).rpartition(":")
     if file.endswith(".py"):
-        return [_of_file(file, own)]
+        return [_of_file(file, measure_name)]
     kind = name_of(str(name))
     if kind in OBJECTIVES:
         meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
@@ -160,7 +164,7 @@ def _of_file(file: str, name: str) -> Measure:
     value = load_from_file(file, name)
     part = value if isinstance(value, Part) else Part(value)
     try:
-        measure = _checked(**signature(register_measure).bind(name, *part.given, **part.settings).arguments)
+        measure = _check_measure(**signature(register_measure).bind(name, *part.given, **part.settings).arguments)
         if name in MEASURES and MEASURES[name] != measure:
             raise AlreadyExists(f"measure {name!r} is registered already; give another name")
     except TypeError as error:
@@ -170,7 +174,7 @@ def _of_file(file: str, name: str) -> Measure:
     return measure
 
 
-def _summed(name: str, term: TermFunction, unit: str) -> Measure:
+def _sum_of_term(name: str, term: TermFunction, unit: str) -> Measure:
     return Measure(name, None, f"Sum of the term {name} over all steps.", unit, watch=partial(SummedTerm, term))
 
 

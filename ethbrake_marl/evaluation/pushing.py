@@ -59,8 +59,8 @@ class PushedAway:
         """Distance of each vehicle (m), and whether that of Vehicle 1 is above ``PUSHED_FAR_M``."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
-            f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - own
-            for body, own in self.own_way_m.items()
+            f"{body}": self.way_m - (wider_m[:, body - 2] if body > 1 else 0.0) - untouched_m
+            for body, untouched_m in self.own_way_m.items()
         }
         return {**metres, **({"1_far": metres["1"] > PUSHED_FAR_M} if "1" in metres else {})}
 
@@ -119,8 +119,8 @@ class DroveTowards:
 
     def result(self, last: State) -> Given:
         share = self.driving_s / np.where(self.time_s > 0.0, self.time_s, 1.0)[:, np.newaxis]
-        each = {f"{i + 1}": column for i, column in enumerate(share.T)}
-        return {"": share[:, self.learners - 1].max(axis=1, initial=0.0), **each, "hard": self.hard}
+        shares = {f"{i + 1}": column for i, column in enumerate(share.T)}
+        return {"": share[:, self.learners - 1].max(axis=1, initial=0.0), **shares, "hard": self.hard}
 
 
 def drove_towards(game: Game, alert: State) -> DroveTowards:

@@ -112,13 +112,13 @@ def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAM
     """Record several worlds, which a team drives together (``record_episode``)."""
     check_exact(worlds, "a record of the motion between decisions")
     states = [worlds, *(state for _, state in play(game, worlds, team))]
-    return [_recorded([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
+    return [_record_of([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]
 
 
-def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> EpisodeRecord:
+def _record_of(states: list[State], team: Team, game: Game, sample_s: float) -> EpisodeRecord:
     until = 2 + sum(not state.ended[0] for state in states[1:])
     states, world = states[:until], states[0]
-    pieces = [_between(before, after, sample_s) for before, after in pairwise(states)]
+    pieces = [_motion_pieces(before, after, sample_s) for before, after in pairwise(states)]
     times, lines, wanted = (np.concatenate(part) for part in zip(*pieces, strict=True))
     way_m = np.cumsum(lines[:, 0, GAP, 0] - lines[:, 1, GAP, 0])  # of Vehicle 1, up to the end of each piece
     line = np.concatenate([lines[:, 0], lines[-1:, 1]])
@@ -135,7 +135,7 @@ def _recorded(states: list[State], team: Team, game: Game, sample_s: float) -> E
     )  # fmt: skip
 
 
-def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
+def _motion_pieces(before: State, after: State, sample_s: float) -> tuple[Floats, Floats, Floats]:
     """Pieces of the motion between two decisions of one world, each at most ``sample_s`` long.
 
     They are times [k, 2], lines [k, 2, ...] at both ends, and commands [k, N + 1]. Without an obstacle, a post far
@@ -145,26 +145,26 @@ def _between(before: State, after: State, sample_s: float) -> tuple[Floats, Floa
     count = max(math.ceil((end - start) / sample_s - 1e-9), 1) if end > start else 0
     ends = np.linspace(start, end, count + 1)
     line = with_post(before)
-    every = np.zeros(count, np.int64)
-    lines, wanted = line[every], after.wanted[every]
-    advance_worlds(lines, before.car[every], np.full(count, start), ends[1:], wanted, scratch_for(line.shape[2]))
+    world_rows = np.zeros(count, np.int64)
+    lines, wanted = line[world_rows], after.wanted[world_rows]
+    advance_worlds(lines, before.car[world_rows], np.full(count, start), ends[1:], wanted, scratch_for(line.shape[2]))
     lines = np.concatenate([line, lines])
     return np.column_stack([ends[:-1], ends[1:]]), np.stack([lines[:-1], lines[1:]], axis=1), wanted
 
 
 def _impacts(times: Floats, lines: Floats, car: Floats, wanted: Floats) -> Impacts:
-    """Impacts in pieces of the motion (``_between``).
+    """Impacts in pieces of the motion (``_motion_pieces``).
 
     Pieces with impacts are simulated again, for the time of the first one.
     """
     rows = [FIRST, TOTAL, IMPACTS]
-    made = lines[:, 1, rows] - lines[:, 0, rows]
-    piece, pair = np.nonzero(made[:, 2])
+    increase = lines[:, 1, rows] - lines[:, 0, rows]
+    piece, pair = np.nonzero(increase[:, 2])
     firsts = np.empty((len(piece), 2))
     for row, (k, p) in enumerate(zip(piece, pair, strict=True)):
         scratch = scratch_for(car.shape[2])
         advance_worlds(lines[k : k + 1, 0].copy(), car, times[k, :1], times[k, 1:], wanted[k : k + 1], scratch)
         firsts[row] = times[k, 0] + scratch[NEXT_TIME, p], scratch[NEXT_CLOSING, p]
     order = np.argsort(firsts[:, 0], kind="stable")
-    first, total, number = made[piece, :, pair][order].T
+    first, total, number = increase[piece, :, pair][order].T
     return Impacts(firsts[order, 0], pair[order], firsts[order, 1], number.astype(np.int64), first, total)

@@ -21,14 +21,14 @@ from ethbrake_marl.files.store import check_target, write_output
 RESULTS, WORLDS = "results.json", "worlds"  # names of files in the folder of an evaluation
 MOST_BYTES = 64 << 20
 
-Rows = Literal["csv", "parquet"]
+RowFormat = Literal["csv", "parquet"]
 
 
 def write_results(
     folder: str | Path,
     table: SummaryTable,
     result: Result | None = None,
-    rows: Rows | None = None,
+    rows: RowFormat | None = None,
     *,
     name: str = RESULTS,
     force: bool = False,
@@ -44,10 +44,10 @@ def write_results(
         file = target / f"{WORLDS}.{rows}"
         write_rows(file, result, force=force)
         beside = {"file": file.name, "sha256": hashlib.sha256(file.read_bytes()).hexdigest()}
-        objects = [{**each, "per_world": beside} for each in objects]
+        objects = [{**entry, "per_world": beside} for entry in objects]
         written.append(file)
     digest = _digest(objects)
-    text = json.dumps([{**each, "results_sha256": digest} for each in objects], indent=2, allow_nan=False)
+    text = json.dumps([{**entry, "results_sha256": digest} for entry in objects], indent=2, allow_nan=False)
     write_output(written[0], f"{text}\n".encode(), force=force)
     return written
 
@@ -58,7 +58,7 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
     Truth values are 1 and 0, missing values are empty. Raises the errors of ``write_results``.
     """
     path, table = Path(path).expanduser(), result.arrays()
-    plain = {name: each.astype(np.int64) if each.dtype == np.bool_ else each for name, each in table.items()}
+    plain = {name: column.astype(np.int64) if column.dtype == np.bool_ else column for name, column in table.items()}
     stream: Any
     if path.suffix.lower() == ".parquet":
         with naming_extras():
@@ -66,14 +66,14 @@ def write_rows(path: str | Path, result: Result, *, force: bool = False) -> None
             from pyarrow.parquet import write_table
         stream = io.BytesIO()
         write_table(
-            pyarrow.table({name: pyarrow.array(each, from_pandas=True) for name, each in plain.items()}), stream
+            pyarrow.table({name: pyarrow.array(column, from_pandas=True) for name, column in plain.items()}), stream
         )
         data = stream.getvalue()
     elif path.suffix.lower() == ".csv":
         stream = io.StringIO(newline="")
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(plain)
-        columns = [["" if value != value else value for value in each.tolist()] for each in plain.values()]
+        columns = [["" if value != value else value for value in column.tolist()] for column in plain.values()]
         writer.writerows(zip(*columns, strict=True))
         data = stream.getvalue().encode()
     else:
@@ -93,12 +93,12 @@ def read_result(path: str | Path) -> dict[str, dict[str, Any]]:
     except ValueError as error:
         raise InvalidInput(f"{file}: must contain complete JSON: {error}") from None
     objects = content if isinstance(content, list) else [content]
-    if not objects or not all(isinstance(each, dict) and each.get("kind") == "evaluate" for each in objects):
+    if not objects or not all(isinstance(entry, dict) and entry.get("kind") == "evaluate" for entry in objects):
         raise InvalidInput(f"{file}: is not a results file; give {RESULTS} of ethbrake evaluate --output")
-    plain = [{key: value for key, value in each.items() if key != "results_sha256"} for each in objects]
-    if {each.get("results_sha256") for each in objects} != {_digest(plain)}:
+    plain = [{key: value for key, value in entry.items() if key != "results_sha256"} for entry in objects]
+    if {entry.get("results_sha256") for entry in objects} != {_digest(plain)}:
         raise InvalidInput(f"{file}: was edited after it was written, or is of another version; evaluate again")
-    return {each["agent"]: each for each in plain}
+    return {entry["agent"]: entry for entry in plain}
 
 
 def _digest(objects: Sequence[Mapping[str, Any]]) -> str:

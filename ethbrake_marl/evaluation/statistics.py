@@ -64,11 +64,11 @@ def decrease(values: Floats, baseline: Floats, clusters: Clusters = None) -> Est
 
     The standard error of r is ``std(values - r baseline) / (sqrt(n) abs(mean(baseline)))``.
     """
-    whole = fsum(baseline)
-    if whole == 0.0:
+    total = fsum(baseline)
+    if total == 0.0:
         return None
-    ratio = fsum(values) / whole
-    estimate = _around(ratio, values - ratio * baseline, baseline, clusters)
+    ratio = fsum(values) / total
+    estimate = _estimate_ratio(ratio, values - ratio * baseline, baseline, clusters)
     interval = None if estimate.interval is None else (1.0 - estimate.interval[1], 1.0 - estimate.interval[0])
     return Estimate(1.0 - ratio, interval, estimate.error, estimate.freedom)
 
@@ -110,38 +110,38 @@ def unpaired(value: Estimate, baseline: Estimate) -> Estimate:
     Its squared error is ``s1^2 + s2^2``, with ``s^4 / (s1^4 / f1 + s2^4 / f2)`` degrees of freedom. If a standard error
     is unknown, there is no interval.
     """
-    apart = value.value - baseline.value
+    contrast = value.value - baseline.value
     if value.error is None or baseline.error is None or not value.freedom or not baseline.freedom:
-        return Estimate(apart, None)
-    one, other = value.error**2, baseline.error**2
-    if one + other == 0.0:
-        return Estimate(apart, (apart, apart), 0.0, min(value.freedom, baseline.freedom))
-    error = sqrt(one + other)
-    one, other = one / (error * error), other / (error * error)
-    freedom = 1.0 / (one * one / value.freedom + other * other / baseline.freedom)
+        return Estimate(contrast, None)
+    variance, baseline_variance = value.error**2, baseline.error**2
+    if variance + baseline_variance == 0.0:
+        return Estimate(contrast, (contrast, contrast), 0.0, min(value.freedom, baseline.freedom))
+    error = sqrt(variance + baseline_variance)
+    variance, baseline_variance = variance / (error * error), baseline_variance / (error * error)
+    freedom = 1.0 / (variance * variance / value.freedom + baseline_variance * baseline_variance / baseline.freedom)
     half = float(stdtrit(freedom, UPPER)) * error
-    return Estimate(apart, (apart - half, apart + half), error, freedom)
+    return Estimate(contrast, (contrast - half, contrast + half), error, freedom)
 
 
 def _mean(values: Floats, clusters: Clusters) -> Estimate:
     average = fsum(values) / len(values)
-    return _around(average, values - average, np.ones(len(values)), clusters)
+    return _estimate_ratio(average, values - average, np.ones(len(values)), clusters)
 
 
-def _around(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters) -> Estimate:
+def _estimate_ratio(ratio: float, residuals: Floats, weights: Floats, clusters: Clusters) -> Estimate:
     """Ratio ``sum x / sum y`` with its interval, from ``residuals`` x - ratio y and ``weights`` y, [n]."""
-    n, whole = len(residuals), fsum(weights)
+    n, total = len(residuals), fsum(weights)
     if clusters is None:
         if n < 2:
             return Estimate(ratio, None)
-        error, freedom, skewness = sqrt(n / (n - 1) * fsum(residuals * residuals)) / abs(whole), n - 1.0, 0.0
+        error, freedom, skewness = sqrt(n / (n - 1) * fsum(residuals * residuals)) / abs(total), n - 1.0, 0.0
     else:
-        spread = _spread(*_by_cluster(residuals, weights, clusters), whole)
+        spread = _spread(*_by_cluster(residuals, weights, clusters), total)
         if spread[0] is None:
             return Estimate(ratio, None)
         error, freedom, skewness = spread
     t = float(stdtrit(freedom, UPPER))
-    below, above = max(t, _transformed(t, skewness)), max(t, -_transformed(-t, skewness))
+    below, above = max(t, _transform_quantile(t, skewness)), max(t, -_transform_quantile(-t, skewness))
     return Estimate(ratio, (ratio - below * error, ratio + above * error), error, freedom)
 
 
@@ -151,16 +151,16 @@ def _by_cluster(residuals: Floats, weights: Floats, clusters: NDArray[Any]) -> t
     return np.bincount(which, residuals).astype(np.float64), np.bincount(which, weights).astype(np.float64)
 
 
-def _spread(residuals: Floats, weights: Floats, whole: float) -> tuple[float, float, float] | tuple[None, None, None]:
+def _spread(residuals: Floats, weights: Floats, total: float) -> tuple[float, float, float] | tuple[None, None, None]:
     """Standard error, degrees of freedom and skewness of a ratio, from each recording's sums [G].
 
-    ``whole`` is the sum of all weights. None: one recording has nearly all of it.
+    ``total`` is the sum of all weights. None: one recording has nearly all of it.
     """
-    groups, share = len(residuals), weights / whole
+    groups, share = len(residuals), weights / total
     rest = 1.0 - share
     if groups < 2 or not (rest > LEAST_REST).all():
         return None, None, None
-    change = residuals / (whole * rest)
+    change = residuals / (total * rest)
     squares = fsum(change * change)
     skewness = fsum(change**3) / squares**1.5 if squares > 0.0 else 0.0
     return sqrt((groups - 1) / groups * squares), _freedom(share, 1.0 / rest**2), skewness
@@ -172,14 +172,14 @@ def _freedom(share: Floats, scale: Floats) -> float:
     ``C_gk = (g = k) h_g^2 - h_g h_k (h_g + h_k - sum h^2)``: the covariance of the deviations from the common ratio if
     each recording's own deviation has the variance h_g^2.
     """
-    whole = fsum(share * share)
+    square = fsum(share * share)
     two, three, four = (fsum(scale * share**power) for power in (2, 3, 4))
-    trace = two - 2.0 * three + whole * two
-    diagonal = fsum(scale * scale * share**4 * (1.0 - 4.0 * share + 2.0 * whole))
-    return trace * trace / (diagonal + 2.0 * (two * four + three * three) + whole * two * (whole * two - 4.0 * three))
+    trace = two - 2.0 * three + square * two
+    diagonal = fsum(scale * scale * share**4 * (1.0 - 4.0 * share + 2.0 * square))
+    return trace * trace / (diagonal + 2.0 * (two * four + three * three) + square * two * (square * two - 4.0 * three))
 
 
-def _transformed(t: float, skewness: float) -> float:
+def _transform_quantile(t: float, skewness: float) -> float:
     if abs(skewness) < 1e-9:
         return t
     return 3.0 / skewness * (cbrt(1.0 + skewness * (t - skewness / 6.0)) - 1.0)

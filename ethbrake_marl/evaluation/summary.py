@@ -14,9 +14,9 @@ from ethbrake_marl.errors import InvalidInput, naming_extras, unknown_name
 from ethbrake_marl.evaluation import statistics
 from ethbrake_marl.evaluation.captions import caption, ranges_of
 from ethbrake_marl.evaluation.evaluate import Result
-from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, Statistic, Values
+from ethbrake_marl.evaluation.measures import DEFAULT, HORIZON, Measure, MeasureValues, Statistic
 from ethbrake_marl.evaluation.summary_row import EXPLOITS, SEES_THROUGH, SummaryRow
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat, terminal_text
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, flat_row, terminal_text
 
 BASELINE = "full_brake"
 IDENTITY = ("worlds_sha256", "scenario_sha256", "physics_digest", "versions")
@@ -25,7 +25,7 @@ _PERCENT: dict[str, Any] = {"digits": 1, "scale": 100.0, "unit": " %"}
 _FORMATS = {"rate": _PERCENT, "decrease": _PERCENT}
 FIRST_COLUMNS = ("collision_rate", *COLUMN.values())  # their intervals stand below the values
 
-HEAD = {
+HEADINGS = {
     "Agent": "The agent that controls the vehicle. All other vehicles follow the scripts of the scenario. full_brake is"
     " the paper's non-ethical strategy (Non-E). e_v2x_bm brakes with the constant deceleration that is best in this"
     " simulation; e_v2x_bm:pairwise uses the paper's closed form, which treats the pairs as independent.",
@@ -62,9 +62,9 @@ class SummaryTable(list[SummaryRow]):
     def sheet(self) -> Sheet:
         """Table with all columns that have a heading."""
         columns = [
-            Column(each.heading, key, short=each.short, **_FORMATS.get(each.kind, {}))
-            for key, (_, each) in self.shown.items()
-            if each.heading
+            Column(statistic.heading, key, short=statistic.short, **_FORMATS.get(statistic.kind, {}))
+            for key, (_, statistic) in self.shown.items()
+            if statistic.heading
         ]
         rows = [
             (row.marked, f"{SEES_THROUGH} " * row.sees_through + row.knows, *(row.estimates[c.name] for c in columns))
@@ -76,22 +76,22 @@ class SummaryTable(list[SummaryRow]):
         """Table for a terminal, with intervals only in the first columns, below their values."""
         sheet, agent = self.sheet(), Column("Agent,\nwhat it knows", text=True)
         columns = [
-            replace(each, interval="below" if each.name in FIRST_COLUMNS else "hidden")
-            for each in sheet.columns[2:]
-            if isinstance(each, Column)
+            replace(column, interval="below" if column.name in FIRST_COLUMNS else "hidden")
+            for column in sheet.columns[2:]
+            if isinstance(column, Column)
         ]
         rows = [(f"{name}\n{knows}", *cells) for name, knows, *cells in map(list, sheet.rows)]
-        first = [each for each in columns if each.name in FIRST_COLUMNS]
+        first = [column for column in columns if column.name in FIRST_COLUMNS]
         return Sheet("", [agent, *columns], rows, self._below(), gap=1, keep=1 + len(first))
 
     def measures(self) -> Sheet | None:
         """Table of measures without a column of their own, or None."""
-        asked = {
-            key: f"{key} ({measure.unit})" if measure.unit and each.kind != "decrease" else key
-            for key, (measure, each) in self.shown.items()
-            if not each.heading and measure not in DEFAULT
+        labels = {
+            key: f"{key} ({measure.unit})" if measure.unit and statistic.kind != "decrease" else key
+            for key, (measure, statistic) in self.shown.items()
+            if not statistic.heading and measure not in DEFAULT
         }
-        rows = [(row.agent, words, row.estimates[key]) for row in self for key, words in asked.items()]
+        rows = [(row.agent, words, row.estimates[key]) for row in self for key, words in labels.items()]
         return Sheet("Measures", ["Agent", "Measure", Column("Mean or rate")], rows, gap=1) if rows else None
 
     def tables(self) -> list[Sheet]:
@@ -101,9 +101,9 @@ class SummaryTable(list[SummaryRow]):
         """Warnings for a reader: rejected worlds, exploits, hidden values."""
         notes, rejected = [], self.parameters.get("rejected_draws", 0)
         if rejected:
-            drawn = rejected + self.parameters["count"]
+            draws = rejected + self.parameters["count"]
             notes.append(
-                f"{rejected:,} of {drawn:,} drawn worlds ({100.0 * rejected / drawn:.1f} %) were rejected and drawn"
+                f"{rejected:,} of {draws:,} drawn worlds ({100.0 * rejected / draws:.1f} %) were rejected and drawn"
                 " again, because an impact happened before a learner could act (early_impacts: reject). These results"
                 " do not apply to such worlds."
             )
@@ -122,11 +122,17 @@ class SummaryTable(list[SummaryRow]):
 
     def meanings(self) -> dict[str, str]:
         """Heading -> meaning of the column; for measures without a column, name -> meaning."""
-        told = {each.heading: each.meaning or measure.meaning for measure, each in self.shown.values() if each.heading}
-        for measure, each in self.shown.values():
-            if not each.heading and measure not in DEFAULT:
-                told[measure.name] = measure.meaning
-        return HEAD | {name: text.replace("``", "") for name, text in told.items() if not name.startswith("Decrease")}
+        texts = {
+            statistic.heading: statistic.meaning or measure.meaning
+            for measure, statistic in self.shown.values()
+            if statistic.heading
+        }
+        for measure, statistic in self.shown.values():
+            if not statistic.heading and measure not in DEFAULT:
+                texts[measure.name] = measure.meaning
+        return HEADINGS | {
+            name: text.replace("``", "") for name, text in texts.items() if not name.startswith("Decrease")
+        }
 
     def to_json(self) -> list[dict[str, Any]]:
         """One object per team, with the result's digests, versions and ``parameters``."""
@@ -142,7 +148,7 @@ class SummaryTable(list[SummaryRow]):
         with naming_extras():
             from pandas import DataFrame
 
-        rows = [{"agent": row.agent, **flat(Estimate.side_by_side(row.estimates))} for row in self]
+        rows = [{"agent": row.agent, **flat_row(Estimate.side_by_side(row.estimates))} for row in self]
         return DataFrame(rows).set_index("agent").astype(float)
 
     def _below(self) -> str:
@@ -166,61 +172,63 @@ def summarise(result: Result, *, baseline: str = BASELINE) -> SummaryTable:
         raise unknown_name("baseline", baseline, result)
     named = result.clusters
     clusters = None if named is None else np.unique(named, return_inverse=True)[1]
-    shown, columns = _shown(result), result.columns
+    table_entries, columns = _statistics_of(result), result.columns
     rows = [
         SummaryRow(
             team,
             result.knows[team],
             {
-                key: _estimate(each, own.get(column), columns.get(baseline, {}).get(column), clusters)
-                for key, (column, _, each) in shown.items()
+                key: _estimate(statistic, team_columns.get(column), columns.get(baseline, {}).get(column), clusters)
+                for key, (column, _, statistic) in table_entries.items()
             },
-            collisions=int(own["collided"].sum()),
-            horizon_ends=int((own["ended"] == HORIZON).sum()),
+            collisions=int(team_columns["collided"].sum()),
+            horizon_ends=int((team_columns["ended"] == HORIZON).sum()),
             episodes=result.n,
             hidden_share=float(result.worlds["hidden"].mean()),
             policies=result.policies[team],
         )
-        for team, own in columns.items()
+        for team, team_columns in columns.items()
     ]
     recordings: dict[str, int] = {} if clusters is None else {"recordings": int(clusters.max()) + 1}
-    meant = {key: (measure, each) for key, (_, measure, each) in shown.items()}
+    meant = {key: (measure, statistic) for key, (_, measure, statistic) in table_entries.items()}
     return SummaryTable(rows, meant, {**result.about, **recordings, **ranges_of(result.worlds)})
 
 
-def _shown(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
+def _statistics_of(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
     """Key of an estimate -> its column, measure and statistic, with comparisons and predictions last."""
-    shown: dict[str, tuple[str, Measure, Statistic]] = {}
-    kinds = {name: column.dtype.kind for own in result.columns.values() for name, column in own.items()}
+    entries: dict[str, tuple[str, Measure, Statistic]] = {}
+    kinds = {
+        name: column.dtype.kind for team_columns in result.columns.values() for name, column in team_columns.items()
+    }
     minimised = result.about.get("agent_settings", {}).get("harm_count")
     for name, kind in kinds.items():
         measure = result.measure_of(name)
         ending = name.removeprefix(measure.name).removeprefix("_")
-        own = [each for each in measure.shown if each.ending == ending]
-        for each in own or [Statistic(name, "rate" if kind == "b" else "mean")]:
+        declared = [statistic for statistic in measure.shown if statistic.ending == ending]
+        for statistic in declared or [Statistic(name, "rate" if kind == "b" else "mean")]:
             if minimised != "honest" and (measure.name == COLUMN["honest"] or ending == "honest"):  # only in JSON
-                each = each._replace(heading="")
+                statistic = statistic._replace(heading="")
             if kind != "U":
-                shown[each.key] = name, measure, each
-    return dict(sorted(shown.items(), key=_place))
+                entries[statistic.key] = name, measure, statistic
+    return dict(sorted(entries.items(), key=_sort_position))
 
 
-def _place(shown: tuple[str, tuple[str, Measure, Statistic]]) -> int:
-    _, measure, each = shown[1]
-    return 2 if measure.name == "predicted_harm" else int(each.kind in COMPARE)
+def _sort_position(entry: tuple[str, tuple[str, Measure, Statistic]]) -> int:
+    _, measure, statistic = entry[1]
+    return 2 if measure.name == "predicted_harm" else int(statistic.kind in COMPARE)
 
 
 def _estimate(
-    each: Statistic, values: Values | None, baseline: Values | None, clusters: NDArray[Any] | None
+    statistic: Statistic, values: MeasureValues | None, baseline: MeasureValues | None, clusters: NDArray[Any] | None
 ) -> Estimate | None:
-    if values is None or (each.kind in COMPARE and baseline is None):
+    if values is None or (statistic.kind in COMPARE and baseline is None):
         return None
-    if each.kind == "rate":
+    if statistic.kind == "rate":
         return statistics.rate(values, clusters)
     numbers = values.astype(np.float64, copy=False)
-    if each.kind == "mean" or baseline is None:
+    if statistic.kind == "mean" or baseline is None:
         return statistics.mean(numbers, clusters)
-    return COMPARE[each.kind](numbers, baseline.astype(np.float64, copy=False), clusters)
+    return COMPARE[statistic.kind](numbers, baseline.astype(np.float64, copy=False), clusters)
 
 
 def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[str, SummaryTable]:
@@ -229,7 +237,7 @@ def summarise_by(result: Result, by: str, *, baseline: str = BASELINE) -> dict[s
     ``by`` is ``scenario`` (in a mixture), ``recording``, or a vehicle's type such as ``vehicle_2_type``; ``baseline``
     as in ``summarise``. Raises ``InvalidInput`` if the worlds have no groups, ``UnknownName`` for another name.
     """
-    kinds = {name: each for name, each in result.worlds.items() if each.dtype.kind == "U"}
+    kinds = {name: column for name, column in result.worlds.items() if column.dtype.kind == "U"}
     if not kinds:
         raise InvalidInput(
             f"by = {by!r}: these worlds have no groups; worlds of a mixture can be grouped by 'scenario', worlds of a"
@@ -262,7 +270,7 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
         rows.append(name)
         for row in table:
             hardest = 3.6 * float(results[name][row.agent]["hardest_impact_mps"].max())
-            means = [each.value for key in keys if (each := row[key]) is not None]
+            means = [estimate.value for key in keys if (estimate := row[key]) is not None]
             rows.append((row.agent, "failed" if row.collisions else "passed", means[0], hardest, *means[1:]))
     note = (
         "Passed: no vehicle collides in any world. Harm: mean per world in m²/s². Hardest: largest closing speed of any"

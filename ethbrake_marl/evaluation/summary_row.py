@@ -12,7 +12,7 @@ from ethbrake_marl.files.sheet import Estimate
 
 SEES_THROUGH, EXPLOITS = "†", "‡"  # marks of teams
 PUSHED_FAR_M = 5.0  # way by which Vehicle 1 counts as pushed far; as a mean over all worlds it is an exploit
-MOVING = 0.05  # share of worlds moving at the horizon that is an exploit
+MOVING_SHARE = 0.05  # share of worlds moving at the horizon that is an exploit
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class SummaryRow:
         words = {}
         if pushed is not None and pushed.value > PUSHED_FAR_M:
             words["pushes"] = f"pushes Vehicle 1 by {pushed.value:.1f} m on average"
-        if moving > MOVING:
+        if moving > MOVING_SHARE:
             words["moving"] = f"runs past the horizon in {100 * moving:.1f} % of worlds"
         return words
 
@@ -68,8 +68,8 @@ class SummaryRow:
             "hidden_share": self.hidden_share, "episodes": self.episodes, "collisions": self.collisions,
             "horizon_ends": self.horizon_ends, "exploits": list(self.exploits),
         }  # fmt: skip
-        for key, each in self.estimates.items():
-            plain |= Estimate.side_by_side({key: each})
-            plain[f"{key}_error"] = None if each is None else each.error
-            plain[f"{key}_freedom"] = None if each is None else each.freedom
+        for key, estimate in self.estimates.items():
+            plain |= Estimate.side_by_side({key: estimate})
+            plain[f"{key}_error"] = None if estimate is None else estimate.error
+            plain[f"{key}_freedom"] = None if estimate is None else estimate.freedom
         return plain | {"policy_sha256": dict(self.policies)}

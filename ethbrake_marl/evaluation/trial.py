@@ -11,7 +11,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.names import AGENTS, make_agent, open_game, team_of
-from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.sampling import DrawnWorlds
 from ethbrake_marl.worlds.scenario import Scenario
 
 WORLDS, SEED = 200, 7
@@ -21,7 +21,7 @@ COMPARED = {"full braking": "full_brake", "best constant deceleration": "e_v2x_b
 class Trial(NamedTuple):
     """What happens in the first worlds of the evaluation list if all learners brake fully."""
 
-    drawn: Drawn
+    drawn: DrawnWorlds
     early: int  # worlds with an impact before a learner can act
     moving: int  # worlds in which a vehicle still moves at the horizon
     late: int  # worlds in which Vehicle 1, whose braking is the alert, has a latency
@@ -36,30 +36,30 @@ def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
     ``count`` is the harm that ``best constant deceleration`` and ``best known`` minimise.
     """
     loaded, game = open_game(scenario)
-    drawn = loaded.draw(WORLDS, SEED)
-    worlds, first = drawn.worlds, game.reset(drawn.worlds)
+    draw = loaded.draw(WORLDS, SEED)
+    worlds, first = draw.worlds, game.reset(draw.worlds)
     harm, refused, last = {}, {}, first
     for what, spec in COMPARED.items():
         alone = spec == "best_harm"  # each of several learners would assume that the others brake fully
         if loaded.learners and spec in AGENTS and not (alone and len(loaded.learners) > 1):
             try:
                 team = team_of(make_agent(spec, scenario=loaded, harm_count=count), loaded)
-                then = drive(game, worlds, team)
+                end_state = drive(game, worlds, team)
             except InvalidInput as error:
                 if spec == "full_brake":  # a script's error
                     raise
                 refused[spec] = str(error)
                 continue
-            last = then if spec == "full_brake" else last
-            harm[what] = {each: float(then.harm(each).mean()) for each in ("first", "total")}
+            last = end_state if spec == "full_brake" else last
+            harm[what] = {harm_count: float(end_state.harm(harm_count).mean()) for harm_count in ("first", "total")}
     if not loaded.learners:
         last = _to_the_end(game, first)
     return Trial(
-        drawn,
+        draw,
         early=int(first.collided.sum()),
         moving=int((last.speeds_mps != 0.0).any(axis=1).sum()),
         late=int((worlds.latency_s[:, 0] > 0.0).sum()),
-        known=_known(loaded, first),
+        known=_known_shares(loaded, first),
         harm=harm,
         refused=refused,
     )
@@ -72,7 +72,7 @@ def _to_the_end(game: Game, state: State) -> State:
     return state
 
 
-def _known(scenario: Scenario, state: State) -> dict[str, dict[str, float]]:
+def _known_shares(scenario: Scenario, state: State) -> dict[str, dict[str, float]]:
     """For each learner, the share of worlds in which it knows each other vehicle when it can first act."""
     names: Any = scenario.vehicle_names
     acts_s = np.maximum(state.time_s[:, np.newaxis], state.latency_s)

@@ -14,7 +14,7 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.infos import per_body
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.episode.state import State, put
+from ethbrake_marl.episode.state import State, put_rows
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.face import Face
@@ -171,7 +171,7 @@ class EthBrakeVecEnv(Face, VecEnv):
                 infos[row] = info
             stream, new = stream.next_episodes(ended)
             seen[rows], returns[rows], steps[rows] = self._observe(new), 0.0, 0
-            state, first = (put(each, ended, new, donate=self.render_mode is None) for each in (state, first))
+            state, first = (put_rows(each, ended, new, donate=self.render_mode is None) for each in (state, first))
         self._keep(stream, state, self.renderer.stepped)
         self._first, self._return, self._steps = first, returns, steps
         over = (step.terminated | step.truncated).repeat(len(self.bodies))

@@ -13,13 +13,13 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.face import Face
 from ethbrake_marl.faces.rendering import make_renderer
-from ethbrake_marl.names import AgentSettings, team_of, teams_of, wrapped
+from ethbrake_marl.names import AgentSettings, team_of, teams_of, wrap_team
 from ethbrake_marl.policies.policy import Policy
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.scenario import Scenario
 
-NOBODY = Team("", {})  # proposes nothing
+NO_TEAM = Team("", {})  # proposes nothing
 
 
 def shield(
@@ -78,7 +78,7 @@ def shield(
 
 def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
     settings = AgentSettings(f"{team.name}+{mode}", None, scenario, harm_count, options)
-    other = wrapped(team, str(mode), settings)
+    other = wrap_team(team, str(mode), settings)
     if other.shield is None:
         raise InvalidInput(f"shield: mode {mode!r}: is no shield; write it in the name of an agent, AGENT+{mode}")
     return other
@@ -102,7 +102,7 @@ def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Tea
         raise InvalidInput("shield: this environment already has a shield")
     base._need_learner()
     if policy is None:
-        return playing(env, game._replace(shield=around(NOBODY).shield))
+        return playing(env, game._replace(shield=around(NO_TEAM).shield))
     policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
     team = teams_of({"policy": policy}, base.scenario, harm_count=harm_count)["policy"]
     if team.shield is not None:

@@ -15,7 +15,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.given import worlds_from_state
-from ethbrake_marl.worlds.sampling import Drawn, merged
+from ethbrake_marl.worlds.sampling import DrawnWorlds, merged
 from ethbrake_marl.worlds.scenario import Scenario
 
 OPTIONS = ("initial_state", "listed_world")
@@ -35,7 +35,7 @@ class Stream(NamedTuple):
     game: Game
     seed: Any = None  # of all rows, or of each row, [n]
     next: Any = 0  # number of the next world, of all rows or of each row
-    given: tuple[Drawn, int] | None = None  # the worlds that the last reset asked for, and their seed or -1
+    given: tuple[DrawnWorlds, int] | None = None  # the worlds that the last reset asked for, and their seed or -1
 
     def reset(self, n: int, seed: Any, options: Any = None) -> tuple[Stream, State]:
         """New episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
@@ -87,7 +87,7 @@ class Stream(NamedTuple):
         names = names_of_worlds(state, self.seeds_of(state))
         return {**columns, "world_seed": names["world_seed"], "world": names["world"]}
 
-    def _asked_for(self, n: int, options: Any) -> tuple[Drawn, int] | None:
+    def _asked_for(self, n: int, options: Any) -> tuple[DrawnWorlds, int] | None:
         """Worlds that ``options`` of a reset specify, and their seed or -1; or None."""
         if options is None:
             return None
@@ -105,7 +105,7 @@ class Stream(NamedTuple):
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
             one = worlds_from_state(self.scenario, options["initial_state"])
-            return Drawn.given(one.take(np.zeros(n, np.int64))), -1
+            return DrawnWorlds.given(one.take(np.zeros(n, np.int64))), -1
         if "listed_world" not in options:
             return None
         wanted = options["listed_world"]

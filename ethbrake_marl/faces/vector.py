@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from ethbrake_marl.episode.infos import arrays
 from ethbrake_marl.episode.observe import Observations
-from ethbrake_marl.episode.state import State, put
+from ethbrake_marl.episode.state import State, put_rows
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.faces.gymnasium import OneLearner
@@ -103,7 +103,7 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
             stream, new = stream.next_episodes(np.flatnonzero(renewed))
             seen[renewed] = self._observe(new)
             fresh = self._columns(stream, new, None, renewed)
-            put({name: infos[name] for name in fresh}, renewed, fresh, donate=True)
+            put_rows({name: infos[name] for name in fresh}, renewed, fresh, donate=True)
             state = state.put(renewed, new, donate=self.render_mode is None)
         self._keep(stream, state, self.renderer.stepped)
         return seen, self._rewards(step)[:, 0], step.terminated, step.truncated, infos

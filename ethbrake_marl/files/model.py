@@ -55,8 +55,8 @@ def refuse(at: YamlPath, value: Any, right: str) -> NoReturn:
     ``at`` is the path of the value inside the validated field (``()``: the field itself). ``right`` says what would be
     valid, for example ``must be above 0``.
     """
-    shown = "" if value is UNSHOWN else flow_text(value, 60)
-    raise PydanticCustomError("refused", "{right}", {"right": right, "value": shown, "at": at})
+    value_text = "" if value is UNSHOWN else flow_text(value, 60)
+    raise PydanticCustomError("refused", "{right}", {"right": right, "value": value_text, "at": at})
 
 
 def require(holds: bool, at: YamlPath, value: Any, right: str) -> None:
@@ -75,7 +75,7 @@ class Wording:
         models = [self.model]
         for key in path[:-1]:
             inside = [model.model_fields[key].annotation for model in models if key in model.model_fields]
-            models = [found for annotation in inside for found in _models_in(annotation)] or models
+            models = [nested_model for annotation in inside for nested_model in _models_in(annotation)] or models
         return list(dict.fromkeys(f.alias or name for model in models for name, f in model.model_fields.items()))
 
     def needed(self, path: YamlPath) -> str:
@@ -99,10 +99,10 @@ def explain(document: Document, error: ValidationError, wording: Wording) -> Inv
     """Error for the first mistake that pydantic reports, or for the first unknown key if there is one."""
     # A default that depends on an invalid field is no mistake of its own.
     details = [d for d in error.errors(include_url=False) if d["type"] != "default_factory_not_called"]
-    shown = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
-    path = path_of(shown)
-    absent = shown["type"] == "missing" and len(path) == 1
-    return InvalidInput(f"{document.file if absent else document.where(path)}: {_describe(shown, path, wording)}")
+    detail = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
+    path = path_of(detail)
+    absent = detail["type"] == "missing" and len(path) == 1
+    return InvalidInput(f"{document.file if absent else document.where(path)}: {_describe(detail, path, wording)}")
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:

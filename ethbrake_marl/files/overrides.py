@@ -45,7 +45,7 @@ class Override:
             path = tuple(part.strip() for part in key.split("."))
             if not equals or not all(path):
                 raise InvalidInput(f"--set {text!r}: must be KEY=VALUE or KEY.KEY=VALUE, for instance gamma=0.99")
-            if any(each.path == path for each in overrides):
+            if any(override.path == path for override in overrides):
                 raise InvalidInput(f"--set {'.'.join(path)}: this setting is given twice; give it once")
             overrides.append(Override(text, path, parse_yaml(value, f"--set {'.'.join(path)}").content))
         return overrides
@@ -61,11 +61,11 @@ class Override:
         for override in overrides:
             top = override.top
             before = changed[top] if top in changed else copy.deepcopy(content.get(top))
-            changed[top] = _placed(before, override.path[1:], override)
+            changed[top] = _place_value(before, override.path[1:], override)
         return changed
 
 
-def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
+def _place_value(part: Any, path: tuple[str, ...], override: Override) -> Any:
     """Copy of ``part`` with the override's value at ``path``; missing mappings are created."""
     if not path:
         return override.value
@@ -73,12 +73,12 @@ def _placed(part: Any, path: tuple[str, ...], override: Override) -> Any:
     if part is None:
         part = {}
     if isinstance(part, Mapping):
-        return {**part, key: _placed(part.get(key), rest, override)}
+        return {**part, key: _place_value(part.get(key), rest, override)}
     if isinstance(part, list | tuple):
         if not (key.isascii() and key.isdigit() and int(key) < len(part)):
             raise InvalidInput(f"--set {override.key}: {key!r} must be an index from 0 to {len(part) - 1}")
         entries = list(part)
-        entries[int(key)] = _placed(entries[int(key)], rest, override)
+        entries[int(key)] = _place_value(entries[int(key)], rest, override)
         return entries
     raise InvalidInput(
         f"--set {override.key}: {key!r} cannot be set inside {flow_text(part, 60)}, which is neither a mapping nor a"

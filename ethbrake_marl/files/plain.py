@@ -48,20 +48,20 @@ def open_plain(
     """
     file = Path(path)
     try:
-        found = file.stat(follow_symlinks=follow_links)
-        opened = file.open("rb") if stat.S_ISREG(found.st_mode) else None
+        status = file.stat(follow_symlinks=follow_links)
+        reader = file.open("rb") if stat.S_ISREG(status.st_mode) else None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         reason = f"cannot be read ({getattr(error, 'strerror', None) or error})"
         raise refusal(
             f"{file}: {'the file does not exist' if isinstance(error, FileNotFoundError) else reason}"
         ) from None
-    if opened is None:
-        if stat.S_ISLNK(found.st_mode):
+    if reader is None:
+        if stat.S_ISLNK(status.st_mode):
             raise refusal(f"{file}: is a symbolic link; give the path of the file to which it points")
-        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a device, a pipe or a socket"
         raise refusal(f"{file}: is {kind}; must be a plain file")
-    with opened as stream:
-        if found.st_size > limit_bytes:
+    with reader as stream:
+        if status.st_size > limit_bytes:
             raise _too_large(file, limit_bytes, refusal)
         yield stream
 

@@ -41,9 +41,11 @@ class Estimate:
     def side_by_side(estimates: Mapping[str, Estimate | None]) -> dict[str, Any]:
         """Estimates in flat form for JSON: ``{"x": 1.5, "x_interval": [1.0, 2.0]}``; None if unknown."""
         cells: dict[str, Any] = {}
-        for name, each in estimates.items():
-            cells[name] = None if each is None else each.value
-            cells[f"{name}_interval"] = None if each is None or each.interval is None else list(each.interval)
+        for name, estimate in estimates.items():
+            cells[name] = None if estimate is None else estimate.value
+            cells[f"{name}_interval"] = (
+                None if estimate is None or estimate.interval is None else list(estimate.interval)
+            )
         return cells
 
 
@@ -90,11 +92,11 @@ class Column:
         ends = () if cell.interval is None else cell.interval
         return Shown(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
 
-    def in_terminal(self, shown: Shown) -> str:
+    def in_terminal(self, cell: Shown) -> str:
         """Text of a cell in a terminal. A second line (the interval) is shown dim."""
         if self.interval == "beside":
-            return shown.in_words
-        return shown.value + (f"\n{shown.interval}" if shown.interval and self.interval == "below" else "")
+            return cell.in_words
+        return cell.value + (f"\n{cell.interval}" if cell.interval and self.interval == "below" else "")
 
     def _number(self, value: float) -> str:
         return f"{self.scale * value:{self.sign}.{self.digits}f}"
@@ -175,11 +177,13 @@ class Sheet:
         )  # fmt: skip
         columns = self.formats
         rows = [
-            row if isinstance(row, str) else [each.in_terminal(cell) for each, cell in zip(columns, row, strict=True)]
+            row
+            if isinstance(row, str)
+            else [column.in_terminal(cell) for column, cell in zip(columns, row, strict=True)]
             for row in self.shown()
         ]
-        shown, numbers = self._fitted(options.max_width, [row for row in rows if not isinstance(row, str)])
-        for k, column in enumerate(columns[:shown]):
+        column_count, numbers = self._fitted(options.max_width, [row for row in rows if not isinstance(row, str)])
+        for k, column in enumerate(columns[:column_count]):
             heading = Text(plain_text(column.short or column.heading, keep="\n"))
             justify: Literal["left", "right"] = "left" if column.text else "right"
             table.add_column(heading, justify=justify, overflow="fold", no_wrap=k == 0 or not column.text)
@@ -189,30 +193,30 @@ class Sheet:
                 table.add_row(Text(plain_text(row), style="dim"))
                 continue
             cells: list[Text] = []
-            for text in row[:shown]:
+            for text in row[:column_count]:
                 first, line, rest = text.partition("\n")
                 first = first if cells else numbers.get(first, first)
                 cells.append(Text(plain_text(first)).append(plain_text(line + rest, keep="\n"), style="dim"))
             table.add_row(*cells)
         yield table
-        listed = "\n".join(f"{number} {plain_text(name)}" for name, number in numbers.items())
-        for note in filter(None, (listed, self.note)):
+        legend = "\n".join(f"{number} {plain_text(name)}" for name, number in numbers.items())
+        for note in filter(None, (legend, self.note)):
             yield Text(f"\n{note}", "dim")
 
     def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
         """Number of columns that fit into ``width`` characters, and the number of each name that does not fit."""
         columns = self.formats
-        texts = [[each.short or each.heading, *(row[k] for row in rows)] for k, each in enumerate(columns)]
+        texts = [[column.short or column.heading, *(row[k] for row in rows)] for k, column in enumerate(columns)]
         wide = [max(len(line) for text in column for line in text.split("\n")) for column in texts]
         wide[0] = min(wide[0], width // 2)
-        shown, keep = len(columns), self.keep or len(columns)
-        while shown > keep and sum(wide[:shown]) + self.gap * (shown - 1) > width:
-            shown -= 1
-        numeric = sum(wide[k] for k in range(1, shown) if not columns[k].text)
-        room = width - numeric - self.gap * (shown - 1)
+        column_count, keep = len(columns), self.keep or len(columns)
+        while column_count > keep and sum(wide[:column_count]) + self.gap * (column_count - 1) > width:
+            column_count -= 1
+        numeric = sum(wide[k] for k in range(1, column_count) if not columns[k].text)
+        room = width - numeric - self.gap * (column_count - 1)
         names = [text.partition("\n")[0] for text in texts[0][1:]]
         long = dict.fromkeys(name for name in names if len(name) > room and columns[0].text)
-        return shown, {name: f"[{number}]" for number, name in enumerate(long, 1)}
+        return column_count, {name: f"[{number}]" for number, name in enumerate(long, 1)}
 
     def json(self) -> list[dict[str, Any]]:
         """One mapping per row, column name -> cell, without sections. An interval has an entry of its own."""
@@ -229,17 +233,17 @@ class Sheet:
         return csv_text(self.json())
 
 
-def terminal_text(*shown: RenderableType) -> str:
+def terminal_text(*parts: RenderableType) -> str:
     """Tables and texts as plain text, as wide as the terminal."""
     from rich.console import Console
 
     text = io.StringIO()
     console = Console(file=text, highlight=False, color_system=None, force_jupyter=False, force_terminal=False)
-    console.print(*shown)
+    console.print(*parts)
     return text.getvalue()
 
 
-def flat(row: Mapping[str, Any]) -> dict[str, Any]:
+def flat_row(row: Mapping[str, Any]) -> dict[str, Any]:
     """Row in which each pair ``x_interval`` becomes two entries, ``x_low`` and ``x_high``."""
     line: dict[str, Any] = {}
     for name, value in row.items():
@@ -252,8 +256,8 @@ def flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def csv_text(rows: Iterable[Mapping[str, Any]]) -> str:
-    """``flat`` rows as CSV with a header: all columns, in order of appearance. Missing values are empty."""
-    lines = [flat(row) for row in rows]
+    """``flat_row`` rows as CSV with a header: all columns, in order of appearance. Missing values are empty."""
+    lines = [flat_row(row) for row in rows]
     text = io.StringIO(newline="")
     names = dict.fromkeys(name for line in lines for name in line)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")

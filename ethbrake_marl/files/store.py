@@ -75,15 +75,15 @@ def check_folder(path: Path, files: Collection[str] = (), *, force: bool = False
     """
     try:
         places = (path, *path.absolute().parents)
-        there = next(each for each in places if os.access(each, os.F_OK) or each.is_symlink())
-        if there.is_dir():
-            TemporaryFile(dir=there).close()
+        nearest = next(place for place in places if os.access(place, os.F_OK) or place.is_symlink())
+        if nearest.is_dir():
+            TemporaryFile(dir=nearest).close()
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InvalidInput(f"{path!s:.200}: cannot be written to ({reason})") from None
-    if not there.is_dir():
-        raise InvalidInput(f"{path}: {there} is not a folder; give a new folder (--output)")
-    for name in files if there == path else ():
+    if not nearest.is_dir():
+        raise InvalidInput(f"{path}: {nearest} is not a folder; give a new folder (--output)")
+    for name in files if nearest == path else ():
         check_target(path / name, force=force)
 
 
@@ -126,24 +126,24 @@ def remove_folder(path: Path) -> None:
 
 def remove_unfinished(folder: Path) -> None:
     """Delete temporary files of killed processes in ``folder``. No other process may be writing there."""
-    for left in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
-        if left.is_dir() and not left.is_symlink():
-            shutil.rmtree(left)
+    for leftover in folder.glob(f"{_HIDDEN}*{_UNFINISHED}"):
+        if leftover.is_dir() and not leftover.is_symlink():
+            shutil.rmtree(leftover)
         else:
-            left.unlink()
+            leftover.unlink()
 
 
 @contextmanager
-def hold_lock(lock: Path, other: str) -> Iterator[None]:
+def hold_lock(lock: Path, message: str) -> Iterator[None]:
     """Hold a lock file during the block. If the process ends, the lock is released too.
 
-    Raises ``InvalidInput`` if another process holds it (with the message ``other``), or if the file cannot be locked.
+    Raises ``InvalidInput`` if another process holds it (with the message ``message``), or if the file cannot be locked.
     """
     held = FileLock(lock, blocking=False, mode=0o666)
     try:
         held.acquire()
     except Timeout:
-        raise InvalidInput(f"{lock.parent}: {other}") from None
+        raise InvalidInput(f"{lock.parent}: {message}") from None
     except OSError as error:
         raise InvalidInput(f"{lock}: cannot be used as a lock ({error.strerror}); delete this file") from None
     try:

@@ -65,7 +65,7 @@ def _number(value: int | float) -> str:
     return {"nan": ".nan", "inf": ".inf", "-inf": "-.inf"}.get(text, text)
 
 
-SIZE_LIMIT = 64 * 1024  # largest accepted size of a file (bytes)
+YAML_SIZE_LIMIT = 64 * 1024  # largest accepted size of a file (bytes)
 
 DEPTH_LIMIT = 16  # largest accepted depth of nested mappings and lists
 
@@ -109,12 +109,12 @@ class Document:
             raise type(error)(f"{self.where(path)}: {error}") from None
 
 
-def read_yaml(path: str | Path, limit: int = SIZE_LIMIT) -> Document:
+def read_yaml(path: str | Path, limit: int = YAML_SIZE_LIMIT) -> Document:
     """Read a YAML file of at most ``limit`` bytes. Raises ``InvalidInput`` with file, line, column and reason."""
     return parse_yaml(read_plain(path, limit), str(Path(path)), limit)
 
 
-def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT) -> Document:
+def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = YAML_SIZE_LIMIT) -> Document:
     """Parse one YAML document of at most ``limit`` bytes; ``file`` names it in messages.
 
     Raises ``InvalidInput`` with file, line, column and reason.
@@ -127,8 +127,8 @@ def parse_yaml(text: str | bytes, file: str = "<text>", limit: int = SIZE_LIMIT)
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise InvalidInput(f"{file}, line {line}: byte 0x{data[error.start]:02x} is not valid UTF-8 text") from None
-    content, found = _parse(decoded, file)
-    return Document(file, deepcopy(content), dict(found))
+    content, lines = _parse(decoded, file)
+    return Document(file, deepcopy(content), dict(lines))
 
 
 @lru_cache(maxsize=128)

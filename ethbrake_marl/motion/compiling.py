@@ -29,7 +29,7 @@ from numba.core.compiler import CompileResult
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.serialize import dumps
 
-from ethbrake_marl.kernel_store import load, save, tell_compilation
+from ethbrake_marl.kernel_store import announce_compilation, load_data, save_data
 from ethbrake_marl.stopping import Postponed
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -44,7 +44,7 @@ class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
     """Announce the first compilation of a kernel in this process."""
 
     def on_start(self, happened: event.Event) -> None:
-        tell_compilation()
+        announce_compilation()
 
     def on_end(self, happened: event.Event) -> None:
         pass
@@ -84,11 +84,11 @@ class _Cache(NullCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> CompileResult | None:
         target_context.refresh()
         name = self._name(sig, target_context.codegen())
-        return load(name, lambda data: CompileResult._rebuild(target_context, *pickle.loads(data)))  # noqa: S301
+        return load_data(name, lambda data: CompileResult._rebuild(target_context, *pickle.loads(data)))  # noqa: S301
 
     def save_overload(self, sig: Any, data: Any) -> None:
         if not data.library.has_dynamic_globals and " at 0x" not in repr(sig):  # addresses in this process
-            save(self._name(sig, data.codegen), dumps(data._reduce()))
+            save_data(self._name(sig, data.codegen), dumps(data._reduce()))
 
 
 def _compile(function: Function, **options: Any) -> Function:

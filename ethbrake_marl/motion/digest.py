@@ -27,7 +27,7 @@ from ethbrake_marl.motion.layout import (
     scratch_for,
 )
 
-WORLDS = 400  # of each number of vehicles
+DIGEST_WORLDS = 400  # of each number of vehicles
 INTERVALS_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # each with new commands
 
 
@@ -50,13 +50,13 @@ def played(vehicles: int) -> list[Floats]:
     numbers = np.random.PCG64(vehicles)  # its raw numbers are the same in every version of numpy
 
     def drawn(least: float, most: float, columns: int = vehicles) -> Floats:
-        raw = numbers.random_raw(WORLDS * columns).reshape(WORLDS, columns) >> np.uint64(11)
+        raw = numbers.random_raw(DIGEST_WORLDS * columns).reshape(DIGEST_WORLDS, columns) >> np.uint64(11)
         return least + (most - least) * (raw.astype(np.float64) / 2.0**53)
 
     def chosen(*values: float, columns: int = 1) -> Floats:
         return np.array(values)[drawn(0.0, len(values), columns).astype(np.int64)]
 
-    line, car = np.zeros((WORLDS, LINE_ROWS, vehicles + 1)), np.zeros((WORLDS, CAR_ROWS, vehicles + 1))
+    line, car = np.zeros((DIGEST_WORLDS, LINE_ROWS, vehicles + 1)), np.zeros((DIGEST_WORLDS, CAR_ROWS, vehicles + 1))
     line[:, SPEED, 1:], line[:, GAP, -1] = drawn(0.0, 25.0), math.inf
     line[:, GAP, 1:-1] = drawn(0.0, 10.0, vehicles - 1) * chosen(0.0, 0.001, 1.0, 1.0, columns=vehicles - 1)
     line[:, GAP, :1] = np.where(chosen(0.0, 1.0) == 0.0, drawn(0.0, 60.0, 1), FAR_M)
@@ -67,7 +67,12 @@ def played(vehicles: int) -> list[Floats]:
     for row in (BRAKE_RATE, RELEASE_RATE):
         car[:, row, 1:] = np.where(builds == 1.0, drawn(5.0, 50.0), math.inf)
     car[:, [MASS, BRAKE_RATE, RELEASE_RATE], 0] = math.inf
-    lines, time, wanted, scratch = [], np.zeros(WORLDS), np.zeros((WORLDS, vehicles + 1)), scratch_for(vehicles + 1)
+    lines, time, wanted, scratch = (
+        [],
+        np.zeros(DIGEST_WORLDS),
+        np.zeros((DIGEST_WORLDS, vehicles + 1)),
+        scratch_for(vehicles + 1),
+    )
     for length_s in INTERVALS_S:
         share = drawn(-1.5, 1.0)
         wanted[:, 1:] = np.where(

@@ -217,8 +217,8 @@ def resolve_impacts(line, car, scratch, now, ahead):
     """Resolve every cluster in which a pair closes, and count its harm; return False if no pair closes.
 
     Harm of an impact: the squared closing speed (m2/s2), added to the rows NEW of ``scratch``. A touch does none. The
-    part of a further impact that forces have built up since the pair last touched is a push (``motion.push``). ``now``
-    (s from the start of the interval) is noted for the first impact of each pair.
+    part of a further impact that forces have built up since the pair last touched is a push (``motion.add_push``).
+    ``now`` (s from the start of the interval) is noted for the first impact of each pair.
     """
     pairs, closes, first = line.shape[1] - 1, False, ahead
     for p in range(ahead, pairs):

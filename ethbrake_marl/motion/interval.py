@@ -55,7 +55,7 @@ from ethbrake_marl.motion.layout import (
     TOTAL,
     WAY,
 )
-from ethbrake_marl.motion.push import push
+from ethbrake_marl.motion.push import add_push
 
 # what `move_line` returns
 APART = 0  # no two bodies could touch
@@ -313,7 +313,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
                 break
             parting = accelerate(line, car, scratch, ahead, builds)
             passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
-            push(line, car, scratch, passed, ahead, builds)
+            add_push(line, car, scratch, passed, ahead, builds)
             if not move(line, scratch, passed, ahead, builds):
                 break
             for i in range(ahead, bodies):

@@ -50,7 +50,7 @@ def integral_of_largest(value, rate, count, duration):
 
 
 @kernel
-def alone(car, scratch, body, last, toward, side, held):
+def group_acceleration(car, scratch, body, last, toward, side, held):
     """Acceleration (m/s2) of ``body`` if only the bodies from it to ``last`` were there.
 
     ``toward`` is 1 for the bodies behind a contact, where the largest mean counts, and -1 for those in front, where the
@@ -69,7 +69,7 @@ def alone(car, scratch, body, last, toward, side, held):
 
 @large
 def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
-    """Speed (m/s) that ``alone`` gives ``body``, where brakes build up; ``side_jerk``: row of the rates."""
+    """Speed (m/s) that ``group_acceleration`` gives ``body`` where brakes build up; ``side_jerk``: row of the rates."""
     count, mass, force, rate = 0, 0.0, 0.0, 0.0
     for i in range(body, last + toward, toward):
         if car[MASS, i] == math.inf:
@@ -86,7 +86,7 @@ def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
 
 
 @kernel
-def push(line, car, scratch, duration, ahead, builds):
+def add_push(line, car, scratch, duration, ahead, builds):
     """Add what the contacts take up in ``duration`` (s), in which no event happens, to the row PUSHED of ``line``."""
     pairs, head = line.shape[1] - 1, ahead
     for p in range(ahead, pairs):
@@ -104,7 +104,8 @@ def push(line, car, scratch, duration, ahead, builds):
             taken = gain(car, scratch, p + 1, tail, 1, behind, behind + LOW_JERK - LOW, held, duration)
             taken -= gain(car, scratch, p, head, -1, front, front + LOW_JERK - LOW, held, duration)
         else:
-            taken = alone(car, scratch, p + 1, tail, 1, behind, held) - alone(car, scratch, p, head, -1, front, held)
+            taken = group_acceleration(car, scratch, p + 1, tail, 1, behind, held)
+            taken -= group_acceleration(car, scratch, p, head, -1, front, held)
             taken *= duration
         if taken > SAME_MPS2 * duration:  # less is rounding
             line[PUSHED, p] += taken

@@ -15,7 +15,7 @@ from ethbrake_marl.policies.manifest import Manifest, content_sha256
 from ethbrake_marl.policies.policy import MANIFEST, WEIGHTS, Policy, checked_tensors
 
 LIMITS_BYTES = {MANIFEST: 1 << 20, WEIGHTS: 256 << 20}  # of the files of a bundle
-SHIPPED = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a bundle, NAME/card.md describes it
+POLICY_FOLDER = Path(__file__).resolve().parents[1] / "_policies"  # NAME/policy is a bundle, NAME/card.md describes it
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
@@ -49,10 +49,10 @@ def _read_manifest(file: Path) -> Manifest:
         content, manifest = read_json_model(_read(file), Manifest)
     except ValueError as error:
         raise CorruptBundle(str(error) if isinstance(error, CorruptBundle) else f"{file}: {error}") from None
-    own = content_sha256(content)
-    if own != manifest.manifest_sha256:
+    digest = content_sha256(content)
+    if digest != manifest.manifest_sha256:
         raise CorruptBundle(
-            f"{file}: the content has SHA-256 {own}, but manifest_sha256 is {manifest.manifest_sha256}; the file was"
+            f"{file}: the content has SHA-256 {digest}, but manifest_sha256 is {manifest.manifest_sha256}; the file was"
             " changed after it was saved"
         )
     manifest.observation.check(file, manifest.versions.get("ethbrake-marl", "not recorded"))
@@ -78,7 +78,7 @@ def _bundle_in(path: Path) -> Path:
 
 def shipped_policies() -> dict[str, Path]:
     """Name -> folder of every shipped policy. The folder has its card and the bundle ``policy``."""
-    return {folder.parent.name: folder.parent for folder in sorted(SHIPPED.glob("*/policy"))}
+    return {folder.parent.name: folder.parent for folder in sorted(POLICY_FOLDER.glob("*/policy"))}
 
 
 def load_shipped(name: str) -> Policy:
@@ -111,7 +111,7 @@ def save_drivers(drivers: Mapping[str, Policy], folder: str | os.PathLike[str], 
 def load_drivers(folder: str | os.PathLike[str]) -> dict[str, Policy]:
     """Vehicle -> policy, front to rear, of a ``save_drivers`` folder. Raises the errors of ``load_policy``."""
     path = Path(folder)
-    names = sorted((each.name for each in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
+    names = sorted((place.name for place in path.glob("vehicle_[1-9]*")), key=lambda name: (len(name), name))
     if names:
         return {name: load_policy(path / name) for name in names}
     policy = load_policy(path)

@@ -18,7 +18,7 @@ Float32s = NDArray[np.float32]
 Layers = list[tuple[Float32s, Float32s]]  # weights and biases, from the first layer to the last
 
 SATURATED = 10.0  # above 9.02 tanh is 1 in single precision
-SMALL = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
+CUBIC_BELOW = 1e-4  # below this, x - x^3 / 3 is tanh(x) to double precision
 
 
 def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers:
@@ -28,8 +28,8 @@ def layers_of(tensors: Mapping[str, Float32s], name: str, hidden: int) -> Layers
     """
     names = [f"{name}.{k}" for k in range(hidden)] + [f"{name}.output"]
     return [
-        (np.ascontiguousarray(tensors[f"{each}.weight"]), np.ascontiguousarray(tensors[f"{each}.bias"]))
-        for each in names
+        (np.ascontiguousarray(tensors[f"{layer}.weight"]), np.ascontiguousarray(tensors[f"{layer}.bias"]))
+        for layer in names
     ]
 
 
@@ -41,16 +41,16 @@ def dense(weight: Float32s, bias: Float32s, x: Float32s, y: Float32s) -> None:
     of a plain sum. A column of ``y`` depends only on the same column of ``x``.
     """
     inputs = weight.shape[1]
-    whole = inputs - inputs % 4
+    block_end = inputs - inputs % 4
     for j in range(weight.shape[0]):
         out = y[j]
         out[:] = bias[j]
-        for k in range(0, whole, 4):
+        for k in range(0, block_end, 4):
             w0, w1, w2, w3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
             x0, x1, x2, x3 = x[k], x[k + 1], x[k + 2], x[k + 3]
             for r in range(out.shape[0]):
                 out[r] += (w0 * x0[r] + w1 * x1[r]) + (w2 * x2[r] + w3 * x3[r])
-        for k in range(whole, inputs):
+        for k in range(block_end, inputs):
             for r in range(out.shape[0]):
                 out[r] += weight[j, k] * x[k, r]
 
@@ -69,6 +69,6 @@ def squash(values: Float32s) -> None:
             z = 2.0 * a
             k = int(z * PER_LN2 + 0.5)
             t = 1.0 - 2.0 / (exp_rest(z, k) * float(1 << k) + 1.0)
-            if a < SMALL:
+            if a < CUBIC_BELOW:
                 t = a - a * a * a / 3.0
             row[r] = np.float32(t if x >= 0.0 else -t)

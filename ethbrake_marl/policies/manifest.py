@@ -17,12 +17,12 @@ from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.files.model import NAME_PATTERN
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.policies.network import NetworkSpec
-from ethbrake_marl.policies.observed import Finite, ObservationSchema, Sha256
+from ethbrake_marl.policies.observed import FiniteModel, ObservationSchema, Sha256
 from ethbrake_marl.registry import versions_used
 
 LONGEST_STEP_S = 1e6
-PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")
-PHYSICS = "physics"  # key of `versions`: digest of the physics; files of earlier versions lack it
+POLICY_PACKAGES = ("ethbrake-marl", "gymnasium", "numba", "numpy", "safetensors", "stable-baselines3", "torch")
+PHYSICS_KEY = "physics"  # key of `versions`: digest of the physics; files of earlier versions lack it
 
 Learner = Annotated[str, Field(pattern=r"^vehicle_[1-9][0-9]?$")]
 
@@ -32,11 +32,11 @@ version_of = cache(version)  # reading one takes a millisecond
 
 def installed_versions() -> dict[str, str]:
     """Name -> version of Python, the physics, and every package that may affect a training."""
-    own = {"python": platform.python_version(), PHYSICS: physics_digest()}
-    return own | {name: version_of(name) for name in PACKAGES} | versions_used()
+    core_versions = {"python": platform.python_version(), PHYSICS_KEY: physics_digest()}
+    return core_versions | {name: version_of(name) for name in POLICY_PACKAGES} | versions_used()
 
 
-class Manifest(Finite):
+class Manifest(FiniteModel):
     """Everything that a policy bundle records, except the tensors."""
 
     format: Literal["ethbrake-policy"] = "ethbrake-policy"
@@ -58,8 +58,8 @@ class Manifest(Finite):
     def time_step_s(self) -> float:
         """Time between two decisions in training (s); NaN if the file does not contain it."""
         step = self.scenario.get("time_step_s")
-        known = isinstance(step, int | float) and not isinstance(step, bool) and 0.0 < step <= LONGEST_STEP_S
-        return float(step) if known else math.nan  # type: ignore[arg-type]  # a number
+        is_valid = isinstance(step, int | float) and not isinstance(step, bool) and 0.0 < step <= LONGEST_STEP_S
+        return float(step) if is_valid else math.nan  # type: ignore[arg-type]  # a number
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Manifest:

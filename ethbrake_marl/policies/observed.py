@@ -36,13 +36,13 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Neighbours = Annotated[int, Field(ge=0, le=64)]
 
 
-class Finite(FileModel):
+class FiniteModel(FileModel):
     """A part of a file in which infinity and NaN are not allowed."""
 
     model_config = ConfigDict(allow_inf_nan=False)
 
 
-class FeatureDefinition(Finite):
+class FeatureDefinition(FiniteModel):
     """A feature with a function of its own, as it was when the policy was trained."""
 
     name: Annotated[str, Field(max_length=64)]
@@ -55,15 +55,15 @@ class FeatureDefinition(Finite):
     tried: Annotated[tuple[float, ...], Field(max_length=64)]  # what is observed in a few worlds
 
     @classmethod
-    def of_own(cls, name: str, own: Own) -> Self:
-        feature = own.feature
+    def of_own(cls, name: str, entry: Own) -> Self:
+        feature = entry.feature
         return cls(
-            name=name, of=own.of, unit=feature.unit, scale=feature.scale, low=feature.low, high=feature.high,
-            unknown=own.unknown, tried=_tried(own),
+            name=name, of=entry.of, unit=feature.unit, scale=feature.scale, low=feature.low, high=feature.high,
+            unknown=entry.unknown, tried=_trial_values(entry),
         )  # fmt: skip
 
 
-class ObservationSchema(Finite):
+class ObservationSchema(FiniteModel):
     """The features that a policy observes, in order, with a hash of their scaling."""
 
     front: Neighbours  # number of observed neighbours ahead
@@ -77,11 +77,11 @@ class ObservationSchema(Finite):
         scaling = [[f.name, f.unit, f.scale, f.low, f.high] for f in view.features]
         split = [name.rpartition(".") for name in view.names]
         sides = [side_of(name.partition(".")[0]) or 0 for name in view.names]
-        own = dict.fromkeys(last for side, _, last in split if last in FEATURES and (not side or side_of(side)))
+        names = dict.fromkeys(last for side, _, last in split if last in FEATURES and (not side or side_of(side)))
         return cls(
             front=max(0, -min(sides)), rear=max(0, *sides), features=view.names,
             scaling_sha256=hashlib.sha256(json.dumps(scaling).encode()).hexdigest(),
-            registered=tuple(FeatureDefinition.of_own(name, FEATURES[name]) for name in own),
+            registered=tuple(FeatureDefinition.of_own(name, FEATURES[name]) for name in names),
         )  # fmt: skip
 
     def check(self, where: Path, version: str) -> None:
@@ -90,23 +90,23 @@ class ObservationSchema(Finite):
         ``InvalidInput``: a user's feature is missing or has changed. ``CorruptBundle``: a feature of this package
         differs.
         """
-        for was in self.registered:
-            observes = f"{where}: the policy observes the feature {was.name!r:.80}"
-            if was.name not in FEATURES:
+        for old in self.registered:
+            observes = f"{where}: the policy observes the feature {old.name!r:.80}"
+            if old.name not in FEATURES:
                 raise InvalidInput(
                     f"{observes}, which is not registered; install the package that registers it, or register it"
                     " yourself first with eb.register_feature"
                 )
-            own = FEATURES[was.name]
-            now = FeatureDefinition.of_own(was.name, own)
-            alike = len(was.tried) == len(now.tried) and np.allclose(was.tried, now.tried, rtol=1e-6, atol=1e-6)
-            if alike or _is_ours(own):
-                now = now.model_copy(update={"tried": was.tried})
-            for key, value in now:
-                if getattr(was, key) != value:
+            entry = FEATURES[old.name]
+            new = FeatureDefinition.of_own(old.name, entry)
+            alike = len(old.tried) == len(new.tried) and np.allclose(old.tried, new.tried, rtol=1e-6, atol=1e-6)
+            if alike or _is_ours(entry):
+                new = new.model_copy(update={"tried": old.tried})
+            for key, value in new:
+                if getattr(old, key) != value:
                     what = "value in a few worlds" if key == "tried" else key
                     raise InvalidInput(
-                        f"{observes}, whose {what} was {getattr(was, key)!r:.60} in training and is {value!r:.60} now;"
+                        f"{observes}, whose {what} was {getattr(old, key)!r:.60} in training and is {value!r:.60} now;"
                         " register the feature as in training, or train again"
                     )
         try:
@@ -120,18 +120,18 @@ class ObservationSchema(Finite):
             )
 
 
-def _is_ours(own: Own) -> bool:
-    return str(getattr(own.function, "__module__", "")).startswith("ethbrake_marl.")
+def _is_ours(entry: Own) -> bool:
+    return str(getattr(entry.function, "__module__", "")).startswith("ethbrake_marl.")
 
 
-def _tried(own: Own) -> tuple[float, ...]:
+def _trial_values(entry: Own) -> tuple[float, ...]:
     """A feature's values in the trial worlds: in one world if this package defines it, else in three."""
     state = _trial_worlds()
-    if _is_ours(own):
+    if _is_ours(entry):
         state = state.take(slice(1))
-    known = np.ones(state.n, np.bool_)
-    seen = [(1, 0), (2, 0), (3, 0)] if own.of == "own" else [(2, -1), (2, 1), (3, -2)]
-    values = [own_feature(own, state, body, offset, known) for body, offset in seen]
+    all_known = np.ones(state.n, np.bool_)
+    places = [(1, 0), (2, 0), (3, 0)] if entry.of == "own" else [(2, -1), (2, 1), (3, -2)]
+    values = [own_feature(entry, state, body, offset, all_known) for body, offset in places]
     return tuple(np.concatenate(values).tolist())
 
 

@@ -110,14 +110,14 @@ def checked_tensors(data: bytes, network: NetworkSpec) -> dict[str, Float32s]:
         tensors = safetensors.numpy.load(data)
     except (SafetensorError, KeyError, TypeError) as error:  # a damaged file, a type that numpy has not
         raise ValueError(f"not a safetensors file ({error})") from None
-    wanted = network.tensors
-    for name in sorted(wanted.keys() ^ tensors.keys()):
-        raise ValueError(f"tensor {name!r}: {'is missing' if name in wanted else 'must not be in this file'}")
+    shapes = network.tensors
+    for name in sorted(shapes.keys() ^ tensors.keys()):
+        raise ValueError(f"tensor {name!r}: {'is missing' if name in shapes else 'must not be in this file'}")
     for name, tensor in tensors.items():
-        if tensor.dtype != np.float32 or tensor.shape != wanted[name]:
+        if tensor.dtype != np.float32 or tensor.shape != shapes[name]:
             raise ValueError(
                 f"tensor {name!r} has type {tensor.dtype} and shape {list(tensor.shape)}; must have type float32 and"
-                f" shape {list(wanted[name])}"
+                f" shape {list(shapes[name])}"
             )
         if not np.isfinite(tensor).all():
             raise ValueError(f"tensor {name!r}: contains a number that is not finite")

@@ -24,12 +24,12 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import held, rollout
-from ethbrake_marl.shields.shield import NamedShield, check_harm_count, check_learners, checked_drivers, spread
+from ethbrake_marl.shields.shield import NamedShield, check_drivers, check_harm_count, checked_drivers, spread
 
-ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
+ACTION_ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
 
 
-class Memory(NamedTuple):
+class EpisodeShieldMemory(NamedTuple):
     """What the shield remembers between two decisions."""
 
     chosen: Bools  # [n] whether the policy drives
@@ -65,9 +65,9 @@ class EpisodeShield:
                 " 'step' guards several, and needs none"
             )
 
-    def begin(self, game: Game, alert: State, state: State) -> Memory:
+    def begin(self, game: Game, alert: State, state: State) -> EpisodeShieldMemory:
         """Memory at the first decision ``state``: which driver gets each episode."""
-        check_learners(game, self.drivers)
+        check_drivers(game, self.drivers)
         ((body, agent),) = self.drivers.items()
         remembered = begin_script(game.agents({body: agent})[body], alert, body)
         known = alert._replace(wanted=state.wanted)
@@ -78,24 +78,26 @@ class EpisodeShield:
         policy_harm = price(game, state, rollout(game, self.drivers, own, held_back, self.count), self.count)
         bound_harm = price(game, state, held_back, self.count) if self.coupled else choice.harm
         nothing = np.zeros((state.n, 1))
-        return Memory(
+        return EpisodeShieldMemory(
             policy_harm <= bound_harm, policy_harm, bound_harm, backup, remembered, nothing, nothing,
             np.zeros((state.n, state.vehicles), np.bool_),
         )  # fmt: skip
 
-    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        memory: Memory = state.memories["shield"]
+    def decide(
+        self, game: Game, state: State, proposed: Floats | None, *, donate: bool
+    ) -> tuple[Floats, EpisodeShieldMemory]:
+        memory: EpisodeShieldMemory = state.memories["shield"]
         (body,) = self.drivers
         own, after = propose(game.agents(self.drivers), state, {body: memory.agent})
         proposed = own if proposed is None else np.where(np.isnan(proposed), own, proposed)
         applied = np.where(memory.chosen[:, np.newaxis], own, memory.backup)
-        differ = (np.abs(applied - proposed) > ROUNDING) & ~state.ended[:, np.newaxis]
+        differ = (np.abs(applied - proposed) > ACTION_ROUNDING) & ~state.ended[:, np.newaxis]
         return applied, memory._replace(
             agent=after[body], proposed=proposed, applied=applied, intervened=spread(game, state, differ, False)
         )
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        memory: Memory = state.memories["shield"]
+        memory: EpisodeShieldMemory = state.memories["shield"]
         return {
             "chosen_policy": memory.chosen,
             "policy_harm": memory.policy_harm,

@@ -19,10 +19,10 @@ from ethbrake_marl.episode.hold import descend, hold
 from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.motion.layout import Floats
 
-SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
-ROUNDS = 2  # in which they try them
+BRAKE_SHARES = np.linspace(0.0, 1.0, 21)  # of its brakes that each of several learners tries at the alert
+FALLBACK_ROUNDS = 2  # in which they try them
 CHANGES = np.array([0.05, -0.05, 0.1, -0.1, 0.2, -0.2, 0.4, -0.4])  # of the plan's next actions, tried as constants
-ALONE = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried while the others follow the plan
+SINGLE_ACTIONS = np.linspace(0.0, -1.0, 4)  # actions of one of several learners, tried while the others follow the plan
 
 
 def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floats]:
@@ -40,7 +40,7 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
         action[:, column] = actions_of(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
         actions.append(action)
     if len(learners) > 1:
-        wanted, _ = descend(state, learners.tolist(), SHARES, ROUNDS, until_s, count)
+        wanted, _ = descend(state, learners.tolist(), BRAKE_SHARES, FALLBACK_ROUNDS, until_s, count)
         actions += [actions_of(alert, learners, wanted[:, learners]), np.full((n, len(learners)), -1.0)]
     return [held(game, action) for action in actions]
 
@@ -62,9 +62,9 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
     planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]
     actions = np.minimum(np.maximum(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0), 0.0)
     if len(learners) > 1:
-        alone = np.repeat(planned[:, np.newaxis], len(learners) * len(ALONE), axis=1)
+        alone = np.repeat(planned[:, np.newaxis], len(learners) * len(SINGLE_ACTIONS), axis=1)
         for column in range(len(learners)):
-            alone[:, column * len(ALONE) : (column + 1) * len(ALONE), column] = ALONE
+            alone[:, column * len(SINGLE_ACTIONS) : (column + 1) * len(SINGLE_ACTIONS), column] = SINGLE_ACTIONS
         actions = np.concatenate([actions, alone], axis=1)
     commands = actions.repeat(each, axis=0) * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
     harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], count)[0]

@@ -77,7 +77,7 @@ def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
     return guard_scripts(dict(sorted((drivers or {}).items())))
 
 
-def check_learners(game: Game, drivers: Mapping[int, Agent]) -> None:
+def check_drivers(game: Game, drivers: Mapping[int, Agent]) -> None:
     if list(drivers) != game.settings.learners.tolist():
         theirs, right = (", ".join(f"vehicle_{i}" for i in each) for each in (drivers, game.settings.learners))
         raise InvalidInput(f"shield: has agents for {theirs}; must have one for each learner, {right or 'none'}")

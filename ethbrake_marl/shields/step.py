@@ -49,8 +49,8 @@ from ethbrake_marl.shields.fallbacks import best_constant, first_plans, rollout
 from ethbrake_marl.shields.shield import (
     NamedShield,
     ShieldReason,
+    check_drivers,
     check_harm_count,
-    check_learners,
     checked_drivers,
     spread,
 )
@@ -64,7 +64,7 @@ NO_DECISION, SAME_AS_PLAN, PLAN_REMAINS, CONSTANT, NO_CERTIFICATE, NOT_A_NUMBER,
 )
 
 
-class Memory(NamedTuple):
+class StepShieldMemory(NamedTuple):
     """What the shield remembers between two decisions."""
 
     plan: Floats  # [n, T, L] actions at every decision; only those from now on count
@@ -121,7 +121,7 @@ class StepShield:
 
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
-    def seen(self, state: State, memory: Memory) -> State:
+    def seen(self, state: State, memory: StepShieldMemory) -> State:
         """M possible states of each world, M rows per world, the nominal one first. Here M = 1."""
         return state
 
@@ -140,10 +140,10 @@ class StepShield:
         """Plans in which the shield's agents drive on until the harm is above ``most`` [n]."""
         return rollout(game, self.drivers, state, plans, self.count, most)
 
-    def bound(self, memory: Memory) -> Floats:
+    def bound(self, memory: StepShieldMemory) -> Floats:
         return np.maximum(memory.price, memory.first + self.allowance) if self.allowance else memory.price
 
-    def begin(self, game: Game, alert: State, state: State) -> Memory:
+    def begin(self, game: Game, alert: State, state: State) -> StepShieldMemory:
         return self.first_memory(game, alert, state, state, self.agents_at(game, alert))
 
     def agents_at(self, game: Game, alert: State) -> dict[int, Any]:
@@ -157,7 +157,9 @@ class StepShield:
         prices = np.stack([self.price(game, states, plan) for plan in plans])
         return np.stack(plans)[prices.argmin(axis=0), np.arange(prices.shape[1])], prices.min(axis=0)
 
-    def first_memory(self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]) -> Memory:
+    def first_memory(
+        self, game: Game, alert: State, state: State, states: State, agents: dict[int, Any]
+    ) -> StepShieldMemory:
         """Memory at the first decision; its plan is the best constant actions or the agents' rollout.
 
         ``states`` are the possible states (``seen``), ``agents`` body -> memory at the alert.
@@ -165,7 +167,7 @@ class StepShield:
         plan, harm = self.cheapest(game, states, self.plans(game, alert, state, states))
         caps = played(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
         if agents:
-            check_learners(game, agents)
+            check_drivers(game, agents)
             own = self.rolled_out(game, state._replace(memories={**state.memories, **agents}), plan)
             value = self.price(game, states, own, caps=caps)
             better = value <= harm
@@ -173,14 +175,16 @@ class StepShield:
         last, _ = played(game, state, plan, self.count)
         settles: Bools = (last.line[:, SPEED] == 0.0).all(axis=1) & (last.line[:, FORCE] <= 0.0).all(axis=1)
         nothing = np.zeros((state.n, len(game.settings.learners)))
-        return Memory(
+        return StepShieldMemory(
             plan, harm, harm.copy(), caps, settles, tuple(agents.values()), nothing, nothing,
             np.full(nothing.shape, NO_DECISION), nothing, np.zeros((state.n, state.vehicles), np.bool_),
             np.zeros(state.n, np.int64),
         )  # fmt: skip
 
-    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        memory: Memory = state.memories["shield"]
+    def decide(
+        self, game: Game, state: State, proposed: Floats | None, *, donate: bool
+    ) -> tuple[Floats, StepShieldMemory]:
+        memory: StepShieldMemory = state.memories["shield"]
         proposed, state = self.asked(game, state, proposed)
         if not donate:
             memory = memory._replace(plan=memory.plan.copy(), price=memory.price.copy())
@@ -233,7 +237,14 @@ class StepShield:
         return proposed, state._replace(memories={**memories, **own})
 
     def accept(
-        self, game: Game, state: State, memory: Memory, rows: Ints, actions: Floats, now: Ints, rests: list[Fallback]
+        self,
+        game: Game,
+        state: State,
+        memory: StepShieldMemory,
+        rows: Ints,
+        actions: Floats,
+        now: Ints,
+        rests: list[Fallback],
     ) -> tuple[Ints, Floats]:
         """Store, in each world of ``rows``, a plan that begins with ``actions`` and keeps the bound, if one is found.
 
@@ -245,7 +256,7 @@ class StepShield:
         plans[np.arange(len(rows)), now] = actions
         seen = self.seen(state, memory)
         M = seen.n // state.n
-        before = part(seen, rows, M)
+        before = take_worlds(seen, rows, M)
         # First the actions with the rest of the present plan, then, where this is rejected, with each fallback.
         least = self.price(game, before, plans, most, take(memory.caps, rows))
         reason = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE)
@@ -253,7 +264,7 @@ class StepShield:
             left = (reason == NO_CERTIFICATE).nonzero()[0]
             if not len(left):
                 break
-            here = part(before, left, M)
+            here = take_worlds(before, left, M)
             after, _ = game.follow(here, actions[left].repeat(M, axis=0))
             later, value = rest(self, game, after, plans[left], most[left])
             # Only plans that the estimate does not rule out are priced.
@@ -263,7 +274,7 @@ class StepShield:
                 tried = np.empty((len(at), *plans.shape[1:]))
                 tried[:] = later[hopeful]
                 tried[np.arange(len(at)), now[at]] = actions[at]
-                states, caps = part(here, hopeful, M), take(memory.caps, rows[at])
+                states, caps = take_worlds(here, hopeful, M), take(memory.caps, rows[at])
                 value[hopeful] = self.price(game, states, tried, most[at], caps)
                 good = value[hopeful] <= most[at]
                 plans[at[good]], reason[at[good]] = tried[good], code
@@ -274,7 +285,7 @@ class StepShield:
         return reason, least
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        memory: Memory = state.memories["shield"]
+        memory: StepShieldMemory = state.memories["shield"]
         borne = {}
         if memory.caps is not None:
             last, _ = played(game, state, memory.plan, self.count)
@@ -291,7 +302,7 @@ class StepShield:
         }
 
 
-def part(states: State, rows: Ints, M: int) -> State:
+def take_worlds(states: State, rows: Ints, M: int) -> State:
     if len(rows) * M == states.n:
         return states
     return states.take(rows if M == 1 else (rows[:, np.newaxis] * M + np.arange(M)).ravel())

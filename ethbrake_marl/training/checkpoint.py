@@ -26,7 +26,7 @@ from ethbrake_marl.files.store import write_file
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 KEYS = {"training", "versions", "steps", "course", "model"}  # of a checkpoint
-MOST = 2  # checkpoints that are kept; if the newest is damaged, training resumes from the one before
+MOST_CHECKPOINTS = 2  # checkpoints that are kept; if the newest is damaged, training resumes from the one before
 LARGEST_BYTES = 1 << 36
 
 
@@ -41,7 +41,7 @@ def capture(model: BaseAlgorithm) -> dict[str, Any]:
         "counters": {name: getattr(model, name) for name in COUNTERS},
         "environment": environment.snapshot(),
         "last": [model._last_obs, np.array(model._last_episode_starts)],
-        "episodes": [[each["r"], each["l"]] for each in model.ep_info_buffer or ()],
+        "episodes": [[episode["r"], episode["l"]] for episode in model.ep_info_buffer or ()],
         "numpy": np.random.get_state(legacy=False),  # noqa: NPY002
         "python": random.getstate(),
         "torch": torch.get_rng_state(),
@@ -60,7 +60,7 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
     environment: Any = model.env
     model._last_obs, model._last_episode_starts = environment.reset(), np.ones(environment.num_envs, np.bool_)
     new = capture(model)
-    state = {part: like(new[part], saved[part]) for part in ("environment", "last", "numpy", "actions")}
+    state = {part: restore_types(new[part], saved[part]) for part in ("environment", "last", "numpy", "actions")}
     model.set_parameters(saved["parameters"], device="cpu")
     for name, value in saved["variables"].items():
         recursive_getattr(model, name).data.copy_(value)
@@ -86,7 +86,7 @@ def restore(model: BaseAlgorithm, saved: Mapping[str, Any]) -> None:
     model.action_space.np_random.bit_generator.state = state["actions"]
 
 
-def like(new: Any, saved: Any) -> Any:
+def restore_types(new: Any, saved: Any) -> Any:
     """Saved data with the types of ``new``: arrays instead of tensors, named tuples instead of plain ones.
 
     Raises ``ValueError`` if entries, or shape or type of an array, differ.
@@ -99,9 +99,9 @@ def like(new: Any, saved: Any) -> Any:
     if isinstance(new, dict):
         if new.keys() != saved.keys():
             raise ValueError(f"has the entries {', '.join(saved)}; must have {', '.join(new)}")
-        return {key: like(value, saved[key]) for key, value in new.items()}
+        return {key: restore_types(value, saved[key]) for key, value in new.items()}
     if isinstance(new, list | tuple):
-        parts = [like(each, other) for each, other in zip(new, saved, strict=True)]
+        parts = [restore_types(entry, saved_entry) for entry, saved_entry in zip(new, saved, strict=True)]
         return type(new)(*parts) if hasattr(new, "_fields") else type(new)(parts)
     return saved
 
@@ -112,7 +112,7 @@ def to_tensors(tree: Any) -> Any:
     if isinstance(tree, dict):
         return {key: to_tensors(value) for key, value in tree.items()}
     if isinstance(tree, list | tuple):
-        parts = [to_tensors(each) for each in tree]
+        parts = [to_tensors(entry) for entry in tree]
         return parts if isinstance(tree, list) else tuple(parts)
     return tree
 
@@ -128,7 +128,7 @@ def write(folder: Path, saved: Mapping[str, Any]) -> None:
     torch.save(to_tensors(dict(saved)), data)
     folder.mkdir(exist_ok=True)
     write_file(folder / f"step_{saved['steps']:012d}.pt", data.getvalue())
-    for old in files_in(folder)[MOST:]:
+    for old in files_in(folder)[MOST_CHECKPOINTS:]:
         old.unlink()
 
 
@@ -146,7 +146,7 @@ def read(path: Path) -> dict[str, Any]:
     return saved
 
 
-def newest(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
+def newest_checkpoint(folder: Path) -> tuple[dict[str, Any] | None, list[str]]:
     """Return the newest undamaged checkpoint, or None, and the errors of newer ones, which are deleted."""
     reasons: list[str] = []
     for path in files_in(folder):

@@ -49,7 +49,7 @@ class Experiment(NamedTuple):
         return Compared.of(scenario, teams, episodes=episodes, seed=seed, harm_count=count, measures=measures)
 
 
-class Report(Protocol):
+class ReportWriter(Protocol):
     """Writes a report about an experiment into the run's folder; extensions provide others."""
 
     measures: tuple[str, ...]  # names of the measures that it can show; those that no package has are left out
@@ -78,7 +78,7 @@ def run_experiment(
     list_seed: int = SEED,
     force: bool = False,
     settings: Sequence[str] = (),
-    report: Report | None = None,
+    report: ReportWriter | None = None,
     on_progress: OnProgress | None = None,
 ) -> tuple[Experiment, Sequence[Any], str]:
     """Train, compare, and write ``results.json``, ``worlds.csv`` and a report into the run's folder.
@@ -96,13 +96,13 @@ def run_experiment(
             f" {scenario.physics} has none; use ethbrake train and ethbrake evaluate"
         )
     started, tell = time.monotonic(), on_progress or (lambda progress: None)
-    shown: Report = report or Tables()
+    writer: ReportWriter = report or Tables()
     count = recipe.reward.harm_count
-    first = partial(evaluate, scenario, episodes=1, seed=list_seed, harm_count=count)
-    whole = partial(evaluate, scenario, FULL_BRAKE.name, episodes=episodes, seed=list_seed)
-    baselines = usable("baselines", TEAM_BASELINES if len(scenario.learners) > 1 else BASELINES, first, tell)
-    installed = [name for name in shown.measures if name in MEASURES]
-    measures = tuple(usable("measures", installed, lambda name: whole(measures=name), tell))
+    test_in_world = partial(evaluate, scenario, episodes=1, seed=list_seed, harm_count=count)
+    test_on_list = partial(evaluate, scenario, FULL_BRAKE.name, episodes=episodes, seed=list_seed)
+    baselines = usable("baselines", TEAM_BASELINES if len(scenario.learners) > 1 else BASELINES, test_in_world, tell)
+    installed = [name for name in writer.measures if name in MEASURES]
+    measures = tuple(usable("measures", installed, lambda name: test_on_list(measures=name), tell))
     trained = train(
         recipe, scenario, directory, steps=steps, seed=seed, force=force, settings=settings, on_progress=on_progress
     )
@@ -116,11 +116,11 @@ def run_experiment(
         tell(Progress("evaluation", 0, episodes, note=note))
         compared = Compared.of(
             scenario, compared_teams(trained, scenario, count, baselines), episodes=episodes, seed=list_seed,
-            harm_count=count, measures=measures, on_done=lambda done: tell(Progress("evaluation", done, episodes)),
+            harm_count=count, measures=measures, on_done=lambda worlds: tell(Progress("evaluation", worlds, episodes)),
         )  # fmt: skip
         write_results(trained.directory, compared.table, compared.result, "csv", force=True)
         experiment = Experiment(trained, compared, measures, started)
-        tables, where = shown.write(experiment, tell)
+        tables, where = writer.write(experiment, tell)
     return experiment, tables, where
 
 
@@ -129,16 +129,16 @@ def usable(what: str, names: Sequence[str], use: Callable[[str], object], tell: 
 
     Raises the error if full braking fails.
     """
-    found = []
+    usable_names = []
     for number, name in enumerate(names):
         try:
             use(name)
-            found.append(name)
+            usable_names.append(name)
         except InvalidInput as error:
             if name == FULL_BRAKE.name:
                 raise
             tell(Progress(what, number, len(names), note=f"{name} is left out: {error}"))
-    return found
+    return usable_names
 
 
 def compared_teams(
@@ -152,9 +152,9 @@ def compared_teams(
     if len(trained.policies) == 1:
         agents |= {POLICY: trained.agent, HYBRID: f"{trained.agent}+episode"}
     else:
-        own = {vehicle: f"policy@{trained.directory / place}" for vehicle, place in trained.training.drivers.items()}
-        agents[TEAM] = own
-        agents |= {without(vehicle): {**own, vehicle: FULL_BRAKE.name} for vehicle in own}
+        specs = {vehicle: f"policy@{trained.directory / place}" for vehicle, place in trained.training.drivers.items()}
+        agents[TEAM] = specs
+        agents |= {without(vehicle): {**specs, vehicle: FULL_BRAKE.name} for vehicle in specs}
         agents[SHIELDED] = f"{trained.agent}+step"
     return teams_of(agents, scenario, harm_count=harm_count)
 

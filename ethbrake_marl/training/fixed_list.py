@@ -19,9 +19,9 @@ from ethbrake_marl.training.training import Training
 
 Policies = Mapping[str, Policy]  # learner -> policy, front to rear; learners may share one
 Evaluate = Callable[[Policies], Mapping[str, float]]  # returns metrics of policies, by name
-Measure = Callable[[Training], Evaluate]
+PolicyMeasure = Callable[[Training], Evaluate]
 
-OBJECTIVE = "objective"  # mean of what the learners minimise, where that is not the harm of the line
+OBJECTIVE_METRIC = "objective"  # mean of what the learners minimise, where that is not the harm of the line
 
 
 def measure_on_list(training: Training) -> Evaluate:
@@ -36,7 +36,7 @@ def measure_on_list(training: Training) -> Evaluate:
     parts = [worlds.take(slice(first, first + CHUNK)) for first in range(0, plan.worlds, CHUNK)]
 
     def measure(policies: Policies) -> dict[str, float]:
-        drivers = {1 + scenario.vehicle_names.index(name): LearnedAgent(each) for name, each in policies.items()}
+        drivers = {1 + scenario.vehicle_names.index(name): LearnedAgent(policy) for name, policy in policies.items()}
         team = Team("policy", drivers)
         return metrics_of(training, State.join([drive(game, part, team) for part in parts]))
 
@@ -46,23 +46,23 @@ def measure_on_list(training: Training) -> Evaluate:
 def metrics_of(training: Training, last: State) -> dict[str, float]:
     reward, scenario = training.recipe.reward, training.scenario
     counts = sorted(COLUMN, key=lambda count: count != reward.harm_count)  # what is counted comes first
-    known = [count for count in counts if count != "honest" or last.is_exact]
-    metrics = {COLUMN[count]: mean(last.harm(count)) for count in known}
+    harm_counts = [count for count in counts if count != "honest" or last.is_exact]
+    metrics = {COLUMN[count]: exact_mean(last.harm(count)) for count in harm_counts}
     metrics["collision_rate"] = float(last.collided.mean())
     metrics["horizon_rate"] = float(last.moving.mean())
     objectives = objectives_of(reward.objective or scenario.objective, scenario.vehicles)
-    if reward.harm > 0.0 and any(each.kind is not OBJECTIVES["total"] for each in objectives):
+    if reward.harm > 0.0 and any(objective.kind is not OBJECTIVES["total"] for objective in objectives):
         harm = amounts(objectives, None, last, reward.harm_count)
-        each = {scenario.vehicle_names[body - 1]: mean(harm[:, body - 1]) for body in scenario.learners}
-        metrics[OBJECTIVE] = sum(each.values()) / len(each)
-        metrics |= {f"{OBJECTIVE}_{name}": value for name, value in each.items()}
+        learner_harm = {scenario.vehicle_names[body - 1]: exact_mean(harm[:, body - 1]) for body in scenario.learners}
+        metrics[OBJECTIVE_METRIC] = sum(learner_harm.values()) / len(learner_harm)
+        metrics |= {f"{OBJECTIVE_METRIC}_{name}": value for name, value in learner_harm.items()}
     return metrics
 
 
-def mean(values: Floats) -> float:
+def exact_mean(values: Floats) -> float:
     return math.fsum(values) / len(values)
 
 
 def deciding(metrics: Mapping[str, float], harm_count: str) -> float:
     """Value by which a training picks its best policy, less is better; NaN if it was not measured."""
-    return metrics.get(OBJECTIVE, metrics.get(COLUMN[harm_count], np.nan))
+    return metrics.get(OBJECTIVE_METRIC, metrics.get(COLUMN[harm_count], np.nan))

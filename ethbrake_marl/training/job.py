@@ -70,5 +70,5 @@ class Job(NamedTuple):
         """Best measurement of a finished training: ``steps``, ``harm`` (the minimised count), and others."""
         count = self.training.recipe.reward.harm_count
         evaluations = read_object(RunFolder(self.folder).status)["evaluations"]
-        best = min(evaluations, key=lambda each: deciding(each, count))
+        best = min(evaluations, key=lambda evaluation: deciding(evaluation, count))
         return {"steps": best["steps"], "harm": deciding(best, count), **{name: best[name] for name in MEASURED}}

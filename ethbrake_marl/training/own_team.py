@@ -51,7 +51,7 @@ def save_team(
     policies: dict[str, Policy] = {}
     for name in views:
         actor = actors[name]
-        sharing = tuple(other for other in views if actors[other] is actor)
+        sharing = tuple(learner for learner in views if actors[learner] is actor)
         policies[name] = policies.get(sharing[0]) or Policy.make(
             network=network_of(name, actor),
             tensors=tensors_of("policy", actor.mean) | {"policy.log_std": array_of(actor.log_std)},
@@ -70,11 +70,11 @@ def network_of(name: str, actor: Any) -> NetworkSpec:
     mean, log_std = getattr(actor, "mean", None), getattr(actor, "log_std", None)
     layers: list[Any] = list(mean) if isinstance(mean, nn.Sequential) else []
     linear, between = layers[::2], layers[1::2]
-    used = (key for key, kind in ACTIVATIONS.items() if between and all(isinstance(each, kind) for each in between))
-    activation = next(used, None)
+    names = (key for key, kind in ACTIVATIONS.items() if between and all(isinstance(layer, kind) for layer in between))
+    activation = next(names, None)
     fits = len(linear) == len(between) + 1 and all(isinstance(layer, nn.Linear) for layer in linear)
-    one = fits and linear[-1].out_features == 1 and isinstance(log_std, Tensor) and log_std.shape == (1,)
-    if activation is None or not one:
+    has_one_output = fits and linear[-1].out_features == 1 and isinstance(log_std, Tensor) and log_std.shape == (1,)
+    if activation is None or not has_one_output:
         raise InvalidInput(f"save_team: the actor of {name}, a {type(actor).__name__}, {CONTRACT}")
     return NetworkSpec(
         observation_size=linear[0].in_features,

@@ -27,7 +27,9 @@ Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
-Layers = Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(strict=False, min_length=1, max_length=8)]
+LayerSizes = Annotated[
+    tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(strict=False, min_length=1, max_length=8)
+]
 
 MOST_DECISIONS = 2**24  # of one update that fit into memory
 ACTOR_LAYERS = "hidden layers of the actor"
@@ -49,15 +51,15 @@ class LearningRate(FileModel):
 
         ``remaining`` is the fraction (1 to 0) of the training's steps that remains.
         """
-        done = min(max(1.0 - remaining, 0.0), 1.0)
-        return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * done))
+        progress = min(max(1.0 - remaining, 0.0), 1.0)
+        return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * progress))
 
 
 class NetworkShape(FileModel):
     """Hidden layers of actor and critics."""
 
-    policy: Layers = Field(description=ACTOR_LAYERS)
-    value: Layers = Field(description="hidden layers of each critic")
+    policy: LayerSizes = Field(description=ACTOR_LAYERS)
+    value: LayerSizes = Field(description="hidden layers of each critic")
     activation: Activation = "relu"
 
 
@@ -170,7 +172,7 @@ class TrainingRecipe(FileModel):
     def replace(self, **changes: Any) -> Self:
         """Recipe with changed values, such as ``replace(seed=3)``. Raises the errors of ``load_recipe``."""
         content = {**self.model_dump(mode="json"), **{key: plain(value) for key, value in changes.items()}}
-        changed = _checked(Document(f"recipe {self.name!r}", content, {}))
+        changed = _check_recipe(Document(f"recipe {self.name!r}", content, {}))
         return changed  # type: ignore[return-value]  # another class only with another algorithm
 
 
@@ -276,20 +278,20 @@ def load_recipe(recipe: str | Path | Mapping[str, Any] | TrainingRecipe) -> Trai
     if isinstance(recipe, TrainingRecipe):
         return recipe
     if isinstance(recipe, Mapping):
-        return _checked(Document("recipe", plain(recipe), {}))
+        return _check_recipe(Document("recipe", plain(recipe), {}))
     text, shipped = str(recipe), shipped_recipes()
     if Path(text).suffix in (".yaml", ".yml") or "/" in text or "\\" in text:
-        return _checked(read_yaml(Path(text).expanduser()))
+        return _check_recipe(read_yaml(Path(text).expanduser()))
     if text not in shipped:
         raise unknown_name("recipe", text, usable_recipes())
-    return _checked(read_yaml(shipped[text]), shipped[text])
+    return _check_recipe(read_yaml(shipped[text]), shipped[text])
 
 
 def _algorithm_in(document: Document) -> object:
     return document.content.get("algorithm", "ppo") if isinstance(document.content, dict) else "ppo"
 
 
-def _checked(document: Document, shipped: Path | None = None) -> TrainingRecipe:
+def _check_recipe(document: Document, shipped: Path | None = None) -> TrainingRecipe:
     name = _algorithm_in(document)
     if not isinstance(name, str) or name not in ALGORITHMS:
         right = f"must be one of {', '.join(ALGORITHMS)}"
@@ -363,9 +365,9 @@ def algorithm_of(recipe: TrainingRecipe) -> Any:
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()
     name = f"{recipe.algorithm}.{recipe.device.partition(':')[0]}"
     if name not in VARIANTS:
-        others = "".join(f", {of} also on {kind}" for of, _, kind in (each.partition(".") for each in VARIANTS))
+        devices = "".join(f", {of} also on {kind}" for of, _, kind in (variant.partition(".") for variant in VARIANTS))
         raise InvalidInput(
             f"recipe {recipe.name!r}: device = {recipe.device!r}: the algorithm {recipe.algorithm} cannot train there;"
-            f" every algorithm trains on cpu{others}"
+            f" every algorithm trains on cpu{devices}"
         )
     return VARIANTS[name]()

@@ -14,8 +14,10 @@ from ethbrake_marl.training.recipe import ALGORITHMS, TrainingRecipe
 def recipe_schema() -> dict[str, Any]:
     """JSON Schema of recipe files. The possible keys depend on ``algorithm``."""
     classes = {name: recipe for name, (recipe, _) in ALGORITHMS.usable().items()}
-    places, whole = models_json_schema([(each, "validation") for each in classes.values()], schema_generator=FileSchema)
-    parts = whole["$defs"]
+    places, schema = models_json_schema(
+        [(recipe, "validation") for recipe in classes.values()], schema_generator=FileSchema
+    )
+    parts = schema["$defs"]
     for name, recipe in classes.items():
         keys = parts[str(places[recipe, "validation"]["$ref"]).rpartition("/")[2]]["properties"]
         keys["algorithm"] |= {"description": key_meanings(recipe)["algorithm"], "const": name}
@@ -46,7 +48,7 @@ def recipe_schema() -> dict[str, Any]:
 def key_meanings(recipe: type[TrainingRecipe]) -> dict[str, str]:
     """Key -> meaning; a key without a description takes it from the base class."""
     meanings: dict[str, str] = {}
-    for each in reversed(recipe.__mro__):
-        for key, field in each.model_fields.items() if issubclass(each, TrainingRecipe) else ():
+    for base in reversed(recipe.__mro__):
+        for key, field in base.model_fields.items() if issubclass(base, TrainingRecipe) else ():
             meanings |= {key: field.description} if field.description else {}
     return meanings

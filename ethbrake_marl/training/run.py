@@ -21,7 +21,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 Status = Literal["running", "finished", "interrupted", "failed"]
 
-FORMAT = "ethbrake-run"
+RUN_FORMAT = "ethbrake-run"
 
 
 class RunFolder:
@@ -61,7 +61,7 @@ class RunFolder:
 
     def write_status(self, status: Status, **more: Any) -> None:
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        before = read_object(self.status) if self.status.exists() else {"format": FORMAT, "format_version": 1}
+        before = read_object(self.status) if self.status.exists() else {"format": RUN_FORMAT, "format_version": 1}
         times = {"started_utc": before.get("started_utc", now), "ended_utc": None if status == "running" else now}
         write_json(self.status, {**before, "status": status, **times, **more})
 
@@ -126,8 +126,8 @@ class RunFolder:
         """
         self.progress.unlink(missing_ok=True)  # it may be a link, whose target must not be overwritten
         if steps is None:
-            for left in self.tensorboard.glob("events.out.tfevents.*"):
-                left.unlink()
+            for event_file in self.tensorboard.glob("events.out.tfevents.*"):
+                event_file.unlink()
         table = CSVOutputFormat(str(self.progress))
         table.file.write(progress)
         table.file.flush()

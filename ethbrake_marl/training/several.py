@@ -36,10 +36,10 @@ class CentralCriticPolicy(ActorCriticPolicy):
 class _OwnPartForTheActor(MlpExtractor):
     """Hidden layers of an actor that sees the first ``own`` of ``whole`` entries, and of a critic that sees all."""
 
-    def __init__(self, own: int, whole: int, net_arch: Any, activation_fn: Any) -> None:
-        super().__init__(own, net_arch, activation_fn, device="cpu")
-        self.value_net = MlpExtractor(whole, net_arch, activation_fn, device="cpu").value_net
-        self.own = own
+    def __init__(self, actor_size: int, critic_size: int, net_arch: Any, activation_fn: Any) -> None:
+        super().__init__(actor_size, net_arch, activation_fn, device="cpu")
+        self.value_net = MlpExtractor(critic_size, net_arch, activation_fn, device="cpu").value_net
+        self.own = actor_size
 
     def forward_actor(self, features: Tensor) -> Tensor:
         return super().forward_actor(features[:, : self.own])
@@ -64,10 +64,10 @@ class SeparatePolicies(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space)
         low, high, kind = observation_space.low, observation_space.high, observation_space.dtype.type
-        own = [Box(low[list(each)], high[list(each)], dtype=kind) for each in columns]
+        spaces = [Box(low[list(indices)], high[list(indices)], dtype=kind) for indices in columns]
         self.columns = columns
         self.members = nn.ModuleList(
-            ActorCriticPolicy(space, action_space, lr_schedule, use_sde=use_sde, **network) for space in own
+            ActorCriticPolicy(space, action_space, lr_schedule, use_sde=use_sde, **network) for space in spaces
         )
 
     @property
@@ -87,8 +87,8 @@ class SeparatePolicies(BasePolicy):
         count = len(observation)
         actions, values, likelihood = torch.empty(count, 1), torch.empty(count, 1), torch.empty(count)
         for number, policy, rows in self._by_learner(observation):
-            own = observation[rows][:, self.columns[number]]
-            actions[rows], values[rows], likelihood[rows] = policy(own, deterministic)
+            part = observation[rows][:, self.columns[number]]
+            actions[rows], values[rows], likelihood[rows] = policy(part, deterministic)
         return actions, values, likelihood
 
     def predict_values(self, observation: Any) -> Tensor:
@@ -135,9 +135,9 @@ class IndependentPPO(PPO):
             self.policy, self.rollout_buffer, self._logger = joint, buffer, log
 
     def _part(self, buffer: RolloutBuffer, number: int) -> RolloutBuffer:
-        own, count = self.policy.policies[number].observation_space, len(self.names)
+        space, count = self.policy.policies[number].observation_space, len(self.names)
         part = RolloutBuffer(
-            buffer.buffer_size, own, self.action_space, self.device, self.gae_lambda, self.gamma, self.n_envs // count
+            buffer.buffer_size, space, self.action_space, self.device, self.gae_lambda, self.gamma, self.n_envs // count
         )
         for name in ("actions", "rewards", "episode_starts", "values", "log_probs", "returns", "advantages"):
             setattr(part, name, getattr(buffer, name)[:, number::count].copy())

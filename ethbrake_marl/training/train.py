@@ -25,11 +25,11 @@ from ethbrake_marl.progress import Progress, Told
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.stopping import stop_on_signal
 from ethbrake_marl.training import checkpoint
-from ethbrake_marl.training.fixed_list import Measure, Policies, measure_on_list
+from ethbrake_marl.training.fixed_list import Policies, PolicyMeasure, measure_on_list
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, algorithm_of
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.training import Training
-from ethbrake_marl.training.updates import BetweenUpdates, Stopped, check_finite
+from ethbrake_marl.training.updates import BetweenUpdates, Stopped, check_finite_model
 from ethbrake_marl.worlds.game import AnyScenario
 
 APPENDED: dict[Scheme, Any] = {"independent": "number", "centralised": "state"}
@@ -68,17 +68,17 @@ class TrainResult:
     def metrics(self) -> Mapping[str, float] | None:
         """Evaluation of ``policies``; None if nothing was measured."""
         steps = next(iter(self.policies.values())).manifest.steps
-        return next((each for each in self.evaluations if each["steps"] == steps), None)
+        return next((evaluation for evaluation in self.evaluations if evaluation["steps"] == steps), None)
 
     @property
     def policy(self) -> Policy:
         """The policy that drives all learners. Raises ``InvalidInput`` if each has its own."""
-        return _only(self.policies)
+        return _shared_policy(self.policies)
 
     @property
     def last_policy(self) -> Policy:
         """The policy at the end. Raises ``InvalidInput`` if each learner has its own."""
-        return _only(self.last_policies)
+        return _shared_policy(self.last_policies)
 
 
 def train(
@@ -92,7 +92,7 @@ def train(
     device: str | None = None,
     force: bool = False,
     settings: Sequence[str] = (),
-    measure: Measure | None = measure_on_list,
+    measure: PolicyMeasure | None = measure_on_list,
     on_progress: Told = "show",
 ) -> TrainResult:
     """Train the learners of a scenario, and write the folder of the run.
@@ -137,7 +137,7 @@ def train(
 def resume(
     directory: str | Path,
     *,
-    measure: Measure | None = measure_on_list,
+    measure: PolicyMeasure | None = measure_on_list,
     on_progress: Told = "show",
     other_versions: bool = False,
 ) -> TrainResult:
@@ -163,7 +163,7 @@ def resume(
         model = make_model(training, environment)
         updates = BetweenUpdates(model, training, folder, evaluate, Progress.listener(on_progress), stop)
         _check_unfinished(folder, training)
-        saved, damaged = checkpoint.newest(folder.checkpoints)
+        saved, damaged = checkpoint.newest_checkpoint(folder.checkpoints)
         if saved is not None:
             _check_same(folder, training, saved, other_versions)
         folder.clear()
@@ -175,9 +175,9 @@ def agent_of(training: Training, directory: Path) -> str:
     return f"{'policy' if len(training.learners) == 1 else 'team'}@{directory}"
 
 
-def _only(policies: Policies) -> Policy:
-    first, *others = policies.values()
-    if any(other is not first for other in others):
+def _shared_policy(policies: Policies) -> Policy:
+    first, *rest = policies.values()
+    if any(policy is not first for policy in rest):
         name = next(iter(policies))
         raise InvalidInput(
             f"training: {', '.join(policies)} have different policies; use the attribute policies, for instance"
@@ -253,7 +253,7 @@ def _learn(updates: BetweenUpdates, saved: Mapping[str, Any] | None) -> TrainRes
                 reset_num_timesteps=saved is None,
             )
         except ValueError:  # torch's, of weights that are not finite, says nothing to a user
-            check_finite(model)
+            check_finite_model(model)
             raise
     except Stopped:
         status = "interrupted"
@@ -285,10 +285,10 @@ def _check_same(folder: RunFolder, training: Training, saved: Mapping[str, Any],
             " the old content, or train again in another folder"
         )
     now, then = installed_versions(), saved["versions"]
-    asked = then.keys() | (now.keys() - versions_used().keys())  # this process may have loaded more parts
-    other = sorted(name for name in asked if now.get(name) != then.get(name))
-    if other and not other_versions:
-        name = other[0]
+    packages = then.keys() | (now.keys() - versions_used().keys())  # this process may have loaded more parts
+    changed_packages = sorted(name for name in packages if now.get(name) != then.get(name))
+    if changed_packages and not other_versions:
+        name = changed_packages[0]
         raise InvalidInput(
             f"{folder.path}: this training began with {name} {then.get(name)}, but {name} {now.get(name)} is installed"
             " and may compute other numbers; install the old version, or continue anyway (--other-versions)"

@@ -15,7 +15,7 @@ from ethbrake_marl.policies.network import NetworkSpec
 from ethbrake_marl.training.recipe import Scheme, TrainingRecipe, load_recipe
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario, views_of
-from ethbrake_marl.worlds.mixture import WORDS
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from ethbrake_marl.worlds.scenario import Scenario
 
 
@@ -84,8 +84,8 @@ class Training(NamedTuple):
         """What the learners minimise, such as ``own``; "" if it is the harm of the whole line."""
         declared = self.recipe.reward.objective or self.scenario.objective
         objectives = objectives_of(declared, self.scenario.vehicles)
-        whole = all(each.kind is OBJECTIVES["total"] for each in objectives)
-        if whole or not self.recipe.reward.harm:
+        is_total = all(objective.kind is OBJECTIVES["total"] for objective in objectives)
+        if is_total or not self.recipe.reward.harm:
             return ""
         if isinstance(declared, str):
             return declared
@@ -93,8 +93,8 @@ class Training(NamedTuple):
 
     def content(self) -> dict[str, dict[str, Any]]:
         """Everything that affects the training, including defaults, without titles and descriptions."""
-        recipe = self.recipe.model_dump(mode="json", exclude=set(WORDS))
-        return {"recipe": recipe, "scenario": self.scenario.content(without=WORDS)}
+        recipe = self.recipe.model_dump(mode="json", exclude=set(DESCRIPTIVE_KEYS))
+        return {"recipe": recipe, "scenario": self.scenario.content(without=DESCRIPTIVE_KEYS)}
 
     @property
     def identity(self) -> str:

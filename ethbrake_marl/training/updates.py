@@ -109,12 +109,12 @@ class BetweenUpdates(BaseCallback):
 
     def keep_weights(self) -> None:
         """Copy the current weights. Raises ``TrainingDiverged``."""
-        check_finite(self.model)
+        check_finite_model(self.model)
         self.weights = weights_of(self.training, self.model)
         self.steps, self.updates = self.model.num_timesteps, self.count
 
     def make_policies(self) -> None:
-        self.policies = policies_of(self.training, self.steps, self.weights)
+        self.policies = make_policies(self.training, self.steps, self.weights)
 
     def measure(self) -> None:
         """Measure the policies, and remember them if they are the best so far."""
@@ -151,7 +151,7 @@ class BetweenUpdates(BaseCallback):
         )
 
     def write_checkpoint(self) -> None:
-        check_finite(self.model)
+        check_finite_model(self.model)
         best = [self.best[learners[0]] for learners in self.training.groups] if self.best else []
         course = {
             "updates": self.count,
@@ -180,8 +180,8 @@ class BetweenUpdates(BaseCallback):
             self.cpu_start = time.process_time() - course["cpu_s"]
             self.keep_weights()
             if course["best"]:
-                tensors = [{name: each.numpy() for name, each in policy.items()} for policy in course["best"]]
-                self.best = policies_of(self.training, course["best_steps"], tensors)
+                tensors = [{name: tensor.numpy() for name, tensor in policy.items()} for policy in course["best"]]
+                self.best = make_policies(self.training, course["best_steps"], tensors)
             self.restored = True
         except Exception as error:  # of whatever kind: Python's, NumPy's or torch's
             raise CorruptBundle(
@@ -196,7 +196,10 @@ class BetweenUpdates(BaseCallback):
         for policies, place in ((self.chosen, self.folder.policy), (self.policies, self.folder.last_policy)):
             if policies:
                 save_drivers(policies, place, replace=True)
-        finite = [{name: value for name, value in each.items() if math.isfinite(value)} for each in self.evaluations]
+        finite = [
+            {name: value for name, value in evaluation.items() if math.isfinite(value)}
+            for evaluation in self.evaluations
+        ]
         self.folder.write_status(
             status,
             reason=None if reason is None else f"{type(reason).__name__}: {reason}",
@@ -209,11 +212,11 @@ class BetweenUpdates(BaseCallback):
             remove_folder(self.folder.checkpoints)
 
 
-def check_finite(model: BaseAlgorithm) -> None:
+def check_finite_model(model: BaseAlgorithm) -> None:
     """Raise ``TrainingDiverged`` unless losses, weights and exploration noise are finite, and the noise is above 0."""
     losses = torch.tensor([value for name, value in model.logger.name_to_value.items() if name.endswith("loss")])
     noise = getattr(model.policy, "log_std", torch.zeros(1)).detach().exp()
-    if not all(bool(torch.isfinite(each).all()) for each in (losses, *model.policy.parameters(), noise, 1.0 / noise)):
+    if not all(bool(torch.isfinite(value).all()) for value in (losses, *model.policy.parameters(), noise, 1.0 / noise)):
         raise TrainingDiverged(
             f"training: a loss, a weight or the noise of exploration is not finite at step {model.num_timesteps}; try a"
             " smaller learning_rate or max_grad_norm, or smaller weights of the reward"
@@ -226,7 +229,7 @@ def weights_of(training: Training, model: BaseAlgorithm) -> list[dict[str, Float
     return [algorithm.tensors(*pair) for pair in zip(algorithm.actors(model), training.networks, strict=True)]
 
 
-def policies_of(training: Training, steps: int, weights: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
+def make_policies(training: Training, steps: int, weights: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
     """Learner -> policy after ``steps`` decisions, from the weights of each group's policy."""
     recipe, scenario = training.recipe, training.scenario
     policies: dict[str, Policy] = {}

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
-from ethbrake_marl.worlds.mixture import WORDS, changed_content
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content
 from ethbrake_marl.worlds.scenario import Scenario, plain
 from ethbrake_marl.worlds.table import read_rows
 
@@ -134,7 +134,7 @@ def _built(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenari
         base = _base(document, content["based_on"], folder, above)
         own = {key: value for key, value in content.items() if key != "based_on"}
         unknown = {key: value for key, value in own.items() if key not in Scenario.model_fields}
-        inherited = {key: value for key, value in base.declared().items() if key not in ("name", *WORDS)}
+        inherited = {key: value for key, value in base.declared().items() if key not in ("name", *DESCRIPTIVE_KEYS)}
         content = {**changed_content(inherited, own), **unknown}
     content = _with_rows(document, (), content, folder)
     listed = content.get("mixture") if isinstance(content, dict) else None
@@ -142,7 +142,7 @@ def _built(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenari
         content = {**content, "mixture": [_member(document, i, entry, folder, above) for i, entry in enumerate(listed)]}
     scenario = Scenario.from_document(Document(document.file, content, document.lines))
     if base is not None:
-        for key in document.content.keys() - {"name", *WORDS, "based_on"}:
+        for key in document.content.keys() - {"name", *DESCRIPTIVE_KEYS, "based_on"}:
             with document.refusing_at((key,)):
                 here, there = ([getattr(each, key) for each in one.members or (one,)] for one in (scenario, base))
                 if here == there and key != "mixture":

@@ -45,7 +45,7 @@ from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.counters import Numbers
-from ethbrake_marl.worlds.quantity import Part, ordered
+from ethbrake_marl.worlds.quantity import ScenarioPart, ordered
 
 if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
@@ -57,7 +57,7 @@ Seconds = Annotated[float, Field(ge=0.0, le=60.0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 
 
-class Equipage(Part):
+class Equipage(ScenarioPart):
     """V2X equipment of the vehicles of one type."""
 
     sends: bool = Field(default=True, description="whether the vehicle sends messages")
@@ -115,7 +115,7 @@ class Extension:
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Any:
         """Memory of this extension for n worlds at the alert: None, an array with one row per world, or a tuple.
 
-        ``numbers`` draws random numbers (``counters.numbers_of``); ``unheard``: as in ``V2X.heard_and_seen``.
+        ``numbers`` draws random numbers (``counters.uniform_numbers``); ``unheard``: as in ``V2X.heard_and_seen``.
         """
 
     def layer(self, v2x: V2X) -> Layer:
@@ -144,7 +144,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 OF_MESSAGES = ("message_period_s", "loss_begins", "loss_ends", "radio_s", "processing_s", "actuation_s")
 
 
-class V2X(Part):
+class V2X(ScenarioPart):
     """The key ``v2x`` of a scenario: the name of a preset, or a mapping with settings that differ from a preset.
 
     Other packages may add keys (``EXTENSIONS``).

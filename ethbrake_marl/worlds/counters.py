@@ -31,7 +31,7 @@ def world_numbers(n: int, seed: int, first: int, purpose: str) -> Ints:
     return np.arange(int(first), int(first) + int(n), dtype=np.int64)
 
 
-def numbers_of(seed: int, purpose: str, attempt: int, index: Ints) -> Numbers:
+def uniform_numbers(seed: int, purpose: str, attempt: int, index: Ints) -> Numbers:
     """Function ``(width, stream)`` -> uniform numbers in [0, 1) of the worlds ``index`` [n], ascending, [n, width].
 
     ``stream`` names an independent sequence of random numbers; ``attempt`` counts from 0 if worlds are drawn again. A

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 GRAVITY_MPS2 = 9.81
 LEAST_WEIGHT = 1e-6  # least weight of harm that one vehicle of a line must have, so that shares of weights are exact
 
-Values = dict[str, Floats]  # key of a quantity -> values in k worlds, [k, vehicles, pairs or 1]
+QuantityValues = dict[str, Floats]  # key of a quantity -> values in k worlds, [k, vehicles, pairs or 1]
 
 
 def world_values(
     scenario: Scenario,
     declared: Callable[[str], Floats],
     settle: Callable[[str, Floats], Floats] = lambda _, values: values,
-) -> Values:
+) -> QuantityValues:
     """All quantities of k worlds except the distance of the obstacle, from the declared ones.
 
     ``declared(key)`` returns the drawn values of a declared quantity, [k, entries]; ``settle(key, values)`` may replace
@@ -48,7 +48,7 @@ def world_values(
     return values
 
 
-def obstacle_gap(scenario: Scenario, values: Values, declared: Callable[[str], Floats]) -> Floats:
+def obstacle_gap(scenario: Scenario, values: QuantityValues, declared: Callable[[str], Floats]) -> Floats:
     """Distance from Vehicle 1 to the obstacle, [k, 1] m, in a scenario with an obstacle.
 
     It is declared, or ``margin + v_1 tau_1 + v_1^2 / (2 a_1)`` from speed, latency and braking capacity of Vehicle 1.
@@ -63,7 +63,7 @@ def obstacle_gap(scenario: Scenario, values: Values, declared: Callable[[str], F
     return declared("obstacle_margin_m") + stop[:, np.newaxis]
 
 
-def mistakes(scenario: Scenario, low: Values, high: Values) -> Iterator[tuple[str, int, int, str]]:
+def mistakes(scenario: Scenario, low: QuantityValues, high: QuantityValues) -> Iterator[tuple[str, int, int, str]]:
     """Contradictions in k worlds whose quantities lie between ``low`` and ``high``, each [k, entries].
 
     Yields the quantity's key (``v2x``: the channel), the vehicle's index, the row of the first such world, and what

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.quantities import CAR_ROWS, QUANTITIES, RECORDING, USUAL
-from ethbrake_marl.worlds.sampling import Drawn, Texts
+from ethbrake_marl.worlds.sampling import DrawnWorlds, Texts
 
 if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
 
 
-def columns_of(drawn: Drawn) -> dict[str, NDArray[np.generic]]:
+def columns_of(drawn: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
     """All columns of drawn worlds, [n] each: ``world`` (its number), ``kinds_of`` and ``quantities_of``."""
     numbers = drawn.worlds.clock[:, NUMBER].astype(np.int64)
     return {"world": numbers, **kinds_of(drawn), **quantities_of(drawn.worlds, drawn.friction)}
@@ -51,7 +51,7 @@ def fixed_columns(scenario: Scenario) -> set[str]:
     return {name for name, (low, high) in ends.items() if low == high}
 
 
-def kinds_of(drawn: Drawn) -> dict[str, Texts]:
+def kinds_of(drawn: DrawnWorlds) -> dict[str, Texts]:
     """Columns of texts: ``scenario`` (in a mixture), ``recording``, ``vehicle_1_type`` and so on."""
     columns = {"scenario": drawn.scenarios, RECORDING: drawn.recordings}
     types = drawn.types.T if (drawn.types != "").any() else ()

@@ -12,9 +12,9 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.json_schema import FileSchema, schema_lines
 from ethbrake_marl.files.model import NAME_PATTERN
 from ethbrake_marl.files.plain import read_plain
-from ethbrake_marl.files.yaml import SIZE_LIMIT, flow_text, parse_yaml
+from ethbrake_marl.files.yaml import YAML_SIZE_LIMIT, flow_text, parse_yaml
 from ethbrake_marl.worlds.catalogue import load_scenario, scenario_path
-from ethbrake_marl.worlds.mixture import WORDS
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from ethbrake_marl.worlds.quantities import ALTERNATIVES, QUANTITIES
 from ethbrake_marl.worlds.roles import LEARNER
 from ethbrake_marl.worlds.scenario import Scenario
@@ -106,7 +106,7 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path
     head = _HEAD.format(name=name, base=base.name) + schema_lines("scenario", "scenario schema")
     text = head + _WORDS.format(name=name, based_on=flow_text(based_on))
     for key in listed_keys():
-        if key.name not in ("name", *WORDS, "based_on"):
+        if key.name not in ("name", *DESCRIPTIVE_KEYS, "based_on"):
             short = key.name in values and key.name not in ("mixture", "table")
             text += f"\n# {key.comment}\n# {key.name}: {flow_text(values[key.name]) if short else key.example}\n"
     return text
@@ -115,7 +115,7 @@ def new_scenario_text(name: str, based_on: str = "paper-random", *, folder: Path
 def whole_text(scenario: str | Path) -> str:
     """Text of a scenario's file; if it is based on another scenario, with all values."""
     path, loaded = scenario_path(scenario), load_scenario(scenario)
-    text = read_plain(path, SIZE_LIMIT).decode("utf-8")
+    text = read_plain(path, YAML_SIZE_LIMIT).decode("utf-8")
     if "based_on" not in parse_yaml(text).content:
         return text
     return "".join(f"{key}: {flow_text(value)}\n" for key, value in loaded.declared().items())
@@ -127,7 +127,7 @@ def scenario_json_schema() -> dict[str, Any]:
         for key in properties.keys() & QUANTITIES.keys():
             properties[key]["allOf"] = [{"$ref": f"#/$defs/range_{key}"}]
     for key, described in schema["properties"].items():
-        if key not in ("name", *WORDS, "based_on"):  # null takes the key of another scenario away
+        if key not in ("name", *DESCRIPTIVE_KEYS, "based_on"):  # null takes the key of another scenario away
             schema["properties"][key] = {"anyOf": [described, {"type": "null"}]}
     ranges = {f"range_{key}": rule.schema for key, rule in QUANTITIES.items()}
     return FileSchema.publish({**schema, "$defs": {**schema["$defs"], **ranges}})

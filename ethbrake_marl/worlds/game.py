@@ -22,10 +22,10 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 AnyScenario = str | Path | Mapping[str, Any] | Scenario  # a mapping is the content of a scenario file
 
-AT_ONCE = 1024  # training worlds that are drawn together: drawing one alone costs as much
+WORLDS_AT_ONCE = 1024  # training worlds that are drawn together: drawing one alone costs as much
 
 
-class Pool:
+class WorldPool:
     """The training worlds of a scenario. It draws many at a time and keeps the rest."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -36,7 +36,7 @@ class Pool:
         """Copies of the worlds ``first`` to ``first + n - 1`` of the seed."""
         worlds = self.worlds
         if worlds is None or seed != self.seed or not self.first <= first or first + n > self.first + worlds.n:
-            worlds = self.scenario.sample(max(4 * n, AT_ONCE), seed, first=first, purpose="training")
+            worlds = self.scenario.sample(max(4 * n, WORLDS_AT_ONCE), seed, first=first, purpose="training")
             self.worlds, self.seed, self.first = worlds, seed, first
         return worlds.take(np.arange(first - self.first, first - self.first + n))
 
@@ -67,7 +67,7 @@ def game_of(
     if rewarding.params.harm:
         _warn_of_ties(scenario, rewarding.params.objective or scenario.objective)
     views = (View(), *views_of(scenario))
-    game = Game(Pool(scenario), scenario.name, settings, rewarding, views, bodies, guard_scripts(scripts))
+    game = Game(WorldPool(scenario), scenario.name, settings, rewarding, views, bodies, guard_scripts(scripts))
     v2x = (scenario.members or (scenario,))[0].v2x  # members of a mixture have the same
     if v2x.extensions:
         layers = [extension.layer(v2x) for extension in v2x.extensions]

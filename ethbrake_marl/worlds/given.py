@@ -19,7 +19,7 @@ from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.derived import mistakes, obstacle_gap, world_values
 from ethbrake_marl.worlds.game import AnyScenario
-from ethbrake_marl.worlds.quantities import OPTIONAL, QUANTITIES, USUAL, Entry, table_columns
+from ethbrake_marl.worlds.quantities import OPTIONAL, QUANTITIES, USUAL, QuantityEntry, table_columns
 from ethbrake_marl.worlds.sampling import state_of
 from ethbrake_marl.worlds.scenario import Scenario
 from ethbrake_marl.worlds.table import CsvFile
@@ -33,7 +33,7 @@ def worlds_from_state(scenario: Scenario, initial_state: Mapping[str, Any]) -> S
     where = "initial_state"
     if not isinstance(initial_state, Mapping):
         raise InvalidInput(f"{where} = {initial_state!r}: must be a mapping such as {{'gaps_m': [7, 7]}}")
-    columns = dict[Entry, Floats]()
+    columns = dict[QuantityEntry, Floats]()
     for key, value in initial_state.items():
         _check_known(f"{where}: unknown key {key!r}", str(key), given_keys(scenario))
         count, numbers = QUANTITIES[key].count(scenario.vehicles), _numbers(f"{where}: {key}", value)
@@ -97,7 +97,7 @@ def given_keys(scenario: Scenario) -> tuple[str, ...]:
     return USUAL + tuple(key for key in OPTIONAL if there.get(key, key in scenario.sources))
 
 
-def given_columns(scenario: Scenario) -> dict[str, Entry]:
+def given_columns(scenario: Scenario) -> dict[str, QuantityEntry]:
     """Possible columns of a table of worlds, such as ``{"gap_1_m": ("gaps_m", 0)}``."""
     return table_columns(given_keys(scenario), scenario.vehicles)
 
@@ -107,7 +107,7 @@ def _check_known(what: str, name: str, known: Sequence[str]) -> None:
         raise InvalidInput(f"{what}; {suggestion(name, known) or 'known: ' + ', '.join(known)}")
 
 
-def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entry]:
+def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[QuantityEntry]:
     known = given_columns(scenario)
     for name in header:
         if header.count(name) > 1:
@@ -117,7 +117,7 @@ def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[Entr
 
 
 def _worlds(
-    scenario: Scenario, given: Mapping[Entry, Floats], where: str, row_text: Callable[[int], str] | None = None
+    scenario: Scenario, given: Mapping[QuantityEntry, Floats], where: str, row_text: Callable[[int], str] | None = None
 ) -> State:
     """Checked worlds from the columns ``given``, (key, index) -> [n], and the scenario's fixed values.
 

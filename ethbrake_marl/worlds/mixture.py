@@ -13,9 +13,9 @@ from ethbrake_marl.worlds.quantities import ALTERNATIVES
 if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
 
-WORDS = ("title", "description", "source")
+DESCRIPTIVE_KEYS = ("title", "description", "source")
 
-_OWN = ("name", *WORDS, "mixture")  # keys of the mixture itself; every other key applies to all members
+_OWN = ("name", *DESCRIPTIVE_KEYS, "mixture")  # keys of the mixture itself; every other key applies to all members
 # Members must not differ in these.
 _ONE_FOR_ALL = ("vehicles", "time_step_s", "horizon_s", "physics", "roles", "objective", "observation")
 _SHARED = (*_ONE_FOR_ALL, "v2x", "early_impacts")  # the mixture has them if all members agree
@@ -54,7 +54,7 @@ def with_members(content: dict[str, Any], scenario: type[Scenario]) -> dict[str,
         require(isinstance(member, dict), at, member, by_name)
         nested = "a mixture cannot contain another mixture; list the scenarios of that mixture instead"
         require("mixture" not in member, at, UNSHOWN, nested)
-        own = {key: value for key, value in member.items() if key not in WORDS}
+        own = {key: value for key, value in member.items() if key not in DESCRIPTIVE_KEYS}
         try:
             members.append(scenario(**changed_content(own, beside)))
         except InvalidInput as error:

@@ -22,18 +22,18 @@ from ethbrake_marl.worlds.quantity import DISTRIBUTIONS, support
 # A stream is an independent sequence of uniform random numbers, named by a tuple.
 MAIN: tuple[int, ...] = ()
 NEWS = (1,)  # delays and losses of the links
-OBSTACLE = (2,)
+OBSTACLE_STREAM = (2,)
 TYPES = (3,)  # types and loads of the vehicles
 MIXTURE = (4,)  # scenario of a mixture
 SURROUNDINGS = (6,)  # friction, row of the table, time before the alert
 BRAKES = (7,)  # brake rates, release rates, weights of harm
 
-BLOCK = 8  # numbers of one vehicle in the streams MAIN and BRAKES
+NUMBERS_PER_VEHICLE = 8  # numbers of one vehicle in the streams MAIN and BRAKES
 PER_TYPE = 4  # numbers of one vehicle in TYPES: type, load, two unused
 OF_WORLD = 4  # numbers of a world in the other streams
 
 Place = tuple[tuple[int, ...], int]  # a stream and a column in it
-Entry = tuple[str, int]  # key of a quantity, and index (from 0) of the vehicle or pair
+QuantityEntry = tuple[str, int]  # key of a quantity, and index (from 0) of the vehicle or pair
 
 ROW: Place = (SURROUNDINGS, 1)  # number that selects the row of a table
 RECORDING = "recording"  # column of a table with texts: the recording and the vehicles that a row comes from
@@ -82,11 +82,11 @@ class Rule(NamedTuple):
         return {"vehicle": vehicles, "pair": vehicles - 1, "world": 1}[self.per]
 
     def place(self, index: int) -> Place:
-        """Stream (``counters.numbers_of``) and column of the random number that draws the value of entry ``index``.
+        """Stream (``counters.uniform_numbers``) and column of the number that draws the value of entry ``index``.
 
         ``index`` (from 0) is that of a vehicle or pair.
         """
-        return self.stream, BLOCK * (self.block + index) + self.slot
+        return self.stream, NUMBERS_PER_VEHICLE * (self.block + index) + self.slot
 
     def column_of(self, index: int) -> str:
         """Name of the column of vehicle or pair ``index`` (from 0), such as ``gap_1_m``."""
@@ -149,7 +149,7 @@ _OTHERWISE = (
     Rule(
         "obstacle_margin_m", "m", "world", 1e4, True, 0,
         "distance from the point where vehicle_1 stops by full braking to an unmovable obstacle ahead", "1.7",
-        stream=OBSTACLE,
+        stream=OBSTACLE_STREAM,
     ),
     Rule(
         "alert_s", "s", "world", 3600.0, False, 2,
@@ -162,7 +162,7 @@ _OPTIONAL = (
     Rule(
         "obstacle_gap_m", "m", "world", 1e4, True, 0,
         "distance from the front of vehicle_1 to an unmovable obstacle ahead, at the alert", "42", "obstacle_gap_m",
-        stream=OBSTACLE,
+        stream=OBSTACLE_STREAM,
     ),
     Rule(
         "friction", "", "world", 2.0, True, 0,
@@ -206,9 +206,9 @@ CAR_ROWS = {
 }  # rows of `State.car`
 
 
-def width_of(stream: tuple[int, ...], vehicles: int) -> int:
-    """Number of random numbers that one world takes from a ``stream`` (``counters.numbers_of``), such as ``MAIN``."""
-    return BLOCK * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
+def stream_width(stream: tuple[int, ...], vehicles: int) -> int:
+    """Random numbers that one world takes from a ``stream``, such as ``MAIN`` (``counters.uniform_numbers``)."""
+    return NUMBERS_PER_VEHICLE * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 
 def check_count(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
@@ -217,6 +217,6 @@ def check_count(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
     require(holds, at, UNSHOWN, f"has {len(value) if isinstance(value, tuple) else 1} entries; {right}")
 
 
-def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, Entry]:
+def table_columns(keys: tuple[str, ...], vehicles: int) -> dict[str, QuantityEntry]:
     """Columns of a table with these quantities, such as ``{"gap_1_m": ("gaps_m", 0)}``."""
     return {QUANTITIES[key].column_of(i): (key, i) for key in keys for i in range(QUANTITIES[key].count(vehicles))}

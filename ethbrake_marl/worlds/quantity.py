@@ -26,11 +26,11 @@ def ordered(ends: tuple[float, float]) -> tuple[float, float]:
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[Number, Field(gt=0.0)]
+PositiveNumber = Annotated[Number, Field(gt=0.0)]
 Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 Pair = Annotated[tuple[Number, Number], Field(strict=False)]
 Ends = Annotated[Pair, AfterValidator(ordered)]
-PositiveEnds = Annotated[tuple[Positive, Positive], Field(strict=False), AfterValidator(ordered)]
+PositiveEnds = Annotated[tuple[PositiveNumber, PositiveNumber], Field(strict=False), AfterValidator(ordered)]
 
 
 def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
@@ -39,7 +39,7 @@ def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:
     return np.searchsorted(cumulative / cumulative[-1], u, side="right")
 
 
-class Part(FileModel):
+class ScenarioPart(FileModel):
     """Part of a scenario file; a key without a value is an error."""
 
     @field_validator("*", mode="before")
@@ -49,7 +49,7 @@ class Part(FileModel):
         return value
 
 
-class Distribution(Part):
+class Distribution(ScenarioPart):
     """A distribution. Its first field has the distribution's name and contains its shape."""
 
     @property
@@ -79,11 +79,11 @@ class LogUniform(Distribution):
         return np.clip(low * exp_each(u * log(high / low)), low, high)
 
 
-class NormalShape(Part):
+class NormalShape(ScenarioPart):
     """Mean and standard deviation before truncation, and the smallest and largest possible value."""
 
     mean: Number
-    sd: Positive
+    sd: PositiveNumber
     low: Number
     high: Number
 
@@ -112,13 +112,13 @@ class Normal(Distribution):
         return self.normal.value(u)
 
 
-class LogNormalShape(Part):
+class LogNormalShape(ScenarioPart):
     """Median and standard deviation of the logarithm before truncation, and the smallest and largest value."""
 
-    median: Positive
-    sigma: Positive
-    low: Positive
-    high: Positive
+    median: PositiveNumber
+    sigma: PositiveNumber
+    low: PositiveNumber
+    high: PositiveNumber
 
     @model_validator(mode="after")
     def _likely(self) -> Self:
@@ -130,7 +130,7 @@ class LogNormalShape(Part):
         return NormalShape.model_construct(mean=log(self.median), sd=self.sigma, low=low, high=high)
 
 
-def _check_likely(shape: Part, of_normal: NormalShape) -> None:
+def _check_likely(shape: ScenarioPart, of_normal: NormalShape) -> None:
     require(of_normal.low < of_normal.high, (), shape, "low must be below high")
     below, above = of_normal.shares()
     right = f"the untruncated distribution must have a probability of at least {LEAST_MASS:g} in [low, high]"

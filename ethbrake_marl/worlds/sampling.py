@@ -15,8 +15,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
 from ethbrake_marl.motion.layout import BRAKE_RATE, FAR_M, GAP, IMPACTS, LATENCY, Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import PER_LINK
-from ethbrake_marl.worlds.counters import Numbers, Purpose, numbers_of, world_numbers
-from ethbrake_marl.worlds.derived import Values, obstacle_gap, world_values
+from ethbrake_marl.worlds.counters import Numbers, Purpose, uniform_numbers, world_numbers
+from ethbrake_marl.worlds.derived import QuantityValues, obstacle_gap, world_values
 from ethbrake_marl.worlds.quantities import (
     CAR_ROWS,
     MIXTURE,
@@ -27,7 +27,7 @@ from ethbrake_marl.worlds.quantities import (
     RECORDING,
     ROW,
     TYPES,
-    width_of,
+    stream_width,
 )
 from ethbrake_marl.worlds.quantity import pick
 from ethbrake_marl.worlds.roles import first_command
@@ -43,7 +43,7 @@ IN_CACHE = 1024  # worlds whose arrays fit into a processor's cache
 Texts = NDArray[np.str_]
 
 
-class Drawn(NamedTuple):
+class DrawnWorlds(NamedTuple):
     """Worlds at the alert, with drawn values that their state does not contain."""
 
     worlds: State
@@ -54,12 +54,12 @@ class Drawn(NamedTuple):
     rejected: int = 0  # draws with an impact before the first learner could act
 
     @classmethod
-    def given(cls, worlds: State) -> Drawn:
+    def given(cls, worlds: State) -> DrawnWorlds:
         n = worlds.n
         return cls(worlds, np.full(n, np.nan), np.full((n, worlds.vehicles), ""), np.full(n, ""), np.full(n, ""))
 
 
-def draw(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) -> Drawn:
+def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) -> DrawnWorlds:
     """Worlds ``first`` to ``first + n - 1`` of the endless list of the seed.
 
     Raises ``InvalidInput`` for bad arguments, and for a world that is rejected ``MOST_ATTEMPTS`` times.
@@ -76,11 +76,11 @@ def draw(scenario: Scenario, n: int, seed: int, first: int, purpose: Purpose) ->
 
 def member_numbers(scenario: Scenario, index: Ints, seed: int, purpose: Purpose = "list") -> Ints:
     """Number (from 0) of the member from which each of the worlds ``index`` [n], ascending, is drawn, [n]."""
-    u = numbers_of(seed, purpose, 0, index)(OF_WORLD, MIXTURE)[:, 0]
+    u = uniform_numbers(seed, purpose, 0, index)(OF_WORLD, MIXTURE)[:, 0]
     return pick([member.weight for member in scenario.mixture or ()], u)
 
 
-def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
+def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> DrawnWorlds:
     """Worlds ``index`` from these random numbers, not drawn again if they have an early impact. Not for mixtures."""
     n, N, line, column = len(index), scenario.vehicles, scenario.types_of_line, scenario.columns.get(RECORDING)
     numbers, kind, load = cache(numbers), np.zeros((n, N), np.int64), np.zeros((n, N))
@@ -90,7 +90,7 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> Drawn:
     whole = world_values(scenario, declared)
     if scenario.has_obstacle:
         whole["obstacle_gap_m"] = obstacle_gap(scenario, whole, declared)
-    return Drawn(
+    return DrawnWorlds(
         state_of(scenario, whole, numbers, scenario.unheard(kind), index),
         whole["friction"][:, 0] if "friction" in whole else np.full(n, np.nan),
         np.full((n, N), "") if line is None else np.array(line.names)[kind],
@@ -113,7 +113,7 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
                     continue
                 # All columns of a table take their number from one place, so a world takes them from the same row.
                 stream, column = ROW if isinstance(quantity, TableColumn) else QUANTITIES[key].place(i)
-                u = numbers(width_of(stream, scenario.vehicles), stream)[rows, column]
+                u = numbers(stream_width(stream, scenario.vehicles), stream)[rows, column]
                 of = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)
                 drawn[rows, i] = quantity.value(*of)
         return drawn
@@ -121,11 +121,11 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
     return declared
 
 
-def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools, index: Ints) -> State:
+def state_of(scenario: Scenario, whole: QuantityValues, numbers: Numbers, unheard: Bools, index: Ints) -> State:
     """State at the alert of the worlds ``index`` [n], from ``whole``: all their quantities.
 
-    ``numbers`` draws the delays of V2X links (``counters.numbers_of``); links in ``unheard`` (``Scenario.unheard``)
-    never deliver.
+    ``numbers`` draws the delays of V2X links (``counters.uniform_numbers``); links in ``unheard``
+    (``Scenario.unheard``) never deliver.
     """
     n, N = whole["speeds_mps"].shape
     line, car = np.zeros((n, layout.LINE_ROWS, N + 1)), np.zeros((n, layout.CAR_ROWS, N + 1))
@@ -153,15 +153,15 @@ def state_of(scenario: Scenario, whole: Values, numbers: Numbers, unheard: Bools
     return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 
-def _accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> Drawn:
+def _accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> DrawnWorlds:
     """Worlds ``index``; worlds with an early impact are drawn again if the scenario rejects them."""
-    drawn = draw_once(scenario, numbers_of(seed, purpose, 0, index), index)
+    drawn = draw_once(scenario, uniform_numbers(seed, purpose, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
         return drawn
     pending, rejected, attempt = np.flatnonzero(has_early_impact(scenario, drawn.worlds)), 0, 0
     while len(pending) and attempt < MOST_ATTEMPTS - 1:
         rejected, attempt = rejected + len(pending), attempt + 1
-        again = draw_once(scenario, numbers_of(seed, purpose, attempt, index[pending]), index[pending])
+        again = draw_once(scenario, uniform_numbers(seed, purpose, attempt, index[pending]), index[pending])
         drawn.worlds.put(pending, again.worlds, donate=True)
         for whole, part in zip(drawn[1:5], again[1:5], strict=True):
             whole[pending] = part
@@ -184,7 +184,7 @@ def has_early_impact(scenario: Scenario, alert: State) -> Bools:
     return np.asarray(state.line[:, IMPACTS].any(axis=1))
 
 
-def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
+def merged(parts: Sequence[DrawnWorlds], place: Ints) -> DrawnWorlds:
     """Worlds of all parts together: row i of the joined parts goes to row ``place[i]``."""
     order = np.argsort(place)
 
@@ -194,4 +194,4 @@ def merged(parts: Sequence[Drawn], place: Ints) -> Drawn:
     worlds = State.join([part.worlds for part in parts], of_parts)
     friction, types, scenarios, recordings = map(of_parts, zip(*(part[1:5] for part in parts), strict=True))
     rejected = sum(part.rejected for part in parts)
-    return Drawn(worlds, friction, types, scenarios, recordings, rejected)
+    return DrawnWorlds(worlds, friction, types, scenarios, recordings, rejected)

@@ -35,11 +35,11 @@ from ethbrake_marl.worlds.channel import V2X
 from ethbrake_marl.worlds.checks import ScenarioWording, check_whole
 from ethbrake_marl.worlds.counters import Purpose
 from ethbrake_marl.worlds.derived import world_values
-from ethbrake_marl.worlds.mixture import WORDS, changed_content, with_members
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content, with_members
 from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_count, table_columns
-from ethbrake_marl.worlds.quantity import Part, PerVehicle, Quantity, Weight, support
+from ethbrake_marl.worlds.quantity import PerVehicle, Quantity, ScenarioPart, Weight, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
-from ethbrake_marl.worlds.sampling import Drawn, draw
+from ethbrake_marl.worlds.sampling import DrawnWorlds, draw_worlds
 from ethbrake_marl.worlds.table import Table, TableColumn
 from ethbrake_marl.worlds.vehicle_types import Types, TypesOfLine, VehicleTypes
 
@@ -57,7 +57,7 @@ Observation = Annotated[
 NAME_OR_CONTENT = {"anyOf": [{"type": "object", "additionalProperties": True}, {"type": "string"}]}
 
 
-class Member(Part):
+class Member(ScenarioPart):
     """One scenario of a mixture. In a file ``scenario`` may be a name or path; loading puts the content there."""
 
     scenario: Annotated[Scenario, WithJsonSchema(NAME_OR_CONTENT)] = Field(
@@ -72,7 +72,7 @@ def _quantity(key: str, default: Any = None, **more: Any) -> Any:
     return Field(default=default, description=QUANTITIES[key].meaning, **more)
 
 
-class Scenario(Part):
+class Scenario(ScenarioPart):
     """A line of vehicles, the distribution of each quantity, and the vehicles that learn.
 
     A quantity is a number, ``{uniform: [low, high]}``, ``{loguniform: [low, high]}``,
@@ -240,9 +240,9 @@ class Scenario(Part):
         """
         return self.draw(n, seed, first=first, purpose=purpose).worlds
 
-    def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> Drawn:
+    def draw(self, n: int, seed: int, *, first: int = 0, purpose: Purpose = "list") -> DrawnWorlds:
         """Worlds as in ``sample``, with their types, members and recordings, and the number of rejected draws."""
-        return draw(self, n, seed, first, purpose)
+        return draw_worlds(self, n, seed, first, purpose)
 
     # ---- who is in the line
 
@@ -332,7 +332,7 @@ class Scenario(Part):
 
     def content(self, without: Sequence[str] = ()) -> dict[str, Any]:
         """All values as plain data, including defaults, except the keys ``without`` and the members' titles."""
-        without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*WORDS}}}}
+        without_words: dict[str, Any] = {"mixture": {"__all__": {"scenario": {*DESCRIPTIVE_KEYS}}}}
         return self.model_dump(mode="json", exclude=without_words | dict.fromkeys(without, True))
 
     def replace(self, **changes: Any) -> Scenario:

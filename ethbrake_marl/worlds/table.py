@@ -20,16 +20,16 @@ from ethbrake_marl.files.model import UNSHOWN, require, suggestion
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.worlds.quantities import QUANTITIES, RECORDING, Entry
-from ethbrake_marl.worlds.quantity import Number, Part, pick
+from ethbrake_marl.worlds.quantities import QUANTITIES, RECORDING, QuantityEntry
+from ethbrake_marl.worlds.quantity import Number, ScenarioPart, pick
 
-SIZE_LIMIT = 64 << 20  # bytes of a CSV file
+CSV_SIZE_LIMIT = 64 << 20  # bytes of a CSV file
 
-Cell = Annotated[
+CsvCell = Annotated[
     Annotated[Number, Tag("#number")] | Annotated[str, Tag("#text")],
     Discriminator(lambda value: "#text" if isinstance(value, str) else "#number"),
 ]
-Row = Annotated[tuple[Cell, ...], Field(strict=False)]
+CsvRow = Annotated[tuple[CsvCell, ...], Field(strict=False)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class TableColumn:
         return self.rows[pick(np.ones(len(self.rows)), u)]
 
 
-class Table(Part):
+class Table(ScenarioPart):
     """The key ``table`` of a scenario. A scenario file may name a CSV file with the rows.
 
     Rows with the same text in the column ``recording`` come from the same vehicles in the same recording, so they are
@@ -60,7 +60,7 @@ class Table(Part):
         description="names of the columns, or of the columns of the file that are used: gap_1_m, speed_2_mps, ...;"
         " the column recording has texts that name the recording and the vehicles of a row"
     )
-    rows: Annotated[tuple[Row, ...], Field(strict=False, min_length=1)] | None = Field(
+    rows: Annotated[tuple[CsvRow, ...], Field(strict=False, min_length=1)] | None = Field(
         default=None, description="rows with one number per column (a text for recording); left out if file is given"
     )
 
@@ -76,7 +76,7 @@ class Table(Part):
         require(self.columns != (RECORDING,), ("columns",), self.columns, "must also have a column of numbers")
         return self
 
-    def check_cells(self, known: Mapping[str, Entry]) -> None:
+    def check_cells(self, known: Mapping[str, QuantityEntry]) -> None:
         hint = f"known: {', '.join((*known, RECORDING))}"
         for c, name in enumerate(self.columns):
             unknown = f"unknown column; {suggestion(name, known) or hint}"
@@ -106,7 +106,7 @@ class CsvFile(NamedTuple):
     @classmethod
     def read(cls, path: Path) -> CsvFile:
         rows, line = dict[int, list[str]](), 1
-        data = read_plain(path, SIZE_LIMIT)
+        data = read_plain(path, CSV_SIZE_LIMIT)
         try:
             reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""), strict=True)
             for row in reader:

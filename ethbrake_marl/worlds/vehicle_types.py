@@ -17,12 +17,22 @@ from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, require, suggestion
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import Equipage
 from ethbrake_marl.worlds.quantities import OF_A_TYPE, QUANTITIES, USUAL, check_count
-from ethbrake_marl.worlds.quantity import ONE_OR_EACH, Pair, Part, Quantity, Uniform, Weight, pick, support, values
+from ethbrake_marl.worlds.quantity import (
+    ONE_OR_EACH,
+    Pair,
+    Quantity,
+    ScenarioPart,
+    Uniform,
+    Weight,
+    pick,
+    support,
+    values,
+)
 
-ANY = "any"  # every type, in proportion to its weight
+ANY_TYPE = "any"  # every type, in proportion to its weight
 
 
-class WithLoad(Part):
+class WithLoad(ScenarioPart):
     """``{with_load: [empty, full]}``: ``empty + (full - empty) load``, plus a value that ``spread`` draws."""
 
     with_load: Pair = Field(description="[empty, full]: value of an empty vehicle, value of a full vehicle")
@@ -53,7 +63,7 @@ def _own(key: str) -> Any:
     return Field(default=None, exclude_if=None if key in USUAL else not_, description=QUANTITIES[key].meaning)
 
 
-class VehicleType(Part):
+class VehicleType(ScenarioPart):
     """Masses, capacities, latencies and more of one kind of vehicle.
 
     What it does not declare, the scenario declares outside ``vehicle_types``.
@@ -89,7 +99,12 @@ class VehicleType(Part):
 
 
 def _check_names(kinds: dict[str, VehicleType]) -> dict[str, VehicleType]:
-    require(ANY not in kinds, (ANY,), UNSHOWN, f"{ANY} means every type, so it cannot be a name; use another name")
+    require(
+        ANY_TYPE not in kinds,
+        (ANY_TYPE,),
+        UNSHOWN,
+        f"{ANY_TYPE} means every type, so it cannot be a name; use another name",
+    )
     return kinds
 
 
@@ -107,11 +122,11 @@ def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: i
     right = "can be used only with the key vehicle_types, which declares the types"
     require(kinds is not None, ("types",), types, right)
     check_count(types, vehicles, "vehicle", ("types",))
-    known, listed = [*(kinds or {}), ANY], isinstance(types, tuple)
+    known, listed = [*(kinds or {}), ANY_TYPE], isinstance(types, tuple)
     for index, entry in enumerate(types if listed else (types,)):
         for name in [entry] if isinstance(entry, str) else entry:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
-            good = name in known and (name != ANY or isinstance(entry, str))
+            good = name in known and (name != ANY_TYPE or isinstance(entry, str))
             require(good, ("types", index) if listed else ("types",), entry, f"unknown vehicle type {name}; {hint}")
 
 
@@ -121,8 +136,8 @@ class TypesOfLine:
     def __init__(self, kinds: Mapping[str, VehicleType], types: Any, vehicles: int) -> None:
         self.names, self.kinds = tuple(kinds), tuple(kinds.values())
         every = {name: kind.weight for name, kind in kinds.items()}
-        places = types if isinstance(types, tuple) else (types or ANY,) * vehicles
-        each = [every if here == ANY else {here: 1.0} if isinstance(here, str) else here for here in places]
+        places = types if isinstance(types, tuple) else (types or ANY_TYPE,) * vehicles
+        each = [every if here == ANY_TYPE else {here: 1.0} if isinstance(here, str) else here for here in places]
         self.weights = np.array([[here.get(name, 0.0) for name in kinds] for here in each])  # [N, types]
         self.possible: Bools = self.weights > 0.0  # [N, types]
 

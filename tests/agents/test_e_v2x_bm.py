@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.agents import e_v2x_bm
 from ethbrake_marl.agents.drive import MODEL, STATE, Team, drive
 from ethbrake_marl.agents.e_v2x_bm import coupled, harms
-from ethbrake_marl.agents.pairwise import CANDIDATES, find_candidates, meet, pairwise, predicted_harm
+from ethbrake_marl.agents.pairwise import CLOSED_FORM_CANDIDATES, find_candidates, harm_of_deceleration, meet, pairwise
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
@@ -96,12 +96,12 @@ def as_printed(value: float, printed: str) -> str:
 @pytest.mark.parametrize(("gaps", "speeds", "latency", "ends", "best", "full"), GOLDEN)
 def test_closed_form__has_every_printed_digit(gaps, speeds, latency, ends, best, full):
     world = alert(gaps, speeds, latency_s=[0.0, *latency], **PAPER)
-    at = np.empty(CANDIDATES)
+    at = np.empty(CLOSED_FORM_CANDIDATES)
     parts = world.line[0], world.car[0, BRAKING], wait_of(world)[0], 2
     find_candidates(*parts, at)
     for end in ends:
         assert end in [as_printed(a, end) for a in at]
-    found = [*(column[0] for column in pairwise(world, 2)), predicted_harm(*parts, 7.0)]
+    found = [*(column[0] for column in pairwise(world, 2)), harm_of_deceleration(*parts, 7.0)]
     for value, printed in zip(found, (*best, full), strict=True):
         assert printed is None or as_printed(value, printed) == printed
     assert best[0] is not None or found[0] == pytest.approx(sum(map(float, ends)) / 2, abs=1e-5)
@@ -163,8 +163,8 @@ def test_closed_form__is_attained_and_not_above_a_grid(vehicles, body):
     for k in range(worlds.n):
         parts = worlds.line[k], worlds.car[k, BRAKING], wait_of(worlds)[k], body
         most = worlds.car[k, BRAKING, body]
-        assert 0.0 <= deceleration[k] <= most and predicted_harm(*parts, deceleration[k]) == harm[k]
-        assert harm[k] <= min(predicted_harm(*parts, a) for a in np.linspace(0.0, most, 150)) + 1e-9
+        assert 0.0 <= deceleration[k] <= most and harm_of_deceleration(*parts, deceleration[k]) == harm[k]
+        assert harm[k] <= min(harm_of_deceleration(*parts, a) for a in np.linspace(0.0, most, 150)) + 1e-9
     assert 0.2 < np.mean(harm > 0.0) < 0.9
 
 
@@ -224,7 +224,7 @@ def test_coupled__is_not_worse_than_a_grid(vehicles, body, count):
     all_harms = harms(worlds, body, grid, count, 8.0)
     best = coupled(worlds, body, count)
     excess = best.harm - all_harms[0].min(axis=1)
-    assert np.quantile(excess, 0.99) <= e_v2x_bm.SMALL and excess.mean() <= e_v2x_bm.SMALL
+    assert np.quantile(excess, 0.99) <= e_v2x_bm.LEAST_GAIN and excess.mean() <= e_v2x_bm.LEAST_GAIN
     again = harms(worlds, body, best.deceleration_mps2[:, np.newaxis], count, 8.0)[:, :, 0]
     assert (again[0] == best.harm).all()
 
@@ -234,7 +234,7 @@ def test_coupled__of_vehicle_1_is_not_worse_than_a_grid_before_an_obstacle():
     worlds.wanted[:] = -worlds.car[:, BRAKING]
     best, grid = coupled(worlds, 1, "total"), worlds.car[:, BRAKING, [1]] * np.linspace(0.0, 1.0, 401)
     least = harms(worlds, 1, grid, "total", 8.0)[0].min(axis=1)
-    assert (best.harm <= least + e_v2x_bm.SMALL).all() and best.harm.any() and not best.harm.all()
+    assert (best.harm <= least + e_v2x_bm.LEAST_GAIN).all() and best.harm.any() and not best.harm.all()
 
 
 def test_coupled__decides_ties_by_the_other_count_then_takes_the_middle():

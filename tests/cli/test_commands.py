@@ -192,14 +192,14 @@ def test_stdout__has_results_alone_whatever_writes_past_python(capfd, monkeypatc
 def test_compilation__is_announced(name: str, said: str, tmp_path, monkeypatch, capsys) -> None:
     """What is said promises no time, and no stored result where none can be stored."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(kernel_store, "_tellers", [frame.tell_compilation])
+    monkeypatch.setattr(kernel_store, "_tellers", [frame.print_compilation])
     if name:
-        kernel_store.save(name, b"")
-    kernel_store.tell_compilation()
-    kernel_store.tell_compilation()
+        kernel_store.save_data(name, b"")
+    kernel_store.announce_compilation()
+    kernel_store.announce_compilation()
     [line] = capsys.readouterr().err.splitlines()
     assert line.startswith(f"compiling {said}") and line.endswith("; later commands use the stored result")
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
-    frame.tell_compilation(is_empty=True)
+    frame.print_compilation(is_empty=True)
     assert capsys.readouterr().err == "compiling the physics for the first time, which takes a while\n"

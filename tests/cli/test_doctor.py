@@ -86,7 +86,7 @@ def test_kernel_cache__that_is_damaged_is_named_and_mended(tmp_path: Path, monke
     folder = tmp_path / "ethbrake_marl"
     assert found("kernel cache") == (True, str(folder))
     for name in "abcd":
-        kernel_store.save(name, name.encode())
+        kernel_store.save_data(name, name.encode())
     (folder / "a.compiled").write_bytes(b"")
     (folder / "b.compiled").unlink()
     (folder / "b.compiled" / "inside").mkdir(parents=True)
@@ -99,7 +99,7 @@ def test_kernel_cache__that_is_damaged_is_named_and_mended(tmp_path: Path, monke
         assert found("kernel cache") == (False, told)
     assert found("kernel cache") == (True, f"{folder}; damaged files: 2, of which 2 are deleted now")
     assert found("kernel cache") == (True, str(folder))
-    assert {path.name for path in folder.iterdir()} == {"d.compiled", "README"} and kernel_store.load(
+    assert {path.name for path in folder.iterdir()} == {"d.compiled", "README"} and kernel_store.load_data(
         "d", bytes
     ) == b"d"
 

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.pairwise import CANDIDATES, find_candidates, pairwise, predicted_harm
+from ethbrake_marl.agents.pairwise import CLOSED_FORM_CANDIDATES, find_candidates, harm_of_deceleration, pairwise
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
 from ethbrake_marl.worlds.explain import new_scenario_text
@@ -45,9 +45,12 @@ def test_reference_values__are_those_of_the_closed_form() -> None:
         start = {f"gap_{k}_m": [gap] for k, gap in enumerate(gaps, 1)}
         start |= {f"speed_{k}_mps": [speed] for k, speed in enumerate(speeds, 1)}
         worlds = worlds_from_table(scenario, start)
-        candidates, parts = np.empty(CANDIDATES), (worlds.line[0], worlds.car[0, BRAKING], worlds.car[0, LATENCY], 2)
+        candidates, parts = (
+            np.empty(CLOSED_FORM_CANDIDATES),
+            (worlds.line[0], worlds.car[0, BRAKING], worlds.car[0, LATENCY], 2),
+        )
         find_candidates(*parts, candidates)
-        told = [*candidates, *(column[0] for column in pairwise(worlds, 2)), predicted_harm(*parts, 7.0)]
+        told = [*candidates, *(column[0] for column in pairwise(worlds, 2)), harm_of_deceleration(*parts, 7.0)]
         assert missing_figures(" ".join(ends), " ".join(repr(float(each)) for each in told)) == [], world
 
 

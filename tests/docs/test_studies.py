@@ -9,7 +9,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.style import picture_bytes
-from ethbrake_marl.extensions.search.tables import SHIPPED, BestHarmTable
+from ethbrake_marl.extensions.search.tables import TABLE_FOLDER, BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
 from tests.docs.printed import rows as table_of
 from tests.docs.site import DOCS, load
@@ -34,7 +34,7 @@ best_harm = load("../studies/best_harm")
 
 def test_restamp__renews_a_table_only_if_all_its_harms_keep_their_bits(tmp_path, capsys) -> None:
     file, old = tmp_path / "cooperation-2-five.npz", {"physics": "0123456789abcdef"}
-    shipped = BestHarmTable.load(SHIPPED / file.name)
+    shipped = BestHarmTable.load(TABLE_FOLDER / file.name)
     harm = {count: each.copy() for count, each in shipped.harm.items()}
     harm["total"][7] = np.nextafter(harm["total"][7], 99.0)
     for changed in (

@@ -10,7 +10,7 @@ from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.layer import SENSORS
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.evaluation.evaluate import Result, evaluate
+from ethbrake_marl.evaluation.evaluate import Result, evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.named_measures import measures_called
 from ethbrake_marl.names import open_game
@@ -80,7 +80,7 @@ def evaluated(
     loaded, game = open_game(Scenario(**scenario) if isinstance(scenario, dict) else scenario)
     (body,) = game.settings.learners.tolist()
     drawn = loaded.draw(n, 7)
-    return evaluate(
+    return evaluate_teams(
         drawn, teams(*agents, body=body), game, measures_called(measures), about=about_scenario(loaded, 7), **more
     )
 

@@ -21,7 +21,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
 from ethbrake_marl.evaluation import evaluate as evaluating
-from ethbrake_marl.evaluation.evaluate import evaluate
+from ethbrake_marl.evaluation.evaluate import evaluate_teams
 from ethbrake_marl.evaluation.measures import Measure, Statistic
 from ethbrake_marl.evaluation.named_measures import MEASURES, measures_called, register_measure
 from ethbrake_marl.evaluation.statistics import mean, rate
@@ -112,7 +112,7 @@ def test_conduct__is_measured_in_every_line() -> None:
         alert, learners = scenario.sample(20, 7), game.settings.learners.tolist()
         team = Team("coast", {body: COAST for body in learners})
         asked = measures_called("pushed_mps,pushed_m,drove_towards,still_moving,drove")
-        columns = evaluate(alert, {"coast": team}, game, asked)["coast"]
+        columns = evaluate_teams(alert, {"coast": team}, game, asked)["coast"]
         each = [f"pushed_mps_{i}" for i in range(1, alert.vehicles)] + ["pushed_mps_obstacle"]
         assert np.sum([columns[key] for key in each], axis=0) == pytest.approx(columns["pushed_mps"])
         assert all((columns[key] >= 0.0).all() for key in each) and (
@@ -277,7 +277,7 @@ def test_measures__with_one_statistic_are_refused() -> None:
     two = [Measure(name, lambda game, alert, last: last.collided, "", "", (Statistic("hit"),)) for name in ("a", "b")]
     scenario, game = open_game(PAIR)
     with refused("measures 'a' and 'b': both have the statistic 'hit'; give one of them another key"):
-        evaluate(scenario.draw(2, 7), teams(FULL_BRAKE), game, two)
+        evaluate_teams(scenario.draw(2, 7), teams(FULL_BRAKE), game, two)
 
 
 @pytest.mark.parametrize(
@@ -345,7 +345,7 @@ def test_identity__changes_with_worlds_and_scenario_alone() -> None:
     ) == 16
     drawn = scenario.draw(5, 7)
     given = drawn.worlds._replace(clock=0 * drawn.worlds.clock)  # without their numbers
-    assert evaluate(given, teams(GENTLE), game).about["worlds_sha256"] == about["worlds_sha256"]
+    assert evaluate_teams(given, teams(GENTLE), game).about["worlds_sha256"] == about["worlds_sha256"]
     for other in (evaluated("paper-random", 6), evaluated(scenario.replace(restitution=0.2).declared(), 5)):
         assert other.about["worlds_sha256"] != about["worlds_sha256"]
     for key, value, same in (("horizon_s", 5.0, False), ("title", "Mine", True)):
@@ -401,7 +401,7 @@ def test_our_agents__are_sent_to_processes_and_report_what_they_predict(monkeypa
         "ppo+step": Team("s", ppo, StepShield(ppo)), "ppo+episode": Team("a", ppo, EpisodeShield(ppo)),
     }  # fmt: skip
     monkeypatch.setattr(evaluating, "CHUNK", 40)
-    one, two = (evaluate(scenario.draw(80, 7), agents, game, jobs=jobs) for jobs in (1, 2))
+    one, two = (evaluate_teams(scenario.draw(80, 7), agents, game, jobs=jobs) for jobs in (1, 2))
     for name, columns in one.columns.items():
         assert all((two[name][key] == column).all() for key, column in columns.items())
     assert one["e_v2x_bm"]["predicted_harm"].tolist() == one["e_v2x_bm"]["first_impact_harm"].tolist()
@@ -424,7 +424,7 @@ def test_golden_rows() -> None:
 def test_result__says_who_knows_what_and_what_was_evaluated() -> None:
     scenario, game = open_game("cooperation-2-blocked")
     agents = {**teams(FULL_BRAKE, Careless()), "both": Team("both", {2: FULL_BRAKE._replace(knows="true model")})}
-    result = evaluate(scenario.draw(12, 7), agents, game)
+    result = evaluate_teams(scenario.draw(12, 7), agents, game)
     assert result.knows == {"full_brake": "own sensors", "careless": "not stated", "both": "true model"}
     share = float(result.worlds["hidden"].mean())
     table = summarise(result)
@@ -450,15 +450,15 @@ def refusals() -> dict[str, Any]:
     local, wrong = Careless(), Team("x", {1: FULL_BRAKE})
     local.lock = threading.Lock()  # type: ignore[attr-defined]
     return {
-        "agents = {}: must be a mapping from names to teams": lambda: evaluate(drawn, {}, game),
-        "must be a mapping from names to teams, for instance": lambda: evaluate(drawn, {"a": FULL_BRAKE}, game),  # type: ignore[dict-item]
-        "agents = 'full_brake'": lambda: evaluate(drawn, "full_brake", game),  # type: ignore[arg-type]
-        "3 worlds of 3 vehicles; must be one or more worlds of 3 vehicles at": lambda: evaluate(begun, mine, game),
-        "worlds: 0 worlds": lambda: evaluate(drawn.worlds.take(slice(0)), mine, game),
-        "2 worlds of 5 vehicles; must be": lambda: evaluate(pair, mine, game),
-        "team 'x': drives vehicle_1; must drive exactly vehicle_2": lambda: evaluate(drawn, {"a": wrong}, game),
-        "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan m/s2": lambda: evaluate(drawn, teams(Wild()), game),
-        "this cannot be sent to another process (cannot": lambda: evaluate(drawn, teams(local), game, jobs=2),
+        "agents = {}: must be a mapping from names to teams": lambda: evaluate_teams(drawn, {}, game),
+        "must be a mapping from names to teams, for instance": lambda: evaluate_teams(drawn, {"a": FULL_BRAKE}, game),  # type: ignore[dict-item]
+        "agents = 'full_brake'": lambda: evaluate_teams(drawn, "full_brake", game),  # type: ignore[arg-type]
+        "3 worlds of 3 vehicles; must be one or more worlds of 3 vehicles": lambda: evaluate_teams(begun, mine, game),
+        "worlds: 0 worlds": lambda: evaluate_teams(drawn.worlds.take(slice(0)), mine, game),
+        "2 worlds of 5 vehicles; must be": lambda: evaluate_teams(pair, mine, game),
+        "team 'x': drives vehicle_1; must drive exactly vehicle_2": lambda: evaluate_teams(drawn, {"a": wrong}, game),
+        "agent 'wild', world 0, vehicle_2 at 0.50 s: command nan": lambda: evaluate_teams(drawn, teams(Wild()), game),
+        "this cannot be sent to another process (cannot": lambda: evaluate_teams(drawn, teams(local), game, jobs=2),
     }  # fmt: skip
 
 
@@ -474,7 +474,7 @@ def test_failed_physics__raises_with_the_number_of_the_world() -> None:
     line = worlds.line.copy()
     line[2, GAP, 1] = np.nan
     with refused("world 102: a check of the physics failed", PhysicsError):
-        evaluate(worlds._replace(line=line), teams(FULL_BRAKE), game)
+        evaluate_teams(worlds._replace(line=line), teams(FULL_BRAKE), game)
 
 
 class Touching(Careless):
@@ -495,7 +495,7 @@ def test_what_others_bring__cannot_change_what_happens() -> None:
     scenario, game = open_game("paper-random")
     worlds = scenario.draw(3, 7)
     with refused("agent 'touching', vehicle_2: act fails: ValueError"):
-        evaluate(worlds, teams(Touching()), game)
+        evaluate_teams(worlds, teams(Touching()), game)
 
     def heavier(game: Any, alert: State, last: State) -> Any:
         """Mass."""
@@ -516,10 +516,10 @@ def test_what_others_bring__cannot_change_what_happens() -> None:
 
     for measure in (Measure("heavier", heavier), Measure("slowing", watch=Slowing)):
         with pytest.raises(InvalidInput, match=r"its function fails: ValueError: .*read-only"):
-            evaluate(worlds, teams(GENTLE), game, [measure])
+            evaluate_teams(worlds, teams(GENTLE), game, [measure])
     for name in ("world", "gap_1_m"):
         with refused(f"measure '{name}': is the name of a column of the worlds"):
-            evaluate(worlds, teams(GENTLE), game, [Measure(name, lambda game, alert, last: last.time_s)])
+            evaluate_teams(worlds, teams(GENTLE), game, [Measure(name, lambda game, alert, last: last.time_s)])
 
 
 def test_evaluate__refuses_measures_that_are_no_names_and_a_list_beside_worlds() -> None:

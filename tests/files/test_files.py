@@ -13,7 +13,7 @@ from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.files.plain import read_plain
 from ethbrake_marl.files.python_file import files_run, load_from_file
 from ethbrake_marl.files.store import check_folder, hold_lock, new_folder, remove_unfinished, write_file, write_output
-from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, Document, flow_text, parse_yaml
+from ethbrake_marl.files.yaml import DEPTH_LIMIT, YAML_SIZE_LIMIT, Document, flow_text, parse_yaml
 from tests.refused import refused
 
 
@@ -126,7 +126,7 @@ def test_document__shares_nothing_with_another_reader_of_the_same_text() -> None
 @pytest.mark.parametrize(("opening", "closing"), ["[]", ("{a: ", "}"), ("- ", "")])
 def test_depth_and_size__the_limits_are_allowed(opening: str, closing: str) -> None:
     parse_yaml(opening * DEPTH_LIMIT + "1" + closing * DEPTH_LIMIT)
-    parse_yaml("a: " + "x" * (SIZE_LIMIT - 3))
+    parse_yaml("a: " + "x" * (YAML_SIZE_LIMIT - 3))
 
 
 @settings(max_examples=100)

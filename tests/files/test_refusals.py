@@ -10,7 +10,7 @@ from ethbrake_marl.errors import AlreadyExists, CorruptBundle, InvalidInput
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.files.plain import open_plain, parse_strict_json, read_object, read_plain
 from ethbrake_marl.files.store import check_target, write_output
-from ethbrake_marl.files.yaml import DEPTH_LIMIT, SIZE_LIMIT, parse_yaml, read_yaml
+from ethbrake_marl.files.yaml import DEPTH_LIMIT, YAML_SIZE_LIMIT, parse_yaml, read_yaml
 from tests.refused import refused
 
 # Grows to 3^8 entries where aliases are followed.
@@ -32,7 +32,7 @@ YAML: dict[str, str | bytes] = {
     ", line 1, column 4: integer 99999999999999999999 does": "a: 99999999999999999999\n",
     ": not valid YAML: Exceeds the limit": "a: " + "9" * 5000,
     ", line 1, column 17: mappings and lists": "[" * (DEPTH_LIMIT + 1) + "1" + "]" * (DEPTH_LIMIT + 1),
-    ": is larger than 64 KiB, the limit for": "a: " + "x" * (SIZE_LIMIT - 2),
+    ": is larger than 64 KiB, the limit for": "a: " + "x" * (YAML_SIZE_LIMIT - 2),
     ", line 1, column 4: anchor &a is not": LAUGHS,
     ", line 1, column 5: not valid YAML:": "a: " * 20_000,
     ", line 1, column 1007: not valid YAML:": "key: " + "'" * 1001,

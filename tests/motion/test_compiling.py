@@ -153,7 +153,7 @@ def exchange(file: Path) -> None:
 
 
 def with_a_class_that_is_gone(file: Path) -> None:
-    kernel_store.save(file.name.removesuffix(file.suffix), b"cno_such_module\nClass\n.")
+    kernel_store.save_data(file.name.removesuffix(file.suffix), b"cno_such_module\nClass\n.")
 
 
 DAMAGE = {

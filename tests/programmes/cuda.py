@@ -21,7 +21,7 @@ from pathlib import Path
 import torch
 
 import ethbrake_marl as eb
-from ethbrake_marl.extensions.cuda.device import like
+from ethbrake_marl.extensions.cuda.device import empty_arrays
 from ethbrake_marl.extensions.cuda.machine_code import ptx_of
 from ethbrake_marl.extensions.cuda.worlds import Worlds
 from tests.extensions.cuda.test_worlds import SIX, whole_episodes
@@ -87,7 +87,7 @@ def code_of(name: str, capability: str) -> Told:
     major, minor = (int(part) for part in capability.split("."))
     worlds = Worlds(name, 2, 4, "cpu")
     arguments = worlds.arguments(torch.zeros(2, len(worlds.game.settings.learners)), 0)
-    code = ptx_of(worlds.kernel.name, worlds.kernel.thread, (*like(arguments), 0), (major, minor))
+    code = ptx_of(worlds.kernel.name, worlds.kernel.thread, (*empty_arrays(arguments), 0), (major, minor))
     fused = code.count("fma.rn.f64")
     return Told(not fused, f"{worlds.kernel.name} {len(code) >> 10:,} KiB, {fused} fused multiply-adds")
 

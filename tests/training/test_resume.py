@@ -190,7 +190,7 @@ def test_newest__goes_back_behind_a_damaged_checkpoint(damage: str, run: Path, m
     monkeypatch.chdir(run.parent)
     damaged, before = checkpoint.files_in(run / "checkpoints")
     DAMAGE[damage](damaged)
-    saved, reasons = checkpoint.newest(run / "checkpoints")
+    saved, reasons = checkpoint.newest_checkpoint(run / "checkpoints")
     assert saved is not None and saved["steps"] == 256
     assert len(reasons) == 1 and reasons[0].startswith(f"{damaged}: is ")
     assert checkpoint.files_in(run / "checkpoints") == [before] and not Path("evil").exists()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from ethbrake_marl.worlds.counters import numbers_of
+from ethbrake_marl.worlds.counters import uniform_numbers
 from ethbrake_marl.worlds.quantities import NEWS, QUANTITIES, TYPES
 from ethbrake_marl.worlds.quantity import Choice, LogNormal, LogUniform, Normal, Uniform, support, values
 from ethbrake_marl.worlds.vehicle_types import WithLoad
@@ -60,14 +60,14 @@ def test_distribution__grows_with_u_inside_its_bounds(a: float, b: float, u: lis
 def test_random_numbers__are_those_of_numpys_own_generator() -> None:
     key = np.random.SeedSequence([7], spawn_key=(0, 0)).generate_state(2, np.uint64)
     expected = np.random.Generator(np.random.Philox(key=key)).random(5 * 24).reshape(5, 24)
-    assert numbers_of(7, "list", 0, np.arange(5))(24, ()).tolist() == expected.tolist()
-    assert numbers_of(7, "list", 0, np.array([1, 3, 4]))(24, ()).tolist() == expected[[1, 3, 4]].tolist()
+    assert uniform_numbers(7, "list", 0, np.arange(5))(24, ()).tolist() == expected.tolist()
+    assert uniform_numbers(7, "list", 0, np.array([1, 3, 4]))(24, ()).tolist() == expected[[1, 3, 4]].tolist()
 
 
 def test_random_numbers__differ_by_seed_channel_attempt_and_stream() -> None:
     index = np.arange(3)
     drawn = [
-        numbers_of(seed, purpose, attempt, index)(8, stream).tobytes()
+        uniform_numbers(seed, purpose, attempt, index)(8, stream).tobytes()
         for seed, purpose, attempt, stream in [
             (7, "list", 0, ()), (8, "list", 0, ()), (7, "training", 0, ()), (7, "list", 1, ()), (7, "list", 0, TYPES),
             (7, "list", 0, NEWS),

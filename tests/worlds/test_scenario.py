@@ -17,9 +17,9 @@ from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.files.yaml import read_yaml
 from ethbrake_marl.worlds import catalogue, explain
 from ethbrake_marl.worlds.catalogue import group_of_scenarios, list_scenarios, load_scenario
-from ethbrake_marl.worlds.counters import numbers_of
+from ethbrake_marl.worlds.counters import uniform_numbers
 from ethbrake_marl.worlds.describe import clusters_of, columns_of, fixed_columns
-from ethbrake_marl.worlds.game import Pool, views_of
+from ethbrake_marl.worlds.game import WorldPool, views_of
 from ethbrake_marl.worlds.quantities import QUANTITIES
 from ethbrake_marl.worlds.scenario import Scenario
 from tests.fixtures.scenarios import SHIPPED
@@ -63,7 +63,7 @@ def test_rejected_draws__are_counted_and_drawn_again() -> None:
     assert drawn.worlds.gaps_m.ravel().tolist() == [4.0] * 200
     rejected, pending = 0, np.arange(200)
     for attempt in range(100):
-        pending = pending[numbers_of(7, "list", attempt, pending)(16, ())[:, 0] < 0.5] if len(pending) else pending
+        pending = pending[uniform_numbers(7, "list", attempt, pending)(16, ())[:, 0] < 0.5] if len(pending) else pending
         rejected += len(pending)
     assert drawn.rejected == rejected > 100
     kept = close.sample(200, 7).take(close.sample(200, 7).gaps_m[:, 0] == 4.0)
@@ -155,7 +155,7 @@ def test_bounds__hold_for_every_draw() -> None:
 def test_types_and_loads__are_drawn_first() -> None:
     kinds = {"car": {"weight": 3}, "truck": {"mass_t": {"with_load": [14, 40]}}}
     drawn = line(mass_t=1.5, vehicle_types=kinds).draw(300, 7)
-    u = numbers_of(7, "list", 0, np.arange(300))(12, (3,)).reshape(300, 3, 4)
+    u = uniform_numbers(7, "list", 0, np.arange(300))(12, (3,)).reshape(300, 3, 4)
     assert (drawn.types == np.where(u[..., 0] < 0.75, "car", "truck")).all()
     assert (drawn.worlds.mass_t == np.where(u[..., 0] < 0.75, 1.5, 14 + 26 * u[..., 1])).all()
 
@@ -164,7 +164,7 @@ def test_table__gives_whole_rows() -> None:
     rows = [[5, 11, "a: 1"], [6, 12, "a: 2"], [7, 13, "b: 1"]]
     scenario = line(table={"columns": ["gap_1_m", "speed_2_mps", "recording"], "rows": rows})
     drawn = scenario.draw(400, 7)
-    row = np.floor(3 * numbers_of(7, "list", 0, np.arange(400))(4, (6,))[:, 1])
+    row = np.floor(3 * uniform_numbers(7, "list", 0, np.arange(400))(4, (6,))[:, 1])
     assert drawn.worlds.gaps_m.tolist() == np.stack([5 + row, np.full(400, 7)], axis=1).tolist()
     assert drawn.worlds.speeds_mps[:, 1].tolist() == (11 + row).tolist()
     assert clusters_of(columns_of(drawn)).tolist() == np.where(row < 2, "a", "b").tolist()
@@ -250,7 +250,7 @@ def test_columns__are_all_that_was_drawn() -> None:
 
 
 def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
-    pool = Pool(PAPER)
+    pool = WorldPool(PAPER)
     for seed, first in ((0, 0), (0, 500), (1, 500), (1, 5000), (1, 10)):
         assert bits(pool(3, seed, first)) == bits(PAPER.sample(3, seed, first=first, purpose="training"))
     assert not any(name.startswith("obstacle") for name in views_of(line())[0].names)

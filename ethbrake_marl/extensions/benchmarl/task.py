@@ -16,7 +16,7 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.faces.rendering import RENDERERS, make_renderer
-from ethbrake_marl.faces.shield import NOBODY, guarded
+from ethbrake_marl.faces.shield import NO_TEAM, guarded
 from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box
 from ethbrake_marl.faces.stream import Stream, chosen_seed
 from ethbrake_marl.names import open_game
@@ -75,14 +75,14 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
                 " must have one or more learners, which all observe the same features"
             )
         if shield is not None:
-            game = game._replace(shield=guarded(NOBODY, shield, loaded, "first", {}).shield)
+            game = game._replace(shield=guarded(NO_TEAM, shield, loaded, "first", {}).shield)
         self.game = game
         self.stream = Stream(loaded, self.game, chosen_seed(seed))
         rows = n, len(self.learners)
-        seen = _bound(feature_box(views.pop().features), rows)
-        whole = _bound(feature_box(state_features(loaded.vehicles, *self.of_state)), (n,))
+        observation_bound = _bound(feature_box(views.pop().features), rows)
+        state_bound = _bound(feature_box(state_features(loaded.vehicles, *self.of_state)), (n,))
         self.observation_spec = Composite(
-            {GROUP: Composite({"observation": seen}, shape=rows), "state": whole}, shape=(n,)
+            {GROUP: Composite({"observation": observation_bound}, shape=rows), "state": state_bound}, shape=(n,)
         )
         space = action_space(actions)
         action = Bounded(-1.0, 1.0, shape=(*rows, 1)) if actions is None else Categorical(space.n, shape=rows)
@@ -131,9 +131,9 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
     def _observe(self, state: State) -> dict[str, Any]:
         if self.renderer is not None:
             self.renderer.stepped(state.take([0]))
-        seen = torch.from_numpy(self.game.observe_alike(state, self.learners))
-        own = TensorDict({"observation": seen}, batch_size=seen.shape[:2])
-        return {GROUP: own, "state": torch.from_numpy(full_state(state, *self.of_state))}
+        observation = torch.from_numpy(self.game.observe_alike(state, self.learners))
+        group = TensorDict({"observation": observation}, batch_size=observation.shape[:2])
+        return {GROUP: group, "state": torch.from_numpy(full_state(state, *self.of_state))}
 
 
 class LineTask(TaskClass):  # type: ignore[misc]

@@ -32,7 +32,7 @@ class _Scenarios(Task):  # type: ignore[misc]  # Task has no types if the extra 
         return LineTask
 
     def get_from_yaml(self, path: str | None = None) -> LineTask:
-        return LineTask(self.name, _settings(SCENARIOS[self.name] if path is None else path))
+        return LineTask(self.name, _settings(TASK_SCENARIOS[self.name] if path is None else path))
 
 
 def _settings(scenario: str) -> dict[str, Any]:
@@ -45,9 +45,9 @@ def _task_name(scenario: str) -> str:
 
 _SHIPPED = [entry.name for entry in list_scenarios()]
 
-SCENARIOS = {_task_name(name): name for name in _SHIPPED if load_scenario(name).learners}
+TASK_SCENARIOS = {_task_name(name): name for name in _SHIPPED if load_scenario(name).learners}
 
-EthBrakeTask = _Scenarios("EthBrakeTask", list(SCENARIOS))
+EthBrakeTask = _Scenarios("EthBrakeTask", list(TASK_SCENARIOS))
 
 
 def register_tasks() -> None:
@@ -56,7 +56,7 @@ def register_tasks() -> None:
     for task in EthBrakeTask:
         name = task.name.lower()
         task_config_registry[f"ethbrake/{name}"] = task
-        store.store(group="task/ethbrake", name=name, node=_settings(SCENARIOS[task.name]), package="task")
+        store.store(group="task/ethbrake", name=name, node=_settings(TASK_SCENARIOS[task.name]), package="task")
 
 
 register_tasks()

@@ -19,7 +19,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.messages.belief import known_pieces
 from ethbrake_marl.extensions.messages.links import (
     AT,
-    NAME,
+    MESSAGES_KEY,
     OBSTACLE_HIT,
     P_ACCELERATION,
     P_BRAKING,
@@ -32,7 +32,7 @@ from ethbrake_marl.extensions.messages.links import (
     PLACE,
     SAMPLE_FORCE,
     SAMPLE_SPEED,
-    newest,
+    newest_samples,
     present,
 )
 from ethbrake_marl.motion.compiling import large
@@ -160,8 +160,8 @@ class MedianLine(NamedTuple):
         return alert._replace(line=line, car=car, wanted=self.commands(car, alert.wanted))
 
     def received(self, state: State) -> News:
-        if NAME in state.memories:
-            pieces, sample = known_pieces(state, self.body), newest(state, self.body)
+        if MESSAGES_KEY in state.memories:
+            pieces, sample = known_pieces(state, self.body), newest_samples(state, self.body)
         else:
             known = state.know[:, self.body] <= state.time_s[:, np.newaxis]
             known[:, [0, self.body]] = True
@@ -275,7 +275,7 @@ def check_predictable(scenario: Scenario, body: int) -> None:
     if scenario.members:
         names = ", ".join(member.name for member in scenario.members)
         raise InvalidInput(f"{where} the ranges of one scenario, but this is a mixture; give one of {names}")
-    false = [extension.name for extension in scenario.v2x.extensions if extension.name != NAME]
+    false = [extension.name for extension in scenario.v2x.extensions if extension.name != MESSAGES_KEY]
     if false:
         raise InvalidInput(f"{where} messages without errors; leave {', '.join(false)} out of v2x, or use shield step")
     for other, (name, role) in enumerate(scenario.roles.items(), 1):
@@ -290,7 +290,7 @@ def without_channel(game: Game, median: State) -> tuple[Game, State]:
     """
     car = median.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
-    memories = {name: memory for name, memory in median.memories.items() if name != NAME}
+    memories = {name: memory for name, memory in median.memories.items() if name != MESSAGES_KEY}
     return game._replace(layers=()), median._replace(car=car, know=np.zeros_like(median.know), memories=memories)
 
 

@@ -19,12 +19,12 @@ from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimated import SURPRISE, MedianLine, without_channel
-from ethbrake_marl.extensions.certified.robust import opened
+from ethbrake_marl.extensions.certified.robust import reset_without_shield
 from ethbrake_marl.motion.layout import GAP, LATENCY, SPEED, Bools, Floats, Ints
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.algorithm_1 import EpisodeShield, Memory as EpisodeMemory
+from ethbrake_marl.shields.algorithm_1 import EpisodeShield, EpisodeShieldMemory as EpisodeMemory
 from ethbrake_marl.shields.shield import NamedShield
-from ethbrake_marl.shields.step import Memory, StepShield
+from ethbrake_marl.shields.step import StepShield, StepShieldMemory
 from ethbrake_marl.worlds.scenario import Scenario
 
 
@@ -53,13 +53,15 @@ class EstimatedShield(StepShield):
         super().__init__(drivers, harm_count=harm_count)
         self.line = line_of_learner(scenario)
 
-    def begin(self, game: Game, alert: State, state: State) -> Memory:
-        median, trusted = self.line.heard(state, opened(game, self.line.at_alert(alert, state)))
+    def begin(self, game: Game, alert: State, state: State) -> StepShieldMemory:
+        median, trusted = self.line.heard(state, reset_without_shield(game, self.line.at_alert(alert, state)))
         memory = self.first_memory(game, median, median, median, self.agents_at(game, alert))
         return memory._replace(members=MedianMemory(median, trusted))
 
-    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
-        memory: Memory = state.memories["shield"]
+    def decide(
+        self, game: Game, state: State, proposed: Floats | None, *, donate: bool
+    ) -> tuple[Floats, StepShieldMemory]:
+        memory: StepShieldMemory = state.memories["shield"]
         median, foretold = self.line.heard(state, memory.members.median)
         foretold |= state.ended
         rows = (~foretold).nonzero()[0]
@@ -71,7 +73,7 @@ class EstimatedShield(StepShield):
         after, _ = game.follow(median, applied)
         return applied, memory._replace(members=memory.members._replace(median=after))
 
-    def seen(self, state: State, memory: Memory) -> State:
+    def seen(self, state: State, memory: StepShieldMemory) -> State:
         """Median lines, with the present memories of the agents in ``state``."""
         median: State = memory.members.median
         own = {body: state.memories[body] for body in self.drivers if body in state.memories}
@@ -80,7 +82,7 @@ class EstimatedShield(StepShield):
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
         return super().rolled_out(*without_channel(game, state), plans, most)
 
-    def planned_again(self, game: Game, memory: Memory, median: State, rows: Ints) -> Memory:
+    def planned_again(self, game: Game, memory: StepShieldMemory, median: State, rows: Ints) -> StepShieldMemory:
         """In the worlds ``rows``, replace the plan in ``memory`` by the cheapest of itself and newly made plans."""
         plan, price = memory.plan.copy(), memory.price.copy()
         plan[rows], price[rows] = self.cheapest(game, median, [plan[rows], *self.plans(game, median, median, median)])
@@ -111,7 +113,7 @@ class EstimatedEpisodeShield(EpisodeShield):
         self.line = line_of_learner(scenario)
 
     def begin(self, game: Game, alert: State, state: State) -> EpisodeMemory:
-        median, _ = self.line.heard(state, opened(game, self.line.at_alert(alert, state)))
+        median, _ = self.line.heard(state, reset_without_shield(game, self.line.at_alert(alert, state)))
         game, median = without_channel(game, median)
         return super().begin(game, median, median)
 
@@ -178,7 +180,7 @@ def line_of_learner(scenario: Scenario) -> MedianLine:
     return MedianLine.of(scenario, scenario.learners[0])
 
 
-def make_e_v2x_bm(argument: str | None, settings: Any) -> EstimatedEV2XBM:
+def make_estimated_e_v2x_bm(argument: str | None, settings: Any) -> EstimatedEV2XBM:
     if argument not in (None, "pairwise"):
         raise InvalidInput(f"agent {settings.spec!r}: must be e_v2x_bm:estimated or e_v2x_bm:pairwise:estimated")
     return EstimatedEV2XBM(settings.needed_scenario(), argument == "pairwise", settings.harm_count)
@@ -188,12 +190,16 @@ def _entry(make: Any, form: str, about: str) -> Part:
     return Part(make, form=form, about=about, knows=ESTIMATED)
 
 
-STEP = _entry(NamedShield(EstimatedShield), "step:estimated", "certified in the median line that its vehicle estimates")
-EPISODE = _entry(
+ESTIMATED_STEP = _entry(
+    NamedShield(EstimatedShield), "step:estimated", "certified in the median line that its vehicle estimates"
+)
+ESTIMATED_EPISODE = _entry(
     NamedShield(EstimatedEpisodeShield, "bound"),
     "episode[:pairwise]:estimated",
     "the paper's hybrid in the line that its vehicle estimates",
 )
-E_V2X_BM = _entry(
-    make_e_v2x_bm, "e_v2x_bm[:pairwise]:estimated", "computed from received information and the scenario's ranges"
+ESTIMATED_E_V2X_BM = _entry(
+    make_estimated_e_v2x_bm,
+    "e_v2x_bm[:pairwise]:estimated",
+    "computed from received information and the scenario's ranges",
 )

@@ -23,10 +23,10 @@ from ethbrake_marl.motion.layout import BRAKING, GAP, IMPACTS, SPEED, Bools, Flo
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import held
 from ethbrake_marl.shields.shield import NamedShield
-from ethbrake_marl.shields.step import Memory, StepShield
+from ethbrake_marl.shields.step import StepShield, StepShieldMemory
 
-SHARES = np.linspace(0.0, -1.0, 101)  # constant actions that are tried at the alert for the worst member
-INSIDE = 1e-9  # by which a gap (m) or speed (m/s) may lie outside the range of the members
+CONSTANT_ACTIONS = np.linspace(0.0, -1.0, 101)  # constant actions that are tried at the alert for the worst member
+RANGE_ROUNDING = 1e-9  # by which a gap (m) or speed (m/s) may lie outside the range of the members
 
 
 class Members(NamedTuple):
@@ -61,23 +61,23 @@ class RobustShield(StepShield):
         super().__init__(drivers, harm_count=harm_count, allowance=allowance)
         self.uncertainty = parse_uncertainty(uncertainty)
 
-    def begin(self, game: Game, alert: State, state: State) -> Memory:
+    def begin(self, game: Game, alert: State, state: State) -> StepShieldMemory:
         """Memory at the first decision, with the members of the worlds ``alert``.
 
         Raises ``InvalidInput`` if the intervals do not fit the worlds.
         """
-        states = opened(game, self.uncertainty.members(alert))
+        states = reset_without_shield(game, self.uncertainty.members(alert))
         if (states.time_s >= game.settings.horizon_s).any():
             raise InvalidInput(
                 f"uncertainty: {self.uncertainty}: the first decision may be as late as {states.time_s.max():g} s; must"
                 f" be before the horizon, {game.settings.horizon_s:g} s"
             )
         memory = self.first_memory(game, alert, state, states, self.agents_at(game, alert))
-        return memory._replace(members=Members(apart(states, state.n), np.ones(state.n, np.bool_)))
+        return memory._replace(members=Members(split_members(states, state.n), np.ones(state.n, np.bool_)))
 
-    def seen(self, state: State, memory: Memory) -> State:
+    def seen(self, state: State, memory: StepShieldMemory) -> State:
         """Stored members, M rows for each world, with the present memories of the agents in ``state``."""
-        states = joined(memory.members.states)
+        states = join_members(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)
         own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
         return states._replace(memories={**states.memories, **own})
@@ -99,33 +99,35 @@ class RobustShield(StepShield):
         learners, n, plans = game.settings.learners, state.n, super().plans(game, alert, state, states)
         if states.n == n:
             return plans
-        actions = np.repeat(SHARES[:, np.newaxis], len(learners), axis=1)
+        actions = np.repeat(CONSTANT_ACTIONS[:, np.newaxis], len(learners), axis=1)
         commands = actions * states.car[:, np.newaxis, BRAKING, learners]
         harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.count)[0]
         best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
         return [*plans, held(game, actions[best])]
 
-    def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Memory]:
+    def decide(
+        self, game: Game, state: State, proposed: Floats | None, *, donate: bool
+    ) -> tuple[Floats, StepShieldMemory]:
         before: Members = state.memories["shield"].members
-        trusted, states = before.trusted & may_be_in(state, before.states), joined(before.states)
+        trusted, states = before.trusted & may_be_in(state, before.states), join_members(before.states)
         applied, memory = super().decide(game, state, proposed, donate=donate)
         after, _ = game.follow(states, applied.repeat(states.n // state.n, axis=0))
-        return applied, memory._replace(members=Members(apart(after, state.n), trusted))
+        return applied, memory._replace(members=Members(split_members(after, state.n), trusted))
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
         return {**super().infos(game, state), "trusted": state.memories["shield"].members.trusted}
 
 
-def opened(game: Game, alerts: State) -> State:
+def reset_without_shield(game: Game, alerts: State) -> State:
     return game._replace(shield=None, rewarding=game.rewarding._replace(shaping=None)).reset(alerts)
 
 
-def apart(states: State, n: int) -> State:
+def split_members(states: State, n: int) -> State:
     """Reshape arrays of states from M rows for each of n worlds, [n M, ...], to [n, M, ...]."""
     return mapped(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
 
 
-def joined(states: State) -> State:
+def join_members(states: State) -> State:
     """Reshape arrays of states from [n, M, ...] to M rows for each world, [n M, ...]."""
     return mapped(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
 
@@ -140,7 +142,7 @@ def may_be_in(state: State, members: State) -> Bools:
     inside = np.ones(state.n, np.bool_)
     for row, columns in ((SPEED, slice(1, None)), (GAP, slice(1, -1))):
         now, ends = state.line[:, row, columns], members.line[:, :, row, columns]
-        low, high = ends.min(axis=1) - INSIDE, ends.max(axis=1) + INSIDE
+        low, high = ends.min(axis=1) - RANGE_ROUNDING, ends.max(axis=1) + RANGE_ROUNDING
         inside &= ((low <= now) & (now <= high)).all(axis=1)
     return inside | struck
 

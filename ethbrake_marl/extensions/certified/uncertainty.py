@@ -28,7 +28,7 @@ EXAMPLE = "braking_capacity_mps2=5%,latency_s=0.1,gaps_m.pair_1=0.5"
 ENTRY = re.compile(
     r"(?P<name>\w+)(?:\.(?P<what>vehicle|pair)_(?P<number>[1-9]\d*))?\s*=\s*(?P<width>[^=%\s]+)(?P<share>%?)", re.ASCII
 )
-NUMBER = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+DECIMAL_PATTERN = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 class Interval(NamedTuple):
@@ -157,7 +157,7 @@ def parse_uncertainty(text: object) -> Uncertainty:
     intervals: list[Interval] = []
     for entry in (each.strip() for each in re.split("[,:]", text)):
         match = ENTRY.fullmatch(entry)
-        if match is None or NUMBER.fullmatch(match["width"]) is None:
+        if match is None or DECIMAL_PATTERN.fullmatch(match["width"]) is None:
             raise InvalidInput(f"uncertainty: {entry!r}: {form}")
         name, width, share = match["name"], float(match["width"]), bool(match["share"])
         if name not in UNCERTAIN:

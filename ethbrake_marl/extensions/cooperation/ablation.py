@@ -25,7 +25,7 @@ from ethbrake_marl.episode.objectives import Declared, amounts, objectives_of
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.door import SEED
-from ethbrake_marl.evaluation.evaluate import evaluate
+from ethbrake_marl.evaluation.evaluate import evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
 from ethbrake_marl.evaluation.measures import Given, Measure
 from ethbrake_marl.evaluation.statistics import Clusters
@@ -41,14 +41,14 @@ from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.job import Job
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.training.training import Training
-from ethbrake_marl.worlds.mixture import WORDS
-from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
+from ethbrake_marl.worlds.sampling import DrawnWorlds
 from ethbrake_marl.worlds.scenario import Scenario
 
 SETTINGS, JSON, CSV, FIGURE = "settings.json", "ablation.json", "ablation.csv", "ablation.png"
 FULL = {"seeds": 5, "steps_per_learner": 400_000, "episodes": 4_000, "search_episodes": 600, "budget": 20_000}
-QUICK = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
-ON_GRID = 1e-9  # part of a step by which decisions of two levels may differ
+QUICK_SETTINGS = {"seeds": 2, "steps_per_learner": 200_000, "episodes": 500, "search_episodes": 40, "budget": 2_000}
+STEP_ROUNDING = 1e-9  # part of a step by which decisions of two levels may differ
 
 
 @dataclass(frozen=True)
@@ -97,24 +97,24 @@ class Ablation:
 
     def study_folder(self) -> AbstractContextManager[None]:
         settings = {
-            "levels": [level.scenario.content(without=WORDS) for level in self.levels],
-            "recipes": [recipe.model_dump(mode="json", exclude=set(WORDS)) for recipe in self.recipes],
+            "levels": [level.scenario.content(without=DESCRIPTIVE_KEYS) for level in self.levels],
+            "recipes": [recipe.model_dump(mode="json", exclude=set(DESCRIPTIVE_KEYS)) for recipe in self.recipes],
             **{name: getattr(self, name) for name in FULL},
         }
         advice = f"give another folder (--output); to reuse its trained policies, give a copy without {SETTINGS}"
         return work_in(self.folder, "an ablation", settings, record=SETTINGS, advice=advice, writes=(JSON, CSV, FIGURE))
 
 
-Columns = dict[str, Floats]  # column of an evaluation -> [seeds, n]
+SeedColumns = dict[str, Floats]  # column of an evaluation -> [seeds, n]
 
 
-class Measured(NamedTuple):
+class LevelResult(NamedTuple):
     """Results of one level with one algorithm, in the same worlds as all other levels."""
 
     level: Level
     algorithm: str | None  # None: the level has no learner
-    reached: Columns  # with the trained teams, or with the scripts if there is no learner
-    braking: Columns  # if the learners brake fully, [1, n]
+    reached: SeedColumns  # with the trained teams, or with the scripts if there is no learner
+    braking: SeedColumns  # if the learners brake fully, [1, n]
     worlds: State  # at the alert
     best: Mapping[str, Floats] | None = None  # count -> [1, m] least known harm in the first m worlds (m2/s2)
     clusters: Clusters = None
@@ -126,60 +126,66 @@ def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
 
     Raises ``InvalidInput`` if a training's folder contains anything else.
     """
-    every = [job for _, _, job in plan.jobs()]
-    for done, finished in enumerate(run_each(((job.finish,) for job in every), jobs), 1):
+    all_jobs = [job for _, _, job in plan.jobs()]
+    for job_number, finished in enumerate(run_each(((job.finish,) for job in all_jobs), jobs), 1):
         if not finished:
             return False
-        tell(Progress("trainings", done, len(every)))
+        tell(Progress("trainings", job_number, len(all_jobs)))
     return True
 
 
-def measure(plan: Ablation, tell: OnProgress) -> list[Measured]:
+def measure(plan: Ablation, tell: OnProgress) -> list[LevelResult]:
     trained: dict[Any, list[Job]] = {}
     for level, name, job in plan.jobs():
         trained.setdefault((level.name, name), []).append(job)
     worlds = common_worlds(plan.levels, plan.episodes, SEED)
-    pairs: list[tuple[Level, Drawn, str | None]] = [
-        (level, drawn, algorithm)
-        for level, drawn in zip(plan.levels, worlds, strict=True)
+    pairs: list[tuple[Level, DrawnWorlds, str | None]] = [
+        (level, drawn_worlds, algorithm)
+        for level, drawn_worlds in zip(plan.levels, worlds, strict=True)
         for algorithm in (plan.algorithms if level.scenario.learners else (None,))
     ]
-    measured: list[Measured] = []
-    for done, (level, drawn, algorithm) in enumerate(pairs):
-        tell(Progress(f"driving {level.name}", done, len(pairs)))
-        measured.append(driven(level, drawn, algorithm, trained.get((level.name, algorithm), ())))
+    measured: list[LevelResult] = []
+    for pair_number, (level, drawn_worlds, algorithm) in enumerate(pairs):
+        tell(Progress(f"driving {level.name}", pair_number, len(pairs)))
+        measured.append(driven(level, drawn_worlds, algorithm, trained.get((level.name, algorithm), ())))
     return measured
 
 
-def driven(level: Level, drawn: Drawn, algorithm: str | None, jobs: Any) -> Measured:
+def driven(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs: Any) -> LevelResult:
     scenario, measures = level.scenario, []
     named = {f"{algorithm} seed {seed}": f"team@{job.folder}" for seed, job in enumerate(jobs)}
     teams = teams_of(named, scenario) if named else {"scripts": Team("scripts", {})}
     braking = Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE))
     if named:
         reward = jobs[0].training.recipe.reward
-        goal = partial(minimised, reward.objective or scenario.objective, reward.harm_count)
+        goal = partial(minimised_amount, reward.objective or scenario.objective, reward.harm_count)
         measures.append(Measure("goal", goal))
-    every = {**teams, "full_brake": braking}
-    result = evaluate(drawn, every, open_game(scenario)[1], measures, about=about_scenario(scenario))
+    all_teams = {**teams, "full_brake": braking}
+    result = evaluate_teams(drawn_worlds, all_teams, open_game(scenario)[1], measures, about=about_scenario(scenario))
     numbers = [name for name, values in result["full_brake"].items() if values.dtype.kind in "fib"]
 
-    def stacked(names: Any) -> Columns:
+    def stack_columns(names: Any) -> SeedColumns:
         return {column: np.stack([result[name][column] for name in names]) for column in numbers}
 
     about = {**result.about, "policy_sha256": [dict(result.policies[name]) for name in teams]}
-    return Measured(
-        level, algorithm, stacked(teams), stacked(["full_brake"]), drawn.worlds, clusters=result.clusters, about=about
+    return LevelResult(
+        level,
+        algorithm,
+        stack_columns(teams),
+        stack_columns(["full_brake"]),
+        drawn_worlds.worlds,
+        clusters=result.clusters,
+        about=about,
     )
 
 
-def minimised(declared: Declared, count: str, game: Game, alert: State, last: State) -> Given:
+def minimised_amount(declared: Declared, count: str, game: Game, alert: State, last: State) -> Given:
     """What the training minimises, as a mean over the learners, [n]: the objective ``declared`` in ``count``.
 
     A measure, once the first two arguments are given; ``alert`` is unused.
     """
-    each = amounts(objectives_of(declared, last.vehicles), None, last, count)
-    return np.asarray(each[:, game.settings.learners - 1].mean(axis=1))
+    vehicle_amounts = amounts(objectives_of(declared, last.vehicles), None, last, count)
+    return np.asarray(vehicle_amounts[:, game.settings.learners - 1].mean(axis=1))
 
 
 class Answer(NamedTuple):
@@ -190,73 +196,80 @@ class Answer(NamedTuple):
     driven: Mapping[str, Sequence[Floats]]  # count -> harm of each trained team, [m]
 
 
-def with_optima(plan: Ablation, measured: Sequence[Measured], threads: int, tell: OnProgress) -> list[Measured]:
+def with_optima(plan: Ablation, measured: Sequence[LevelResult], threads: int, tell: OnProgress) -> list[LevelResult]:
     """Add the joint optimum to the results of each level with a learner. Finished parts of the search are read back."""
     tables: dict[bytes, BestHarmTable] = {}
     answers: dict[str, Answer] = {}
-    for one in measured:
-        name, scenario = one.level.name, one.level.scenario
+    for level_result in measured:
+        name, scenario = level_result.level.name, level_result.level.scenario
         if scenario.learners and name not in answers:
-            game, worlds = open_game(scenario)[1], one.worlds.take(slice(plan.search_episodes))
+            game, worlds = open_game(scenario)[1], level_result.worlds.take(slice(plan.search_episodes))
             identity = problem_of(game, worlds).identity.tobytes()
             if identity not in tables:
-                say = partial(_tell, tell, f"joint optimum of {name}")
+                say = partial(_tell_progress, tell, f"joint optimum of {name}")
                 folder = plan.folder / "optimum" / name
                 tables[identity] = search_list(
                     game, worlds, chunks=folder, on_progress=say, counts=[*COLUMN], budget=plan.budget, threads=threads
                 )
-            teams = [each.reached for each in measured if each.level.name == name]
-            driven = {
-                count: [row[: worlds.n] for own in teams for row in own[column]] for count, column in COLUMN.items()
+            teams = [result.reached for result in measured if result.level.name == name]
+            team_harm = {
+                count: [row[: worlds.n] for columns in teams for row in columns[column]]
+                for count, column in COLUMN.items()
             }
-            answers[name] = Answer(scenario, game, worlds, tables[identity], driven)
+            answers[name] = Answer(scenario, game, worlds, tables[identity], team_harm)
     best = {
         name: {count: least_known(answer, answers.values(), count)[np.newaxis] for count in COLUMN}
         for name, answer in answers.items()
     }
-    return [each._replace(best=best.get(each.level.name)) for each in measured]
+    return [result._replace(best=best.get(result.level.name)) for result in measured]
 
 
-def _tell(tell: OnProgress, name: str, done: int, total: int) -> None:
-    tell(Progress(name, done, total))
+def _tell_progress(tell: OnProgress, name: str, finished: int, total: int) -> None:
+    tell(Progress(name, finished, total))
 
 
-def least_known(own: Answer, answers: Iterable[Answer], count: str) -> Floats:
-    """Least known harm in each world of ``own``, [m] m2/s2. ``answers`` are the results of all levels."""
-    best = np.full(own.worlds.n, np.inf)
-    for other in answers:
-        can = can_imitate(own, other)
+def least_known(answer: Answer, answers: Iterable[Answer], count: str) -> Floats:
+    """Least known harm in each world of ``answer``, [m] m2/s2. ``answers`` are the results of all levels."""
+    best = np.full(answer.worlds.n, np.inf)
+    for original in answers:
+        can = can_imitate(answer, original)
         rows = np.flatnonzero(can)
         if rows.size:
-            line = other.worlds.line.copy()
-            line[:, :, 0] = own.worlds.line[:, :, 0]  # the obstacle
-            problem = problem_of(other.game, other.worlds._replace(line=line).take(rows))
-            for profiles in other.searched.profiles.values():
+            line = original.worlds.line.copy()
+            line[:, :, 0] = answer.worlds.line[:, :, 0]  # the obstacle
+            problem = problem_of(original.game, original.worlds._replace(line=line).take(rows))
+            for profiles in original.searched.profiles.values():
                 harm = problem.follow(profiles.take(rows)).harm(count)
                 best[rows] = np.minimum(best[rows], harm)
-            same = rows[other.worlds.line[rows, GAP, 0] == own.worlds.line[rows, GAP, 0]]
-            for driven in other.driven[count]:
-                best[same] = np.minimum(best[same], driven[same])
+            same = rows[original.worlds.line[rows, GAP, 0] == answer.worlds.line[rows, GAP, 0]]
+            for team_harm in original.driven[count]:
+                best[same] = np.minimum(best[same], team_harm[same])
     return best
 
 
-def can_imitate(own: Answer, other: Answer) -> Bools:
-    """Whether the learners of ``own`` can give the commands of the learners of ``other``, [m].
+def can_imitate(imitator: Answer, original: Answer) -> Bools:
+    """Whether the learners of ``imitator`` can give the commands of the learners of ``original``, [m].
 
-    They can if each learner of ``other`` learns in ``own``, the other vehicles of ``own`` have the same roles, lines
-    and latencies are the same, and each decision time of ``other`` is also one of ``own``. Only ``own`` may have an
-    obstacle, because the commands are simulated again in its worlds.
+    They can if each learner of ``original`` learns in ``imitator``, the other vehicles of ``imitator`` have the same
+    roles, lines and latencies are the same, and each decision time of ``original`` is also one of ``imitator``. Only
+    ``imitator`` may have an obstacle, because the commands are simulated again in its worlds.
     """
-    mine, theirs = own.scenario, other.scenario
-    scripted = [name for name, role in mine.roles.items() if role != "learner"]
-    if not set(theirs.learners) <= set(mine.learners) or any(mine.roles[n] != theirs.roles[n] for n in scripted):
-        return np.zeros(own.worlds.n, np.bool_)
-    rows = [row for row in range(own.worlds.car.shape[1]) if row not in (OWN_LATENCY, WEIGHT)]
-    same = (own.worlds.line[:, :, 1:] == other.worlds.line[:, :, 1:]).all(axis=(1, 2))
-    same &= (own.worlds.car[:, rows, 1:] == other.worlds.car[:, rows, 1:]).all(axis=(1, 2))
-    first, later = (problem_of(each.game, each.worlds).state.clock[:, FIRST_DECISION] for each in (own, other))
-    steps = (later - first) / mine.time_step_s
-    ahead = other.worlds.line[:, GAP, 0]
+    imitator_scenario, original_scenario = imitator.scenario, original.scenario
+    scripted = [name for name, role in imitator_scenario.roles.items() if role != "learner"]
+    if not set(original_scenario.learners) <= set(imitator_scenario.learners) or any(
+        imitator_scenario.roles[n] != original_scenario.roles[n] for n in scripted
+    ):
+        return np.zeros(imitator.worlds.n, np.bool_)
+    rows = [row for row in range(imitator.worlds.car.shape[1]) if row not in (OWN_LATENCY, WEIGHT)]
+    same = (imitator.worlds.line[:, :, 1:] == original.worlds.line[:, :, 1:]).all(axis=(1, 2))
+    same &= (imitator.worlds.car[:, rows, 1:] == original.worlds.car[:, rows, 1:]).all(axis=(1, 2))
+    first, later = (
+        problem_of(answer.game, answer.worlds).state.clock[:, FIRST_DECISION] for answer in (imitator, original)
+    )
+    steps = (later - first) / imitator_scenario.time_step_s
+    ahead = original.worlds.line[:, GAP, 0]
     return np.asarray(
-        same & (np.abs(steps - np.rint(steps)) < ON_GRID) & ((ahead == own.worlds.line[:, GAP, 0]) | (ahead >= FAR_M))
+        same
+        & (np.abs(steps - np.rint(steps)) < STEP_ROUNDING)
+        & ((ahead == imitator.worlds.line[:, GAP, 0]) | (ahead >= FAR_M))
     )

@@ -14,7 +14,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.registry import Part
 
 DEFAULT_AGENTS = "e_v2x_bm,universal"  # agents that are compared with the front if the scenario has one learner
-REMAINS = "the same command continues the work in this folder"
+AFTER_STOPPED_STUDY = "the same command continues the work in this folder"
 
 
 def ablate_command(
@@ -67,37 +67,49 @@ def ablate_command(
 
     With --sweep, the levels are copies of one scenario in which one key has different values.
     """
-    with Out(as_json=as_json, remains=REMAINS) as out:
+    with Out(as_json=as_json, remains=AFTER_STOPPED_STUDY) as out:
         from ethbrake_marl.cli.settings import read_settings
-        from ethbrake_marl.cli.train import changed
-        from ethbrake_marl.extensions.cooperation.ablation import FULL, QUICK, Ablation, measure, train_all, with_optima
-        from ethbrake_marl.extensions.cooperation.levels import STANDARD, SWEPT, read_levels, sweep_levels
+        from ethbrake_marl.cli.train import change_recipe
+        from ethbrake_marl.extensions.cooperation.ablation import (
+            FULL,
+            QUICK_SETTINGS,
+            Ablation,
+            measure,
+            train_all,
+            with_optima,
+        )
+        from ethbrake_marl.extensions.cooperation.levels import STANDARD, SWEEP_LEVEL, read_levels, sweep_levels
         from ethbrake_marl.extensions.cooperation.results import tables, write_ablation
         from ethbrake_marl.training.recipe import load_recipe
 
         if sweep is not None and len(sweep) > 1:
             raise InvalidInput("--sweep is given twice; give it once, because the figures can show only one swept key")
-        loaded = [load_recipe(each.strip()) for each in recipes.split(",")]
+        loaded = [load_recipe(name.strip()) for name in recipes.split(",")]
         changes = read_settings(settings, [key for recipe in loaded for key in type(recipe).model_fields])
-        own = [changed(recipe, changes.recipe, out) for recipe in loaded]
-        own = [recipe if recipe.scheme else recipe.replace(scheme="shared") for recipe in own]
-        usual = ",".join(STANDARD) if sweep is None else SWEPT
-        names = [each.strip() for each in (levels or usual).split(",")]
+        changed_recipes = [change_recipe(recipe, changes.recipe, out) for recipe in loaded]
+        changed_recipes = [recipe if recipe.scheme else recipe.replace(scheme="shared") for recipe in changed_recipes]
+        usual = ",".join(STANDARD) if sweep is None else SWEEP_LEVEL
+        names = [name.strip() for name in (levels or usual).split(",")]
         if sweep is not None and len(names) != 1:
             raise InvalidInput(f"levels: {len(names)} levels given; a sweep needs exactly one level")
-        compared = read_levels(names, changes) if sweep is None else sweep_levels(names[0], sweep[0], changes, own)
-        given = {
+        compared = (
+            read_levels(names, changes) if sweep is None else sweep_levels(names[0], sweep[0], changes, changed_recipes)
+        )
+        options = {
             "seeds": seeds, "steps_per_learner": steps, "episodes": episodes, "search_episodes": search_episodes,
         }  # fmt: skip
-        numbers = {**(QUICK if quick else FULL), **{key: each for key, each in given.items() if each is not None}}
-        plan = Ablation(output, tuple(compared), tuple(own), noted=changes.texts, **numbers)
+        numbers = {
+            **(QUICK_SETTINGS if quick else FULL),
+            **{key: value for key, value in options.items() if value is not None},
+        }
+        plan = Ablation(output, tuple(compared), tuple(changed_recipes), noted=changes.texts, **numbers)
         with plan.study_folder():
             if not train_all(plan, jobs or 1, out.show_progress):
-                out.interrupted(f"interrupted; {REMAINS}")
+                out.interrupted(f"interrupted; {AFTER_STOPPED_STUDY}")
             measured = with_optima(plan, measure(plan, out.show_progress), jobs or 1, out.show_progress)
             results, paths = write_ablation(plan, measured)
         alarms = [Text(line, "bold red") for line in results["undertrained"]]
-        out.result(results, *tables(results), results["conditions"], *alarms, kept=True)
+        out.result(results, *tables(results), results["conditions"], *alarms, in_file=True)
         out.note(f"results: {', '.join(map(str, paths))}")
 
 
@@ -179,24 +191,24 @@ def front_command(
         else:
             rows = [parse_yaml(f"[{text}]", "--weights").content for text in weights]
         check_folder(output, ("front.json", "front.png"), force=force)
-        drawn = chosen.draw(episodes, seed)
+        drawn_worlds = chosen.draw(episodes, seed)
         names = DEFAULT_AGENTS if agents is None and len(chosen.learners) == 1 else agents or ""
-        others = [spec for spec in split_specs(names) if spec != "full_brake"] if names else []
+        compared_agents = [spec for spec in split_specs(names) if spec != "full_brake"] if names else []
         front = search_front(
-            chosen, drawn.worlds, rows, count=count, budget=budget, threads=jobs or 1, agents=others,
-            on_progress=lambda done, total: out.progress("front", done, total),
+            chosen, drawn_worlds.worlds, rows, count=count, budget=budget, threads=jobs or 1, agents=compared_agents,
+            on_progress=lambda searches, total: out.progress("front", searches, total),
         )  # fmt: skip
-        largest = least_largest(chosen, drawn.worlds, front, budget=budget, threads=jobs or 1)
-        beside = {"full_brake": full_braking(chosen, drawn), "maximin": largest}
-        results = front_results(front, chosen, drawn, beside, seed)
+        largest = least_largest(chosen, drawn_worlds.worlds, front, budget=budget, threads=jobs or 1)
+        beside = {"full_brake": full_braking(chosen, drawn_worlds), "maximin": largest}
+        results = front_results(front, chosen, drawn_worlds, beside, seed)
         results |= {"budget": budget, "settings": list(settings or ())}
         output.mkdir(parents=True, exist_ok=True)
         out.write(output / "front.json", json.dumps(results, indent=1, allow_nan=False) + "\n")
         out.write(output / "front.png", picture_bytes(front_figure(results), "front.png"), "figure")
-        out.result(results, front_sheet(results), hypervolume_sheet(results), kept=True)
+        out.result(results, front_sheet(results), hypervolume_sheet(results), in_file=True)
 
 
-FRONT = Part(
+FRONT_PART = Part(
     front_command,
     epilog=example(
         "study front --output runs/front",

@@ -21,21 +21,21 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.search.best_harm import best_harm, driven_profiles, starting_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, Profiles, beside_braking, problem_of, with_braking
 from ethbrake_marl.extensions.search.search import search_profiles
-from ethbrake_marl.extensions.search.tables import best_known
+from ethbrake_marl.extensions.search.tables import best_stored
 from ethbrake_marl.motion.layout import WEIGHT, Floats, Ints
 from ethbrake_marl.names import make_teams, open_game
 from ethbrake_marl.policies.bundle import shipped_policies
 from ethbrake_marl.worlds.scenario import Scenario
 
-BUDGET = 3_000  # candidates per world and choice of weights
-CONSTANTS = 101  # constant commands that every search tries
-CHUNK = 1_000  # worlds that are searched together
-MOST = 1_000  # choices of weights in a grid
+FRONT_BUDGET = 3_000  # candidates per world and choice of weights
+FRONT_CONSTANTS = 101  # constant commands that every search tries
+FRONT_CHUNK = 1_000  # worlds that are searched together
+MOST_CHOICES = 1_000  # choices of weights in a grid
 SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides between equal choices
 FIRST_SHARE = 0.6  # of the budget; the second round starts from the best results of all choices of weights
 
 Borne = Mapping[str, Floats]  # count of harm -> harm that each vehicle bears
-Progress = Callable[[int, int], None]  # called with the number of finished searches and of all
+OnSearch = Callable[[int, int], None]  # called with the number of finished searches and of all
 
 
 class Front(NamedTuple):
@@ -50,36 +50,36 @@ class Front(NamedTuple):
     def amounts(self) -> Floats:
         """Weighted harm of each world, [W, n] m2/s2."""
         return np.stack(
-            [weighted(each, row) for each, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
+            [weighted_harm(harm, row) for harm, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
         )
 
 
-def weighted(borne: Floats, weights: Floats) -> Floats:
+def weighted_harm(borne: Floats, weights: Floats) -> Floats:
     """Weighted harm ``N sum_i w_i h_i / sum_i w_i``, [...] m2/s2, as of the objective ``weighted``.
 
     ``borne`` [..., N] is the harm h of each vehicle, ``weights`` [N].
     """
-    total, whole = np.zeros(borne.shape[:-1]), 0.0
+    total, weight_sum = np.zeros(borne.shape[:-1]), 0.0
     for i, weight in enumerate(weights.tolist()):
-        total, whole = total + weight * borne[..., i], whole + weight
-    return np.asarray(len(weights) * total / whole)
+        total, weight_sum = total + weight * borne[..., i], weight_sum + weight
+    return np.asarray(len(weights) * total / weight_sum)
 
 
 def weight_grid(vehicles: int, steps: int) -> Floats:
     """W evenly spaced choices of weights, [W, N]. The weights of each choice sum to 1.
 
     From each row to the next, one weight rises by 1 / ``steps``, and another falls by as much. Raises ``InvalidInput``
-    for more than ``MOST`` choices.
+    for more than ``MOST_CHOICES`` choices.
 
     >>> from ethbrake_marl.extensions.cooperation import weight_grid
     >>> weight_grid(3, 1).tolist()
     [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     """
     number = comb(steps + vehicles - 1, steps)
-    if number > MOST:
+    if number > MOST_CHOICES:
         raise InvalidInput(
             f"steps = {steps}: the grid has {number:,} choices of weights for {vehicles} vehicles, but at most"
-            f" {MOST:,} are allowed; give fewer steps, or give the choices of weights yourself"
+            f" {MOST_CHOICES:,} are allowed; give fewer steps, or give the choices of weights yourself"
         )
     return np.array(_divisions(vehicles, steps)) / steps
 
@@ -90,8 +90,8 @@ def _divisions(vehicles: int, steps: int) -> list[list[int]]:
         return [[steps]]
     divisions: list[list[int]] = []
     for first in range(steps + 1):
-        others = _divisions(vehicles - 1, steps - first)
-        divisions += [[first, *rest] for rest in others[:: -1 if first % 2 else 1]]
+        rest_divisions = _divisions(vehicles - 1, steps - first)
+        divisions += [[first, *rest] for rest in rest_divisions[:: -1 if first % 2 else 1]]
     return divisions
 
 
@@ -105,10 +105,10 @@ def corners(vehicles: int) -> Floats:
 
 def weight_table(rows: Sequence[Sequence[Any]]) -> Floats:
     """Choices of weights as an array, [W, N]. Raises ``InvalidInput`` for unequal rows and what is no number."""
-    numbers = all(isinstance(each, int | float) and not isinstance(each, bool) for row in rows for each in row)
+    numbers = all(isinstance(weight, int | float) and not isinstance(weight, bool) for row in rows for weight in row)
     if not numbers or len({len(row) for row in rows}) != 1:
-        shown = "; ".join(",".join(map(str, row)) for row in rows)
-        raise InvalidInput(f"weights {shown:.80}: must be numbers, the same count in each choice, for instance 1,4,1")
+        text = "; ".join(",".join(map(str, row)) for row in rows)
+        raise InvalidInput(f"weights {text:.80}: must be numbers, the same count in each choice, for instance 1,4,1")
     return np.array(rows, np.float64)
 
 
@@ -118,17 +118,17 @@ def search_front(
     weights: Sequence[Sequence[float]] | Floats,
     *,
     count: str = "honest",
-    budget: int = BUDGET,
+    budget: int = FRONT_BUDGET,
     threads: int = 1,
     agents: Sequence[str] = (),
-    on_progress: Progress | None = None,
+    on_progress: OnSearch | None = None,
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    This harm is at most that of ``CONSTANTS`` constant commands, of the shipped profiles of this world, of ``agents``,
-    of every shipped policy, and of the results for all other choices. With several learners it is also at most what the
-    same search finds for each of them alone, while the others brake fully, if all decide at the same times. A world's
-    result depends on no other world.
+    This harm is at most that of ``FRONT_CONSTANTS`` constant commands, of the shipped profiles of this world, of
+    ``agents``, of every shipped policy, and of the results for all other choices. With several learners it is also at
+    most what the same search finds for each of them alone, while the others brake fully, if all decide at the same
+    times. A world's result depends on no other world.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import search_front
@@ -173,14 +173,16 @@ def search_front(
             on_progress(done, searches)
 
     effort, parts = {"budget": budget, "threads": threads}, []
-    for first in range(0, worlds.n, CHUNK):
-        pool, driven = _searched(together, worlds.take(slice(first, first + CHUNK)), weights, count, effort, tell)
+    for first in range(0, worlds.n, FRONT_CHUNK):
+        pool, driven = _search_chunk(
+            together, worlds.take(slice(first, first + FRONT_CHUNK)), weights, count, effort, tell
+        )
         parts.append((pool.least(weights), driven))
-    borne = _joined([least for least, _ in parts])
-    return Front(weights, count, borne, {name: _joined([driven[name] for _, driven in parts]) for name in agents})
+    borne = _join_chunks([least for least, _ in parts])
+    return Front(weights, count, borne, {name: _join_chunks([driven[name] for _, driven in parts]) for name in agents})
 
 
-def _joined(parts: Sequence[Borne]) -> Borne:
+def _join_chunks(parts: Sequence[Borne]) -> Borne:
     return {count: np.concatenate([part[count] for part in parts], axis=1) for count in COUNTS}
 
 
@@ -194,8 +196,8 @@ class Drivers(NamedTuple):
     @staticmethod
     def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
         chosen = [scenario.replace(harm_weight=row.tolist(), objective="preference") for row in weights]
-        teams = [make_teams(names, each, harm_count=count) for each in chosen]
-        preferring = [(open_game(each)[1], some) for each, some in zip(chosen, teams, strict=True)]
+        teams = [make_teams(names, variant, harm_count=count) for variant in chosen]
+        preferring = [(open_game(variant)[1], some) for variant, some in zip(chosen, teams, strict=True)]
         alone = {}
         for body in scenario.learners if len(scenario.learners) > 1 else ():
             single = scenario.with_learners([scenario.vehicle_names[body - 1]])
@@ -204,37 +206,37 @@ class Drivers(NamedTuple):
         return Drivers(open_game(scenario)[1], preferring, alone)
 
 
-def _searched(
+def _search_chunk(
     drivers: Drivers, worlds: State, weights: Floats, count: str, effort: Mapping[str, int], tell: Callable[[int], None]
-) -> tuple[Pool, dict[str, Borne]]:
+) -> tuple[ProfilePool, dict[str, Borne]]:
     """All profiles that were found in some worlds, and the harm of each vehicle if agents drive."""
-    pool = Pool(problem_of(drivers.game, worlds, count=count), count)
-    driven, problem = _tried(pool, worlds, weights, drivers.preferring), pool.problem
+    pool = ProfilePool(problem_of(drivers.game, worlds, count=count), count)
+    driven, problem = _try_known_commands(pool, worlds, weights, drivers.preferring), pool.problem
     starts: list[list[Profiles]] = [[*starting_profiles(problem, worlds)] for _ in weights]
     for body, single in drivers.alone.items():
-        theirs = with_braking(worlds, [other for other in drivers.alone if other != body])
-        found, _ = _searched(single, theirs, weights, count, effort, tell)
-        for given, row in zip(starts, weights, strict=True):
-            given.append(beside_braking(problem, found.problem, found.best(row)))
-            pool.add(given[-1])
+        braking_worlds = with_braking(worlds, [learner for learner in drivers.alone if learner != body])
+        single_pool, _ = _search_chunk(single, braking_worlds, weights, count, effort, tell)
+        for row_starts, row in zip(starts, weights, strict=True):
+            row_starts.append(beside_braking(problem, single_pool.problem, single_pool.best(row)))
+            pool.add(row_starts[-1])
     for k, share in enumerate((FIRST_SHARE, 1.0 - FIRST_SHARE)):
         spent = {**effort, "budget": max(int(share * effort["budget"]), 1)}
-        for given, row in zip(starts, weights, strict=True):
+        for row_starts, row in zip(starts, weights, strict=True):
             aim = problem.minimising(row / row.sum())
-            pool.add(search_profiles(aim, [pool.best(row), *(given if k == 0 else ())], **spent)[0])
+            pool.add(search_profiles(aim, [pool.best(row), *(row_starts if k == 0 else ())], **spent)[0])
             tell(problem.n)
     return pool, driven
 
 
-def _tried(
-    pool: Pool, worlds: State, weights: Floats, preferring: Sequence[tuple[Game, Mapping[str, Team]]]
+def _try_known_commands(
+    pool: ProfilePool, worlds: State, weights: Floats, preferring: Sequence[tuple[Game, Mapping[str, Team]]]
 ) -> dict[str, Borne]:
     """Add constant commands, the shipped profiles and those of agents; return the harm if the agents drive."""
     problem = pool.problem
-    constants = problem.constant(problem.even_grid(CONSTANTS))
-    for q in range(CONSTANTS):
-        pool.add(constants.take(slice(q, None, CONSTANTS)))
-    pool.add(best_known(problem, pool.count)[1])
+    constants = problem.constant(problem.even_grid(FRONT_CONSTANTS))
+    for q in range(FRONT_CONSTANTS):
+        pool.add(constants.take(slice(q, None, FRONT_CONSTANTS)))
+    pool.add(best_stored(problem, pool.count)[1])
     driven: dict[str, list[Borne]] = {name: [] for name in preferring[0][1]}
     for row, (game, teams) in zip(weights, preferring, strict=True):
         car = worlds.car.copy()
@@ -245,61 +247,68 @@ def _tried(
             else:
                 profiles = driven_profiles(problem, game, worlds._replace(car=car), team)
                 driven[name].append(pool.add(profiles))
-    return {name: {count: np.stack([one[count] for one in each]) for count in COUNTS} for name, each in driven.items()}
+    return {
+        name: {count: np.stack([borne[count] for borne in results]) for count in COUNTS}
+        for name, results in driven.items()
+    }
 
 
 def observes_weights(team: Team) -> bool:
     """Whether commands may depend on the weights of harm: no if there are only policies without this feature."""
     policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
-    seen = [() if policy is None else policy.observation.names for policy in policies]
-    return team.shield is not None or any(not names or any("harm_weight" in name for name in names) for names in seen)
+    feature_names = [() if policy is None else policy.observation.names for policy in policies]
+    return team.shield is not None or any(
+        not names or any("harm_weight" in name for name in names) for names in feature_names
+    )
 
 
-class Pool:
+class ProfilePool:
     def __init__(self, problem: Problem, count: str) -> None:
         self.problem, self.count = problem, count
         self.profiles: list[Profiles] = []
-        self.borne: dict[str, list[Floats]] = {each: [] for each in COUNTS}
+        self.borne: dict[str, list[Floats]] = {harm_count: [] for harm_count in COUNTS}
 
     def add(self, profiles: Profiles) -> Borne:
         self.profiles.append(profiles)
         last = self.problem.follow(profiles)
-        for count, each in self.borne.items():
-            each.append(last.borne_harm(count))
-        return {count: each[-1] for count, each in self.borne.items()}
+        for count, harms in self.borne.items():
+            harms.append(last.borne_harm(count))
+        return {count: harms[-1] for count, harms in self.borne.items()}
 
     def choice(self, weights: Floats) -> Ints:
         """Number of the profile with the least weighted harm in each world, [n]; ties: the least harm."""
         borne = np.stack(self.borne[self.count])
-        amounts = weighted(borne, weights)
+        amounts = weighted_harm(borne, weights)
         least = amounts.min(axis=0)
         return np.asarray(np.where(amounts == least, borne.sum(axis=2), np.inf).argmin(axis=0))
 
     def best(self, weights: Floats) -> Profiles:
         chosen, rows = self.choice(weights), np.arange(self.problem.n)
-        used = np.unique(chosen)
-        ends, commands = zip(*Profiles.padded([self.profiles[k] for k in used]), strict=True)
-        place = np.searchsorted(used, chosen)
+        numbers = np.unique(chosen)
+        ends, commands = zip(*Profiles.padded([self.profiles[k] for k in numbers]), strict=True)
+        place = np.searchsorted(numbers, chosen)
         return Profiles(np.stack(ends)[place, rows], np.stack(commands)[place, rows])
 
     def least(self, weights: Floats) -> Borne:
         """Each vehicle's harm under the best profiles for all ``weights`` [W, N]: count -> [W, n, N]."""
         chosen, rows = [self.choice(row) for row in weights], np.arange(self.problem.n)
-        return {count: np.stack([np.stack(each)[k, rows] for k in chosen]) for count, each in self.borne.items()}
+        return {count: np.stack([np.stack(harms)[k, rows] for k in chosen]) for count, harms in self.borne.items()}
 
 
-def least_largest(scenario: Scenario, worlds: State, front: Front, *, budget: int = BUDGET, threads: int = 1) -> Borne:
+def least_largest(
+    scenario: Scenario, worlds: State, front: Front, *, budget: int = FRONT_BUDGET, threads: int = 1
+) -> Borne:
     """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm.
 
     It is count -> [n, N] m2/s2. The largest harm is at most that under any profile of ``front``, which was searched in
     the same worlds.
     """
     game, parts = open_game(scenario)[1], []
-    for first in range(0, worlds.n, CHUNK):
-        some = worlds.take(slice(first, first + CHUNK))
+    for first in range(0, worlds.n, FRONT_CHUNK):
+        some = worlds.take(slice(first, first + FRONT_CHUNK))
         table = best_harm(game, some, counts=(front.harm_count,), budget=budget, threads=threads, objective="maximin")
         last = problem_of(game, some).follow(table.profiles[front.harm_count])
         parts.append({count: last.borne_harm(count)[np.newaxis] for count in COUNTS})
-    every = {count: np.concatenate([_joined(parts)[count], front.borne[count]]) for count in COUNTS}
+    every = {count: np.concatenate([_join_chunks(parts)[count], front.borne[count]]) for count in COUNTS}
     chosen = every[front.harm_count].max(axis=2).argmin(axis=0)
     return {count: borne[chosen, np.arange(worlds.n)] for count, borne in every.items()}

@@ -17,24 +17,26 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import by_recording
 from ethbrake_marl.evaluation.identity import about_scenario, versions, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
-from ethbrake_marl.extensions.cooperation.front import Borne, Front, weighted
+from ethbrake_marl.extensions.cooperation.front import Borne, Front, weighted_harm
 from ethbrake_marl.extensions.report.style import (
     TITLES,
     finish,
     in_our_style,
     label_text,
     new_panels,
-    plain,
+    plain_number,
     series_style,
 )
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
-from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.sampling import DrawnWorlds
 from ethbrake_marl.worlds.scenario import Scenario
 
-FRONT = "Pareto front"  # name of the front beside the agents in the entry "hypervolume"; no agent can have this name
+FRONT_NAME = (
+    "Pareto front"  # name of the front beside the agents in the entry "hypervolume"; no agent can have this name
+)
 MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of the dimensions less one
 SIZE_IN = (5.6, 4.6)  # narrow enough for a phone
 
@@ -42,7 +44,7 @@ Json = dict[str, Any]
 
 
 def front_results(
-    front: Front, scenario: Scenario, drawn: Drawn, beside: Mapping[str, Borne], seed: int | None
+    front: Front, scenario: Scenario, drawn_worlds: DrawnWorlds, beside: Mapping[str, Borne], seed: int | None
 ) -> Json:
     """Content of ``front.json``: the front, full braking, maximin, and the agents.
 
@@ -50,12 +52,12 @@ def front_results(
     weighted harm divided by the front's (null if that is 0), ``above`` the difference. ``beside``: results beside the
     front, name -> count -> harm of each vehicle, [n, N] m2/s2; it contains ``full_brake``.
     """
-    by = clusters_of(columns_of(drawn))
+    by = clusters_of(columns_of(drawn_worlds))
     return {
         "kind": "front",
         "scenario": scenario.name,
         "seed": seed,
-        "episodes": drawn.worlds.n,
+        "episodes": drawn_worlds.worlds.n,
         **({} if by is None else {"recordings": len(np.unique(by))}),
         "harm_count": front.harm_count,
         "vehicles": list(scenario.vehicle_names),
@@ -64,7 +66,7 @@ def front_results(
         "agents": {name: _points(front, borne, by) for name, borne in front.agents.items()},
         "hypervolume": hypervolumes(front, beside["full_brake"][front.harm_count]),
         "scenario_sha256": about_scenario(scenario)["scenario_sha256"],
-        "worlds_sha256": worlds_sha256(drawn.worlds),
+        "worlds_sha256": worlds_sha256(drawn_worlds.worlds),
         "versions": versions(),
     }
 
@@ -73,7 +75,7 @@ def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
     points = []
     for k, (weights, least) in enumerate(zip(front.weights, front.amounts, strict=True)):
         harm = borne[front.harm_count][k]
-        amounts = weighted(harm, weights)
+        amounts = weighted_harm(harm, weights)
         points.append({
             "weights": weights.tolist(),
             "vehicles": _vehicles({count: borne[count][k] for count in COUNTS}, by),
@@ -86,7 +88,7 @@ def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
 
 
 def _vehicles(borne: Borne, by: Clusters) -> dict[str, list[Json]]:
-    return {count: [mean(each, by).to_json() for each in borne[count].T] for count in COUNTS}
+    return {count: [mean(harm, by).to_json() for harm in borne[count].T] for count in COUNTS}
 
 
 def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
@@ -99,16 +101,21 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
-    points = {name: each[front.harm_count].mean(axis=1) for name, each in {FRONT: front.borne, **front.agents}.items()}
+    points = {
+        name: borne[front.harm_count].mean(axis=1) for name, borne in {FRONT_NAME: front.borne, **front.agents}.items()
+    }
     braking = full_brake.mean(axis=0)
     references = {
-        "full braking": braking, "largest harm of each vehicle": np.maximum(braking, points[FRONT].max(axis=0)),
+        "full braking": braking, "largest harm of each vehicle": np.maximum(braking, points[FRONT_NAME].max(axis=0)),
     }  # fmt: skip
     entries = []
     for words, reference in references.items():
         volumes = {name: hypervolume(rows, reference) for name, rows in points.items()}
-        whole = volumes[FRONT]
-        of = {name: {"volume": each, "share": each / whole if whole else None} for name, each in volumes.items()}
+        volume_of_front = volumes[FRONT_NAME]
+        of = {
+            name: {"volume": volume, "share": volume / volume_of_front if volume_of_front else None}
+            for name, volume in volumes.items()
+        }
         entries.append({"reference": words, "at": reference.tolist(), "of": of})
     return entries
 
@@ -135,9 +142,9 @@ def hypervolume(points: Floats, reference: Floats) -> float:
     return sum(float(height) * hypervolume(below, reference[:-1]) for height, below in slices if height > 0.0)
 
 
-def full_braking(scenario: Scenario, drawn: Drawn) -> Borne:
+def full_braking(scenario: Scenario, drawn_worlds: DrawnWorlds) -> Borne:
     game = open_game(scenario)[1]
-    last = drive(game, drawn.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
+    last = drive(game, drawn_worlds.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
     return {count: last.borne_harm(count) for count in COUNTS}
 
 
@@ -149,13 +156,15 @@ def front_sheet(results: Json) -> Sheet:
     count, agents = results["harm_count"], results["agents"]
 
     def row(name: str, vehicles: Mapping[str, list[Json]], *ratios: float | None) -> tuple[str | float | None, ...]:
-        means = {each: [harm["value"] for harm in vehicles[each]] for each in COUNTS}
+        means = {harm_count: [harm["value"] for harm in vehicles[harm_count]] for harm_count in COUNTS}
         return (name, *means[count], *map(sum, means.values()), *ratios)
 
     rows = [
         row(",".join(f"{weight:g}" for weight in point["weights"]), point["vehicles"], *ratios)
         for point, *ratios in zip(
-            results["points"], *([each["ratio"] for each in points] for points in agents.values()), strict=True
+            results["points"],
+            *([agent_point["ratio"] for agent_point in points] for points in agents.values()),
+            strict=True,
         )
     ]
     rows += [row(name, vehicles) for name, vehicles in results["beside"].items()]
@@ -176,9 +185,9 @@ def front_sheet(results: Json) -> Sheet:
 def hypervolume_sheet(results: Json) -> Sheet:
     share = Column("Share of the front", digits=1, scale=100.0, unit=" %")
     rows = [
-        (each["reference"], name, *volume.values())
-        for each in results["hypervolume"]
-        for name, volume in each["of"].items()
+        (entry["reference"], name, *volume.values())
+        for entry in results["hypervolume"]
+        for name, volume in entry["of"].items()
     ]
     columns: list[Column | str] = ["Reference", "Of", Column("Hypervolume"), share]
     return Sheet(f"Hypervolume of the mean {IN_WORDS[results['harm_count']]}, (m2/s2)^N", columns, rows, gap=2)
@@ -194,15 +203,15 @@ def front_figure(results: Json) -> Figure:
     count, all_positive = results["harm_count"], True
     figure, (axes,) = new_panels(SIZE_IN)
     for number, (name, points) in enumerate({"Pareto front": results["points"], **beside, **results["agents"]}.items()):
-        harm = np.array([[each["value"] for each in point["vehicles"][count]] for point in points])
+        harm = np.array([[vehicle["value"] for vehicle in point["vehicles"][count]] for point in points])
         style = series_style(number) | {"linestyle": "none", "markersize": 5.0, "fillstyle": "none"}
         axes.plot(harm.sum(axis=1), harm.max(axis=1), label=label_text(name, 34), **style)
         all_positive &= bool((harm.max(axis=1) > 0.0).all())
     if all_positive:
         axes.set(xscale="log", yscale="log")
         for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(FuncFormatter(plain))
-            axis.set_minor_formatter(FuncFormatter(plain))
+            axis.set_major_formatter(FuncFormatter(plain_number))
+            axis.set_minor_formatter(FuncFormatter(plain_number))
     axes.tick_params(which="minor", labelsize=7)
     axes.set(xlabel=f"Line: {TITLES[count].lower()}", ylabel=f"Vehicle that bears most: {TITLES[count].lower()}")
     worlds = count_of(results["episodes"], "world")

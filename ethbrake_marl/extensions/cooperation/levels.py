@@ -13,24 +13,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.cli.settings import Settings
+from ethbrake_marl.cli.settings import CommandSettings
 from ethbrake_marl.errors import InvalidInput, count_of
 from ethbrake_marl.files.overrides import Override
 from ethbrake_marl.training.recipe import TrainingRecipe
 from ethbrake_marl.worlds.describe import quantities_of
-from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.sampling import DrawnWorlds
 from ethbrake_marl.worlds.scenario import Scenario
 
 STANDARD = ("level-0-sensors", "level-1-messages", "level-2-own", "level-3-line", "level-4-pair", "level-5-all")
-SWEPT = "cooperation-3-pair"  # default level of a sweep
+SWEEP_LEVEL = "cooperation-3-pair"  # default level of a sweep
 
-SHARED = ("vehicles", "time_step_s", "horizon_s", "observation")  # keys that are the same at all levels
+SHARED_KEYS = ("vehicles", "time_step_s", "horizon_s", "observation")  # keys that are the same at all levels
 MAY_DIFFER = ("obstacle_gap_m", "harm_weight")  # beginnings of columns of the worlds
 SAME_VEHICLES = ("objective", "obstacle_gap_m", "roles", "v2x")  # keys whose sweep leaves the vehicles as they are
 
-MOST = 100  # values of a sweep, such as ``objective=social:0..90:15`` (0, 15, ..., 90 degrees)
-NUMBER = r"-?\d+(?:\.\d+)?"
-ITEM = re.compile(rf"(?P<low>{NUMBER})(?:\.\.(?P<high>{NUMBER}):(?P<step>{NUMBER}))?", re.ASCII)
+MOST_VALUES = 100  # values of a sweep, such as ``objective=social:0..90:15`` (0, 15, ..., 90 degrees)
+NUMBER_PATTERN = r"-?\d+(?:\.\d+)?"
+ITEM = re.compile(rf"(?P<low>{NUMBER_PATTERN})(?:\.\.(?P<high>{NUMBER_PATTERN}):(?P<step>{NUMBER_PATTERN}))?", re.ASCII)
 WORD = re.compile(r"\s*([A-Za-z][\w-]*:)?", re.ASCII)
 
 
@@ -71,7 +71,7 @@ class Level(NamedTuple):
         return self.swept is None or self.swept.key.partition(".")[0] in SAME_VEHICLES
 
 
-def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
+def read_levels(names: Sequence[str], settings: CommandSettings) -> list[Level]:
     """Load the levels of an ablation; each is compared with the previous one.
 
     Raises ``InvalidInput`` for fewer than two levels, or one given twice.
@@ -87,7 +87,7 @@ def read_levels(names: Sequence[str], settings: Settings) -> list[Level]:
     return levels
 
 
-def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[TrainingRecipe]) -> list[Level]:
+def sweep_levels(name: str, sweep: str, settings: CommandSettings, recipes: Sequence[TrainingRecipe]) -> list[Level]:
     """One level for each value of a sweep, in ascending order; each is compared with the previous one.
 
     Raises ``InvalidInput`` if the key is not a scenario's, if a setting or a recipe sets it too, or if its values make
@@ -101,12 +101,12 @@ def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[Tr
             f"--sweep {key}: only a key of a scenario can be swept; to vary a recipe, write a recipe for each value,"
             " and use train/sweep.py"
         )
-    if path[0] in SHARED:
+    if path[0] in SHARED_KEYS:
         raise InvalidInput(
             f"--sweep {key}: levels with different values of {path[0]} cannot be compared; for each value of {path[0]},"
             f" run the command once, with --set {path[0]}=... and an --output of its own"
         )
-    if any(each.path[: len(path)] == path for each in settings.scenario):
+    if any(override.path[: len(path)] == path for override in settings.scenario):
         raise InvalidInput(f"--sweep {key}: --set changes the same key; leave out --sweep or --set")
     for recipe in recipes if path[0] == "objective" else ():
         if recipe.reward.objective is not None:
@@ -114,7 +114,7 @@ def sweep_levels(name: str, sweep: str, settings: Settings, recipes: Sequence[Tr
                 f"--sweep {key}: the sweep has no effect, because recipe {recipe.name!r} has its own objective"
                 " (reward.objective); give a recipe without an objective"
             )
-    for value in (each._replace(key=".".join(path)) for each in values):
+    for value in (swept._replace(key=".".join(path)) for swept in values):
         changed = settings._replace(scenario=[*settings.scenario, *Override.parse([value.setting])])
         scenario = changed.change_scenario(name)
         before = levels[-1].name if levels else None
@@ -127,7 +127,7 @@ def parse_sweep(text: str) -> list[Swept]:
 
     A word may precede the numbers, as in ``objective=social:0..90:15``. Numbers and ranges may be mixed. Raises
     ``InvalidInput`` for any other text, a range that its step does not divide, a repeated number, and fewer than 2 or
-    more than ``MOST`` numbers.
+    more than ``MOST_VALUES`` numbers.
     """
     key, equals, values = (part.strip() for part in text.partition("="))
     match = WORD.match(values)
@@ -141,46 +141,46 @@ def parse_sweep(text: str) -> list[Swept]:
             )
         low, high, step = (Decimal(part or 0) for part in parsed.group("low", "high", "step"))
         steps = (high - low) / step if step > 0 else Decimal(0)
-        if parsed["step"] is not None and (not 0 < steps < MOST or steps % 1):
+        if parsed["step"] is not None and (not 0 < steps < MOST_VALUES or steps % 1):
             raise InvalidInput(
                 f"--sweep {key}: range {item.strip()}: a range LOW..HIGH:STEP must go up from LOW to HIGH in 1 to"
-                f" {MOST - 1} equal steps, for instance 0..90:15"
+                f" {MOST_VALUES - 1} equal steps, for instance 0..90:15"
             )
         numbers += [low + k * step for k in range(int(steps) + 1)]
-    if not 2 <= len(numbers) <= MOST:
-        raise InvalidInput(f"--sweep {key}: has {count_of(len(numbers), 'number')}; give 2 to {MOST} numbers")
+    if not 2 <= len(numbers) <= MOST_VALUES:
+        raise InvalidInput(f"--sweep {key}: has {count_of(len(numbers), 'number')}; give 2 to {MOST_VALUES} numbers")
     if twice := [number for number in numbers if numbers.count(number) > 1]:
         raise InvalidInput(f"--sweep {key}: {twice[0]} is given twice; give each number once")
     return [Swept(key, word, f"{number.normalize():f}") for number in sorted(numbers)]
 
 
-def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[Drawn]:
+def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[DrawnWorlds]:
     """Draw the worlds of each level; world k has the same line of vehicles at all levels.
 
     Only obstacles, weights of harm and, with different ``v2x``, latencies may differ; ``InvalidInput`` names any other
     difference. If a sweep varies a key of the vehicles, worlds k share only their random numbers.
     """
-    drawn = [level.scenario.draw(episodes, seed) for level in levels]
+    drawn_by_level = [level.scenario.draw(episodes, seed) for level in levels]
     if not levels[0].same_vehicles:
-        return drawn
-    every = [_quantities(*pair) for pair in zip(levels, drawn, strict=True)]
+        return drawn_by_level
+    all_quantities = [_quantities(*pair) for pair in zip(levels, drawn_by_level, strict=True)]
     for k, level in enumerate(levels):
         alike = next(j for j in range(k + 1) if levels[j].scenario.v2x == level.scenario.v2x)
-        for key in dict.fromkeys([*every[0], *every[k]]):
-            other = alike if key.startswith("latency") else 0
-            here, there = (every[j].get(key, np.array(["not set"])) for j in (k, other))
+        for key in dict.fromkeys([*all_quantities[0], *all_quantities[k]]):
+            reference = alike if key.startswith("latency") else 0
+            here, there = (all_quantities[j].get(key, np.array(["not set"])) for j in (k, reference))
             if not np.array_equal(here, there):
                 differs = here != there
                 world = int(np.argmax(differs)) if np.shape(differs) == here.shape else 0
                 raise InvalidInput(
                     f"level {level.name!r}: {key} is {here[world]}, but {there[world]} at level"
-                    f" {levels[other].name!r}; levels may differ only in roles, objective, obstacle_gap_m, v2x and,"
+                    f" {levels[reference].name!r}; levels may differ only in roles, objective, obstacle_gap_m, v2x and,"
                     " where v2x differs, latency_s; change or leave out one of the two levels"
                 )
-    return drawn
+    return drawn_by_level
 
 
-def _quantities(level: Level, drawn: Drawn) -> dict[str, Any]:
-    keys = {key: np.array([str(getattr(level.scenario, key))]) for key in SHARED}
-    columns = quantities_of(drawn.worlds)
+def _quantities(level: Level, drawn_worlds: DrawnWorlds) -> dict[str, Any]:
+    keys = {key: np.array([str(getattr(level.scenario, key))]) for key in SHARED_KEYS}
+    columns = quantities_of(drawn_worlds.worlds)
     return keys | {name: column for name, column in columns.items() if not name.startswith(MAY_DIFFER)}

@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter
 from ethbrake_marl.episode.counts import COLUMN, IN_WORDS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.door import SEED
-from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, Measured
+from ethbrake_marl.extensions.cooperation.ablation import CSV, FIGURE, FULL, JSON, Ablation, LevelResult
 from ethbrake_marl.extensions.cooperation.seeds import mean_over_seeds, share_over_seeds
 from ethbrake_marl.extensions.report.style import (
     GREY,
@@ -25,7 +25,7 @@ from ethbrake_marl.extensions.report.style import (
     finish,
     in_our_style,
     new_panels,
-    plain,
+    plain_number,
     series_style,
     write_picture,
 )
@@ -34,7 +34,7 @@ from ethbrake_marl.files.sheet import Column, Estimate, Sheet, csv_text
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Floats
 
-TOLERANCE = 1e-6  # m2/s2; a vehicle counts as worse off if its harm rises by more than this
+HARM_TOLERANCE = 1e-6  # m2/s2; a vehicle counts as worse off if its harm rises by more than this
 LINEAR = 0.1  # m2/s2; axes are linear below this harm and logarithmic above it, because harm varies by a factor of 100
 LEVEL_IN, NARROWEST_IN, WIDEST_IN = 1.05, 5.0, 10.5  # width of a level, and of the figure
 PANEL_IN = 2.8  # height of a panel
@@ -42,7 +42,7 @@ PANEL_IN = 2.8  # height of a panel
 Json = dict[str, Any]
 
 
-def compare(measured: Sequence[Measured], searched: int) -> Json:
+def comparison(measured: Sequence[LevelResult], searched: int) -> Json:
     """Comparison as plain data.
 
     - ``levels``: results of each level and algorithm;
@@ -52,60 +52,66 @@ def compare(measured: Sequence[Measured], searched: int) -> Json:
     The joint optimum is known only in the first ``searched`` worlds; comparisons with it use only these.
     """
     steps = []
-    for algorithm in dict.fromkeys(each.algorithm for each in measured if each.algorithm is not None):
-        own = {each.level.name: each for each in measured if each.algorithm in (None, algorithm)}
-        steps += [_change(own[each.level.before], each, algorithm) for each in own.values() if each.level.before]
+    for algorithm in dict.fromkeys(result.algorithm for result in measured if result.algorithm is not None):
+        results_by_level = {result.level.name: result for result in measured if result.algorithm in (None, algorithm)}
+        steps += [
+            _change(results_by_level[result.level.before], result, algorithm)
+            for result in results_by_level.values()
+            if result.level.before
+        ]
     goals = [
-        (each, *(own["goal"].mean() for own in (each.reached, each.braking))) for each in measured if each.algorithm
+        (result, *(columns["goal"].mean() for columns in (result.reached, result.braking)))
+        for result in measured
+        if result.algorithm
     ]
     named = [
-        f"{each.level.name} ({each.algorithm}) with {reached:.2f} ({braking:.2f} with full braking)"
-        for each, reached, braking in goals
-        if reached > braking + TOLERANCE
+        f"{result.level.name} ({result.algorithm}) with {reached:.2f} ({braking:.2f} with full braking)"
+        for result, reached, braking in goals
+        if reached > braking + HARM_TOLERANCE
     ]
     return {
         "kind": "ablate",
-        "levels": [_level(each, searched) for each in measured],
+        "levels": [_level(result, searched) for result in measured],
         "steps": steps,
         "undertrained": [f"Not trained enough to say anything: {'; '.join(named)}."] if named else [],
     }
 
 
-def place_of(one: Measured) -> Json:
-    swept = one.level.swept
-    return {"level": one.level.name} | ({} if swept is None else {"swept_number": swept.number})
+def level_key(result: LevelResult) -> Json:
+    swept = result.level.swept
+    return {"level": result.level.name} | ({} if swept is None else {"swept_number": swept.number})
 
 
-def _level(one: Measured, searched: int) -> Json:
-    scenario = one.level.scenario
-    mean = partial(mean_over_seeds, clusters=one.clusters)
+def _level(result: LevelResult, searched: int) -> Json:
+    scenario = result.level.scenario
+    mean = partial(mean_over_seeds, clusters=result.clusters)
     entry: Json = {
-        **one.about,
-        **place_of(one),
+        **result.about,
+        **level_key(result),
         "title": scenario.title,
-        "algorithm": one.algorithm,
-        "before": one.level.before,
+        "algorithm": result.algorithm,
+        "before": result.level.before,
         "learners": [scenario.vehicle_names[body - 1] for body in scenario.learners],
-        "seeds": len(one.reached["collided"]),
-        "worlds": one.reached["collided"].shape[1],
-        "collision_rate": mean(one.reached["collided"]).to_json(),
+        "seeds": len(result.reached["collided"]),
+        "worlds": result.reached["collided"].shape[1],
+        "collision_rate": mean(result.reached["collided"]).to_json(),
     }
     for count, column in COLUMN.items():
-        reached, braking = one.reached[column], one.braking[column]
+        reached, braking = result.reached[column], result.braking[column]
         entry[count] = {
             "full_brake": mean(braking).to_json(),
             "harm": mean(reached).to_json(),
             "each_seed": reached.mean(axis=1).tolist(),
-            "vehicles": [mean(each).to_json() for each in _borne(one, column)],
-            "searched": _beside_optimum(one, count, searched),
+            "vehicles": [mean(harm).to_json() for harm in _borne_columns(result, column)],
+            "searched": _beside_optimum(result, count, searched),
         }
     return entry
 
 
-def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
-    first = None if one.clusters is None else one.clusters[:searched]
-    reached, braking = one.reached[COLUMN[count]][:, :searched], one.braking[COLUMN[count]][:, :searched]
-    best = None if one.best is None else one.best[count]
+def _beside_optimum(result: LevelResult, count: str, searched: int) -> Json:
+    first = None if result.clusters is None else result.clusters[:searched]
+    reached, braking = result.reached[COLUMN[count]][:, :searched], result.braking[COLUMN[count]][:, :searched]
+    best = None if result.best is None else result.best[count]
     mean = partial(mean_over_seeds, clusters=first)
     share = None if best is None else share_over_seeds(reached, braking, best, first)
     return {
@@ -118,15 +124,15 @@ def _beside_optimum(one: Measured, count: str, searched: int) -> Json:
     }
 
 
-def _change(before: Measured, after: Measured, algorithm: str) -> Json:
+def _change(before: LevelResult, after: LevelResult, algorithm: str) -> Json:
     """How harm differs between two levels. Seed k is compared with seed k, or with an only seed."""
     entry: Json = {"algorithm": algorithm}
-    for word, one in (("from", before), ("to", after)):
-        entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in place_of(one).items()}
+    for word, result in (("from", before), ("to", after)):
+        entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in level_key(result).items()}
     mean = partial(mean_over_seeds, clusters=after.clusters)
     for count, column in COLUMN.items():
-        new, old = (np.stack(_borne(each, column), axis=2) for each in (after, before))
-        worse = new > old + TOLERANCE
+        new, old = (np.stack(_borne_columns(measured, column), axis=2) for measured in (after, before))
+        worse = new > old + HARM_TOLERANCE
         entry[count] = {
             "difference": mean(after.reached[column], before.reached[column]).to_json(),
             "vehicles": [mean(new[:, :, i], old[:, :, i]).to_json() for i in range(new.shape[2])],
@@ -136,11 +142,11 @@ def _change(before: Measured, after: Measured, algorithm: str) -> Json:
     return entry
 
 
-def _borne(one: Measured, column: str) -> list[Floats]:
-    return [one.reached[f"{column}_{i}"] for i in range(1, one.level.scenario.vehicles + 1)]
+def _borne_columns(result: LevelResult, column: str) -> list[Floats]:
+    return [result.reached[f"{column}_{i}"] for i in range(1, result.level.scenario.vehicles + 1)]
 
 
-def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, list[Path]]:
+def write_ablation(plan: Ablation, measured: Sequence[LevelResult]) -> tuple[Json, list[Path]]:
     recipes = zip(plan.algorithms, plan.recipes, strict=True)
     swept, machine = plan.levels[0].swept, this_machine()
     results = {
@@ -153,7 +159,7 @@ def write_ablation(plan: Ablation, measured: Sequence[Measured]) -> tuple[Json, 
             "date": datetime.now(UTC).date().isoformat(),
         },
         "conditions": f"{conditions(plan, plan.episodes)} {machine}.",
-        **compare(measured, plan.search_episodes),
+        **comparison(measured, plan.search_episodes),
     }
     json_file, csv_file, picture = (plan.folder / name for name in (JSON, CSV, FIGURE))
     write_output(json_file, f"{json.dumps(results, indent=2, allow_nan=False)}\n".encode(), force=True)
@@ -168,52 +174,52 @@ def conditions(plan: Ablation, number: int) -> str:
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
     )
     alike = plan.levels[0].same_vehicles
-    same, drawn = ("the same ", "") if alike else ("", ", drawn with the same random numbers")
+    same_words, draw_words = ("the same ", "") if alike else ("", ", drawn with the same random numbers")
     first = "" if number == plan.episodes else "first "
-    others = "other seeds and other worlds" if plan.seeds > 1 else "other worlds only: one seed says nothing of others"
+    scope = "other seeds and other worlds" if plan.seeds > 1 else "other worlds only: one seed says nothing of others"
     optimum = f"{count_of(plan.search_episodes, 'world')}, {plan.budget:,} candidates per world and count."
     return (
         f"{recipes}; {count_of(plan.seeds, 'seed')}, {plan.steps_per_learner:,} decisions of each learner, rounded up"
         " to whole updates. Harm and honest cost are means per world in m²/s² on"
-        f" {same}{first}{count_of(number, 'world')} of seed {SEED}{drawn}; 95 % intervals for {others}. Joint optimum:"
-        f" the least harm or cost known that the learners can cause, in the first {optimum}"
+        f" {same_words}{first}{count_of(number, 'world')} of seed {SEED}{draw_words}; 95 % intervals for {scope}. Joint"
+        f" optimum: the least harm or cost known that the learners can cause, in the first {optimum}"
     )
 
 
-def levels_csv(measured: Sequence[Measured], searched: int) -> str:
+def levels_csv(measured: Sequence[LevelResult], searched: int) -> str:
     """CSV text with one row per level, algorithm and seed: the mean over worlds of each column of an evaluation.
 
     The columns ``searched_*`` are means over the first ``searched`` worlds.
     """
     rows: list[Json] = []
-    for one in measured:
-        for seed in range(len(one.reached["collided"])):
-            row: Json = {**place_of(one), "algorithm": one.algorithm, "seed": seed if one.algorithm else None}
-            row |= {name: float(values[seed].mean()) for name, values in one.reached.items()}
+    for result in measured:
+        for seed in range(len(result.reached["collided"])):
+            row: Json = {**level_key(result), "algorithm": result.algorithm, "seed": seed if result.algorithm else None}
+            row |= {name: float(values[seed].mean()) for name, values in result.reached.items()}
             for count, name in COLUMN.items():
                 row |= {
-                    f"full_brake_{name}": float(one.braking[name].mean()),
-                    f"searched_{name}": float(one.reached[name][seed, :searched].mean()),
-                    f"searched_full_brake_{name}": float(one.braking[name][:, :searched].mean()),
-                    f"searched_best_known_{name}": None if one.best is None else float(one.best[count].mean()),
+                    f"full_brake_{name}": float(result.braking[name].mean()),
+                    f"searched_{name}": float(result.reached[name][seed, :searched].mean()),
+                    f"searched_full_brake_{name}": float(result.braking[name][:, :searched].mean()),
+                    f"searched_best_known_{name}": None if result.best is None else float(result.best[count].mean()),
                 }
             rows.append(row)
     return csv_text(rows)
 
 
-Columns = list[tuple[Column, str]]
+SheetColumns = list[tuple[Column, str]]
 
 
 def tables(results: Json) -> list[Sheet]:
     swept, levels = results["settings"]["swept"], results["levels"]
     several = len(results["settings"]["recipes"]) > 1
-    algorithm: Columns = [(Column("Algorithm", text=True), "algorithm")] if several else []
-    about: Columns = [(Column("Level", text=True), "level") if swept is None else (Column(swept), "swept_number")]
-    from_to: Columns = [(Column(name, text=True), name.lower()) for name in ("From", "To")]
+    algorithm: SheetColumns = [(Column("Algorithm", text=True), "algorithm")] if several else []
+    about: SheetColumns = [(Column("Level", text=True), "level") if swept is None else (Column(swept), "swept_number")]
+    from_to: SheetColumns = [(Column(name, text=True), name.lower()) for name in ("From", "To")]
     if swept is not None:
         from_to = [(Column(f"{swept}, from"), "from_swept_number"), (Column("To"), "to_swept_number")]
     worlds = count_of(levels[0]["first"]["searched"]["worlds"], "world")
-    known = [level for level in levels if level["first"]["searched"]["best_known"] is not None]
+    searched_levels = [level for level in levels if level["first"]["searched"]["best_known"] is not None]
     sheets = []
     for count, harm in ((count, IN_WORDS[count]) for count in COLUMN):
         sheets += [
@@ -221,7 +227,7 @@ def tables(results: Json) -> list[Sheet]:
                 *about, *algorithm, (share("Collisions"), "collision_rate"),
                 (Column("Full braking"), f"{count} full_brake value"), (Column("Reached"), f"{count} harm"),
             ]),
-            sheet(f"How near the joint optimum, {harm} in the first {worlds}", known, [
+            sheet(f"How near the joint optimum, {harm} in the first {worlds}", searched_levels, [
                 *about, *algorithm, (Column("Full braking"), f"{count} searched full_brake value"),
                 (Column("Reached"), f"{count} searched harm value"),
                 (Column("Joint optimum"), f"{count} searched best_known value"),
@@ -235,7 +241,7 @@ def tables(results: Json) -> list[Sheet]:
     return sheets
 
 
-def sheet(title: str, rows: Sequence[Json], columns: Columns) -> Sheet:
+def sheet(title: str, rows: Sequence[Json], columns: SheetColumns) -> Sheet:
     """Table. A column's path says where its values are: ``first harm`` means ``row["first"]["harm"]``."""
     cells: list[list[Any]] = []
     for row in rows:
@@ -268,14 +274,16 @@ def ablation_figure(results: Json, caption: str) -> Figure:
         points = [(at[level["level"]], level["algorithm"], level[count]["searched"]) for level in levels]
         _draw_bounds(axes, points, 0.3 * unit)
         for number, algorithm in enumerate(results["settings"]["recipes"]):
-            own = [(x + 0.06 * unit * number, each) for x, name, each in points if name in (None, algorithm)]
-            _draw_algorithm(axes, own, unit, algorithm, series_style(1 if number == 0 else number + 3))
+            algorithm_points = [
+                (x + 0.06 * unit * number, entry) for x, name, entry in points if name in (None, algorithm)
+            ]
+            _draw_algorithm(axes, algorithm_points, unit, algorithm, series_style(1 if number == 0 else number + 3))
         if swept is None:
             words = [name.removeprefix("cooperation-").removeprefix("level-").replace("-", "\n", 1) for name in names]
             axes.set_xticks([at[name] for name in names], words, fontsize=8)
         if axes.dataLim.ymin < 1.0:
             axes.set_yscale("symlog", linthresh=LINEAR)
-        axes.yaxis.set_major_formatter(FuncFormatter(plain))
+        axes.yaxis.set_major_formatter(FuncFormatter(plain_number))
         axes.set_ylim(0.0, (1.5 if axes.get_yscale() == "symlog" else 1.1) * axes.get_ylim()[1])
         axes.set(title=TITLES[count], xlabel=swept or "")
     return finish(figure, " ".join([*results["undertrained"], caption]), panels[0], columns=2, fontsize=8.5)
@@ -286,20 +294,20 @@ def _draw_bounds(axes: Axes, points: list[tuple[float, str | None, Json]], half:
         ("full_brake", "full braking", GREY),
         ("best_known", "joint optimum", series_style(3)["color"]),
     ):
-        shown = [(x, each[key]["value"]) for x, _, each in points if each[key] is not None]
-        for number, (x, value) in enumerate(shown):
+        known_points = [(x, entry[key]["value"]) for x, _, entry in points if entry[key] is not None]
+        for number, (x, value) in enumerate(known_points):
             name = "" if number else label
             axes.hlines(value, x - half, x + half, color=colour, linewidth=2.0, label=name)
 
 
 def _draw_algorithm(
-    axes: Axes, own: list[tuple[float, Json]], unit: float, algorithm: str, style: dict[str, Any]
+    axes: Axes, points: list[tuple[float, Json]], unit: float, algorithm: str, style: dict[str, Any]
 ) -> None:
-    harms = [Estimate(**each["harm"]) for _, each in own]
+    harms = [Estimate(**entry["harm"]) for _, entry in points]
     errors = list(zip(*((h.value - h.ends[0], h.ends[1] - h.value) for h in harms), strict=True))
     look = style | {"linestyle": "none"}
-    axes.errorbar([x for x, _ in own], [h.value for h in harms], yerr=errors, capsize=3, label=algorithm, **look)
-    for x, each in own:
-        dots = each["each_seed"]
+    axes.errorbar([x for x, _ in points], [h.value for h in harms], yerr=errors, capsize=3, label=algorithm, **look)
+    for x, entry in points:
+        dots = entry["each_seed"]
         if len(dots) > 1:
             axes.scatter([x + 0.05 * unit] * len(dots), dots, s=6, color=style["color"], alpha=0.5, linewidths=0)

@@ -17,7 +17,7 @@ from ethbrake_marl.files.sheet import Estimate
 from ethbrake_marl.motion.layout import Floats, Ints
 
 RESAMPLES = 2_000
-AT_ONCE = 1 << 20  # resampled worlds in memory (8 MB)
+RESAMPLES_AT_ONCE = 1 << 20  # resampled worlds in memory (8 MB)
 LEAST_REDUCTION = 1e-3  # part of the possible reduction below which a resample is not used
 CONFIDENCE = 0.95
 
@@ -52,7 +52,7 @@ def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clus
     All are [seeds, worlds]. None if ``mean(best) >= mean(worst)``, or if at least 5 % of the resamples leave almost
     nothing to reduce.
     """
-    sides = [np.atleast_2d(each) for each in (values, worst, best)]
+    sides = [np.atleast_2d(array) for array in (values, worst, best)]
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
     if not high > low:
         return None
@@ -86,11 +86,11 @@ def _interval(
 
 def _resampled_means(sides: Sequence[Floats], cluster: Ints) -> Floats:
     worlds, number, rng = len(cluster), int(cluster.max()) + 1, np.random.default_rng(0)
-    means, chunk = np.empty((RESAMPLES, len(sides))), max(1, AT_ONCE // worlds)
+    means, chunk = np.empty((RESAMPLES, len(sides))), max(1, RESAMPLES_AT_ONCE // worlds)
     for begin in range(0, RESAMPLES, chunk):
         size = min(chunk, RESAMPLES - begin)
-        drawn = rng.integers(number, size=(size, number)) + number * np.arange(size)[:, np.newaxis]
-        times = np.bincount(drawn.ravel(), minlength=size * number).reshape(size, number).take(cluster, axis=1)
+        draws = rng.integers(number, size=(size, number)) + number * np.arange(size)[:, np.newaxis]
+        times = np.bincount(draws.ravel(), minlength=size * number).reshape(size, number).take(cluster, axis=1)
         weights = times / times.sum(axis=1, keepdims=True)
         for column, side in enumerate(sides):
             seeds = rng.integers(len(side), size=(size, len(side)))

@@ -16,11 +16,11 @@ from ethbrake_marl.extensions.cuda.kernels import Mine, play_each
 from ethbrake_marl.extensions.cuda.machine_code import ptx_of
 
 OLDEST = (7, 0)  # compute capability that torch supports, and with it this package
-BLOCK = 128  # threads that a GPU starts together
+THREADS_PER_BLOCK = 128  # threads that a GPU starts together
 
 
 class Kernel(NamedTuple):
-    """``kernels.play`` for n worlds, one thread for each: its GPU form and its processor form."""
+    """``kernels.play_world`` for n worlds, one thread for each: its GPU form and its processor form."""
 
     size: tuple[int, ...]  # bodies, learners, features, neighbours in view
     mine: Mine  # memory of one thread, arrays
@@ -35,12 +35,12 @@ class Kernel(NamedTuple):
 
         return play_thread(Mine(*(array.shape for array in self.mine)))
 
-    def launch(self, device: torch.device, n: int, *given: Any) -> None:
-        """Run n threads. ``given``: tensors on this device, numbers, and tuples of both."""
+    def launch(self, device: torch.device, n: int, *arguments: Any) -> None:
+        """Run n threads. ``arguments``: tensors on this device, numbers, and tuples of both."""
         if device.type == "cuda":
-            _driver(device.index or 0).launch(self, n, given)
+            _driver(device.index or 0).launch(self, n, arguments)
         else:
-            play_each(self.mine, *as_arrays((*given, n)))  # type: ignore[no-untyped-call]
+            play_each(self.mine, *as_arrays((*arguments, n)))  # type: ignore[no-untyped-call]
 
 
 def device_named(name: str) -> torch.device:
@@ -100,45 +100,45 @@ def _check_gpu(index: int) -> None:
         )
 
 
-def as_arrays(given: Any) -> Any:
-    return _with(given, Tensor.numpy)
+def as_arrays(arguments: Any) -> Any:
+    return _map_tensors(arguments, Tensor.numpy)
 
 
-def like(given: Any) -> Any:
+def empty_arrays(arguments: Any) -> Any:
     """Arguments of a kernel with empty arrays on the processor in place of tensors, to compile the kernel."""
-    return _with(given, lambda tensor: torch.empty((0,) * tensor.dim(), dtype=tensor.dtype).numpy())
+    return _map_tensors(arguments, lambda tensor: torch.empty((0,) * tensor.dim(), dtype=tensor.dtype).numpy())
 
 
-def _with(given: Any, array_of: Callable[[Tensor], Any]) -> Any:
-    if isinstance(given, Tensor):
-        return array_of(given)
-    if isinstance(given, tuple):
-        parts = [_with(each, array_of) for each in given]
-        return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)
-    return given
+def _map_tensors(argument: Any, array_of: Callable[[Tensor], Any]) -> Any:
+    if isinstance(argument, Tensor):
+        return array_of(argument)
+    if isinstance(argument, tuple):
+        parts = [_map_tensors(part, array_of) for part in argument]
+        return type(argument)(*parts) if hasattr(argument, "_fields") else tuple(parts)
+    return argument
 
 
-def cells_of(given: Any) -> Iterator[Any]:
+def cells_of(argument: Any) -> Iterator[Any]:
     """Arguments of a kernel in the form that code compiled by numba expects.
 
     An array becomes two unused pointers, its number of entries, the size of an entry in bytes, its address, shape and
     strides in bytes. A tuple becomes its parts.
     """
-    if isinstance(given, tuple):
-        for each in given:
-            yield from cells_of(each)
-    elif isinstance(given, Tensor):
-        assert given.is_contiguous()
-        size = given.element_size()
-        shape, strides = given.shape, [size * step for step in given.stride()]
-        for number in (0, 0, given.numel(), size, given.data_ptr(), *shape, *strides):
+    if isinstance(argument, tuple):
+        for part in argument:
+            yield from cells_of(part)
+    elif isinstance(argument, Tensor):
+        assert argument.is_contiguous()
+        size = argument.element_size()
+        shape, strides = argument.shape, [size * step for step in argument.stride()]
+        for number in (0, 0, argument.numel(), size, argument.data_ptr(), *shape, *strides):
             yield ctypes.c_int64(number)
-    elif isinstance(given, bool):
-        yield ctypes.c_int8(given)
-    elif isinstance(given, float):
-        yield ctypes.c_double(given)
+    elif isinstance(argument, bool):
+        yield ctypes.c_int8(argument)
+    elif isinstance(argument, float):
+        yield ctypes.c_double(argument)
     else:
-        yield ctypes.c_int64(given)
+        yield ctypes.c_int64(argument)
 
 
 class _Driver:
@@ -150,29 +150,29 @@ class _Driver:
         self.cuda = ctypes.CDLL("nvcuda.dll" if hasattr(ctypes, "windll") else "libcuda.so.1")
         self.functions: dict[str, ctypes.c_void_p] = {}
 
-    def launch(self, kernel: Kernel, n: int, given: tuple[Any, ...]) -> None:
+    def launch(self, kernel: Kernel, n: int, arguments: tuple[Any, ...]) -> None:
         if not n:
             return
         with torch.cuda.device(self.index):
             if kernel.name not in self.functions:
-                self.functions[kernel.name] = self.load(kernel, given)
-            cells = [*cells_of((*given, n))]
+                self.functions[kernel.name] = self.load(kernel, arguments)
+            cells = [*cells_of((*arguments, n))]
             places = (ctypes.c_void_p * len(cells))(*(ctypes.addressof(cell) for cell in cells))
             stream = ctypes.c_void_p(torch.cuda.current_stream().cuda_stream)
-            function, blocks = self.functions[kernel.name], -(-n // BLOCK)
-            self.check("cuLaunchKernel", function, blocks, 1, 1, BLOCK, 1, 1, 0, stream, places, None)
+            function, blocks = self.functions[kernel.name], -(-n // THREADS_PER_BLOCK)
+            self.check("cuLaunchKernel", function, blocks, 1, 1, THREADS_PER_BLOCK, 1, 1, 0, stream, places, None)
 
-    def load(self, kernel: Kernel, given: tuple[Any, ...]) -> ctypes.c_void_p:
+    def load(self, kernel: Kernel, arguments: tuple[Any, ...]) -> ctypes.c_void_p:
         capability = torch.cuda.get_device_capability(self.index)
-        code = ptx_of(kernel.name, kernel.thread, (*like(given), 0), capability)
+        code = ptx_of(kernel.name, kernel.thread, (*empty_arrays(arguments), 0), capability)
         module, function = ctypes.c_void_p(), ctypes.c_void_p()
         self.check("cuModuleLoadData", ctypes.byref(module), code.encode() + b"\0")
         self.check("cuModuleGetFunction", ctypes.byref(function), module, b"kernel")
         return function
 
-    def check(self, call: str, *given: Any) -> None:
+    def check(self, call: str, *arguments: Any) -> None:
         """Call a function of the driver. Raises ``InvalidInput`` with the driver's reason if it fails."""
-        code = getattr(self.cuda, call)(*given)
+        code = getattr(self.cuda, call)(*arguments)
         if code:
             text = ctypes.c_char_p()
             self.cuda.cuGetErrorString(code, ctypes.byref(text))

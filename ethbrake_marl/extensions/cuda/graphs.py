@@ -20,30 +20,30 @@ class Graphed:
     def __init__(self, function: Callable[..., Any], device: torch.device) -> None:
         self.function, self.device, self.calls = function, device, 0
 
-    def __call__(self, *given: Tensor) -> Any:
+    def __call__(self, *tensors: Tensor) -> Any:
         if self.device.type != "cuda":
-            return self.function(*given)
+            return self.function(*tensors)
         self.calls += 1
         with torch.cuda.device(self.device):
             if self.calls <= WARM_UP:
-                return self._beside(*given)
+                return self._beside(*tensors)
             if self.calls == WARM_UP + 1:
-                self._record(*given)
-            for own, tensor in zip(self.given, given, strict=True):
-                own.copy_(tensor)
+                self._record(*tensors)
+            for buffer, tensor in zip(self.given, tensors, strict=True):
+                buffer.copy_(tensor)
             self.graph.replay()
         return self.result
 
-    def _beside(self, *given: Tensor) -> Any:
+    def _beside(self, *tensors: Tensor) -> Any:
         main, beside = torch.cuda.current_stream(), new_stream()
         beside.wait_stream(main)
         with torch.cuda.stream(beside):
-            result = self.function(*given)
+            result = self.function(*tensors)
         main.wait_stream(beside)
         return result
 
-    def _record(self, *given: Tensor) -> None:
-        self.given = [tensor.clone() for tensor in given]
+    def _record(self, *tensors: Tensor) -> None:
+        self.given = [tensor.clone() for tensor in tensors]
         self.graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self.graph, stream=new_stream()):
             self.result = self.function(*self.given)

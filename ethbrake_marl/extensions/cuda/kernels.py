@@ -20,7 +20,7 @@ from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import CAR_ROWS, LINE_ROWS, ROWS
 
 # what a launch of `play` does
-STEP = 0  # a step; an episode that has ended stays as it is
+STEP_MODE = 0  # a step; an episode that has ended stays as it is
 RENEW = 1  # a step; an episode that ends is replaced by one in the next world of the pool
 BEGIN = 2  # replaces every episode
 LOOK = 3  # only observes
@@ -94,77 +94,77 @@ def memory_of(bodies: int, learners: int, features: int, neighbours: int) -> Min
 
 
 @large
-def load(t, stored, mine):
-    for i in range(mine.wanted.shape[1]):
-        for row in range(mine.line.shape[1]):
-            mine.line[0, row, i] = stored.line[row, i, t]
-        for row in range(mine.car.shape[1]):
-            mine.car[0, row, i] = stored.car[row, i, t]
-        for j in range(mine.wanted.shape[1]):
-            mine.know[0, i, j] = stored.know[i, j, t]
-        mine.wanted[0, i] = stored.wanted[i, t]
-    for row in range(mine.clock.shape[1]):
-        mine.clock[0, row] = stored.clock[row, t]
+def load_world(t, stored, memory):
+    for i in range(memory.wanted.shape[1]):
+        for row in range(memory.line.shape[1]):
+            memory.line[0, row, i] = stored.line[row, i, t]
+        for row in range(memory.car.shape[1]):
+            memory.car[0, row, i] = stored.car[row, i, t]
+        for j in range(memory.wanted.shape[1]):
+            memory.know[0, i, j] = stored.know[i, j, t]
+        memory.wanted[0, i] = stored.wanted[i, t]
+    for row in range(memory.clock.shape[1]):
+        memory.clock[0, row] = stored.clock[row, t]
 
 
 @large
-def save(t, stored, mine, is_new):
-    for i in range(mine.wanted.shape[1]):
-        for row in range(mine.line.shape[1]):
-            stored.line[row, i, t] = mine.line[0, row, i]
-        stored.wanted[i, t] = mine.wanted[0, i]
+def save_world(t, stored, memory, is_new):
+    for i in range(memory.wanted.shape[1]):
+        for row in range(memory.line.shape[1]):
+            stored.line[row, i, t] = memory.line[0, row, i]
+        stored.wanted[i, t] = memory.wanted[0, i]
         if is_new:
-            for row in range(mine.car.shape[1]):
-                stored.car[row, i, t] = mine.car[0, row, i]
-            for j in range(mine.wanted.shape[1]):
-                stored.know[i, j, t] = mine.know[0, i, j]
-    for row in range(mine.clock.shape[1]):
-        stored.clock[row, t] = mine.clock[0, row]
+            for row in range(memory.car.shape[1]):
+                stored.car[row, i, t] = memory.car[0, row, i]
+            for j in range(memory.wanted.shape[1]):
+                stored.know[i, j, t] = memory.know[0, i, j]
+    for row in range(memory.clock.shape[1]):
+        stored.clock[row, t] = memory.clock[0, row]
 
 
 @large
-def play(t, mine, stored, pool, following, actions, results, settings, view, mode):
+def play_world(t, memory, stored, pool, following, actions, results, settings, view, mode):
     """Advance world t by one step, or begin or only observe its episode, as ``mode`` says; then observe it.
 
-    ``mine`` is the memory of this thread. ``stored`` has the running episodes, ``pool`` the worlds from which they
+    ``memory`` is the memory of this thread. ``stored`` has the running episodes, ``pool`` the worlds from which they
     begin; ``following`` [n] is the world of the pool in which each next episode begins. ``actions`` [n, L] float32 are
     clipped to [-1, 1]. If one of them is NaN, nothing moves and ``results.status`` says so. ``settings``: a ``Ruling``.
     ``view``: a ``Looking``.
     """
-    load(t, stored, mine)
+    load_world(t, stored, memory)
     is_new = mode == BEGIN
-    if mode in (STEP, RENEW):
-        runs = mine.clock[0, ENDED] == 0.0
-        for j in range(mine.actions.shape[1]):
+    if mode in (STEP_MODE, RENEW):
+        runs = memory.clock[0, ENDED] == 0.0
+        for j in range(memory.actions.shape[1]):
             action = float(actions[t, j])
-            mine.actions[0, j] = 1.0 if action > 1.0 else (-1.0 if action < -1.0 else action)
+            memory.actions[0, j] = 1.0 if action > 1.0 else (-1.0 if action < -1.0 else action)
         refused, failed = step_worlds(
-            mine.line, mine.car, mine.clock, mine.wanted, mine.actions, mine.scratch, mine.out, mine.reward,
-            settings.learners, settings.time_step_s, settings.harm, settings.terminal, settings.weights,
+            memory.line, memory.car, memory.clock, memory.wanted, memory.actions, memory.scratch, memory.out,
+            memory.reward, settings.learners, settings.time_step_s, settings.harm, settings.terminal, settings.weights,
         )  # fmt: skip
-        for row in range(mine.out.shape[0]):
-            results.out[row, t] = mine.out[row, 0] if refused < 0 else 0.0
-        results.reward[t] = mine.reward[0, 0] if refused < 0 else 0.0
+        for row in range(memory.out.shape[0]):
+            results.out[row, t] = memory.out[row, 0] if refused < 0 else 0.0
+        results.reward[t] = memory.reward[0, 0] if refused < 0 else 0.0
         if failed >= 0:
             results.status[t] = PHYSICS_FAILED
         elif refused >= 0 and runs:
             results.status[t] = NO_ACTION
-        is_new = mode == RENEW and mine.clock[0, ENDED] == 1.0
+        is_new = mode == RENEW and memory.clock[0, ENDED] == 1.0
     if is_new:
-        load(following[t], pool, mine)
+        load_world(following[t], pool, memory)
         following[t] = (following[t] + following.shape[0]) % pool.wanted.shape[1]
     if mode != LOOK:
-        save(t, stored, mine, is_new)
+        save_world(t, stored, memory, is_new)
     observe_worlds(
-        mine.line, mine.car, mine.clock, mine.know, settings.learners, view.offsets, view.role, view.obstacle,
-        view.places, view.scaling, mine.value, mine.seen,
+        memory.line, memory.car, memory.clock, memory.know, settings.learners, view.offsets, view.role, view.obstacle,
+        view.places, view.scaling, memory.value, memory.seen,
     )  # fmt: skip
-    for j in range(mine.seen.shape[1]):
-        for f in range(mine.seen.shape[2]):
-            results.observations[t, j, f] = mine.seen[0, j, f]
+    for j in range(memory.seen.shape[1]):
+        for f in range(memory.seen.shape[2]):
+            results.observations[t, j, f] = memory.seen[0, j, f]
 
 
 @large
-def play_each(mine, stored, pool, following, actions, results, settings, view, mode, n):
+def play_each(memory, stored, pool, following, actions, results, settings, view, mode, n):
     for t in range(n):
-        play(t, mine, stored, pool, following, actions, results, settings, view, mode)
+        play_world(t, memory, stored, pool, following, actions, results, settings, view, mode)

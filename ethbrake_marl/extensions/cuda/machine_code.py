@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl.errors import naming_extras
-from ethbrake_marl.kernel_store import load, save
+from ethbrake_marl.kernel_store import load_data, save_data
 from ethbrake_marl.motion.compiling import stamp_of
 
 NEWEST = (9, 0)  # GPUs that are newer run the code of this one
@@ -21,9 +21,9 @@ PTX_VERSION = "8.4"  # every driver from 550 on reads it, and nothing here needs
 
 
 def ptx_of(
-    name: str, kernel: Callable[[], Callable[..., None]], given: tuple[Any, ...], capability: tuple[int, int]
+    name: str, kernel: Callable[[], Callable[..., None]], arguments: tuple[Any, ...], capability: tuple[int, int]
 ) -> str:
-    """PTX of a kernel, with the entry ``kernel``, for arguments of the types of ``given``.
+    """PTX of a kernel, with the entry ``kernel``, for arguments of the types of ``arguments``.
 
     ``name``: all that decides the code, except the sources. ``kernel``: makes the kernel, if its code is not stored
     yet. ``capability``: the GPU's compute capability. Raises ``MissingExtra`` if the code must be compiled and
@@ -32,21 +32,21 @@ def ptx_of(
     capability = min(capability, NEWEST)
     stamp = stamp_of(str(Path(__file__).with_name("threads.py")))
     file = f"{name}-{capability[0]}{capability[1]}-{stamp[:32]}"
-    code: str | None = load(file, bytes.decode)
+    code: str | None = load_data(file, bytes.decode)
     if code is None:
-        code = made(kernel(), given, capability)
-        save(file, code.encode())
+        code = compile_kernel(kernel(), arguments, capability)
+        save_data(file, code.encode())
     return code
 
 
-def made(kernel: Callable[..., None], given: tuple[Any, ...], capability: tuple[int, int]) -> str:
+def compile_kernel(kernel: Callable[..., None], arguments: tuple[Any, ...], capability: tuple[int, int]) -> str:
     with naming_extras():
         import numba_cuda  # noqa: F401  # replaces numba.cuda
     import numba
     from numba import cuda
 
     with without_fma(capability):
-        types = numba.void(*(numba.typeof(each) for each in given))
+        types = numba.void(*(numba.typeof(argument) for argument in arguments))
         text, _ = cuda.compile_ptx(kernel, types, cc=capability)
     text = re.sub(r"\.version \d+\.\d+", f".version {PTX_VERSION}", text, count=1)
     entry = re.search(r"\.entry (\w+)\(", text)

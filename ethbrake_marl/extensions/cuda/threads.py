@@ -1,4 +1,4 @@
-"""The GPU kernel: each thread takes memory of its own, and calls ``kernels.play``.
+"""The GPU kernel: each thread takes memory of its own, and calls ``kernels.play_world``.
 
 numba's simulator runs it without a GPU. This module is imported only when needed, because numba.cuda is slow to import.
 """
@@ -10,19 +10,19 @@ from typing import Any
 
 from numba import cuda, float32, float64
 
-from ethbrake_marl.extensions.cuda.kernels import Mine, play
+from ethbrake_marl.extensions.cuda.kernels import Mine, play_world
 
 
 def play_thread(shapes: Mine) -> Callable[..., None]:
-    """GPU kernel that runs ``play`` in n threads. ``shapes`` of their memory are constants of its code."""
-    line, car, clock, know, wanted, proposed, scratch, out, rewards, value, seen = shapes
+    """GPU kernel that runs ``play_world`` in n threads. ``shapes`` of their memory are constants of its code."""
+    line, car, clock, know, wanted, proposed, scratch, out, rewards, value, shape_of_observations = shapes
 
     def play_worlds(
         stored: Any, pool: Any, following: Any, actions: Any, results: Any, settings: Any, view: Any, mode: Any, n: Any
     ) -> None:
         t = cuda.grid(1)
         if t < n:
-            mine = Mine(
+            memory = Mine(
                 cuda.local.array(line, float64),
                 cuda.local.array(car, float64),
                 cuda.local.array(clock, float64),
@@ -33,8 +33,8 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
                 cuda.local.array(out, float64),
                 cuda.local.array(rewards, float64),
                 cuda.local.array(value, float64),
-                cuda.local.array(seen, float32),
+                cuda.local.array(shape_of_observations, float32),
             )
-            play(t, mine, stored, pool, following, actions, results, settings, view, mode)
+            play_world(t, memory, stored, pool, following, actions, results, settings, view, mode)
 
     return play_worlds

@@ -21,7 +21,7 @@ from ethbrake_marl.extensions.cuda.kernels import Stored
 from ethbrake_marl.extensions.cuda.worlds import POOL, Worlds
 from ethbrake_marl.extensions.learners.algorithms import Vine
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
-from ethbrake_marl.extensions.learners.vine import Actor, Tried, VineModel
+from ethbrake_marl.extensions.learners.vine import ClippedActor, Tried, VineModel
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.training.training import Training
 
@@ -39,7 +39,8 @@ class CudaVine(Vine):
         assert isinstance(recipe, VineRecipe)
         if recipe.tried % recipe.batch_size:
             raise InvalidInput(
-                f"{place_of(recipe)}: batch_size = {recipe.batch_size}: must divide tried = {recipe.tried} there"
+                f"{recipe_and_device(recipe)}: batch_size = {recipe.batch_size}: must divide tried = {recipe.tried}"
+                " there"
             )
         with enough_memory(sizes(recipe)):
             return CudaVineModel(training, environment, self.device_of(recipe))
@@ -48,12 +49,12 @@ class CudaVine(Vine):
         return recipe.device
 
 
-def place_of(recipe: VineRecipe) -> str:
+def recipe_and_device(recipe: VineRecipe) -> str:
     return f"recipe {recipe.name!r} on device {recipe.device!r}"
 
 
 def sizes(recipe: VineRecipe) -> str:
-    return f"{place_of(recipe)}: n_envs = {recipe.n_envs}, n_steps = {recipe.n_steps}, tried = {recipe.tried}"
+    return f"{recipe_and_device(recipe)}: n_envs = {recipe.n_envs}, n_steps = {recipe.n_steps}, tried = {recipe.tried}"
 
 
 class CudaVineModel(VineModel):
@@ -66,13 +67,13 @@ class CudaVineModel(VineModel):
     def __init__(self, training: Training, environment: EthBrakeVecEnv, device: str) -> None:
         recipe: Any = training.recipe
         new = partial(Worlds, training.scenario, device=device, reward=recipe.reward, seed=recipe.seed)
-        seen = list(training.row.names)
-        self.worlds = new(recipe.n_envs, POOL, observation=seen)
-        self.branches = new(2 * recipe.tried, self.worlds.game.draw(1, recipe.seed, 0), observation=seen)
+        feature_names = list(training.row.names)
+        self.worlds = new(recipe.n_envs, POOL, observation=feature_names)
+        self.branches = new(2 * recipe.tried, self.worlds.game.draw(1, recipe.seed, 0), observation=feature_names)
         super().__init__(training, environment)
         count, place, zeros = recipe.n_envs * recipe.n_steps, self.worlds.device, torch.zeros
         kind = self.worlds.pool.line.dtype
-        self.visited = Stored(*(zeros(*each.shape[:-1], count, dtype=kind, device=place) for each in self.worlds.pool))
+        self.visited = Stored(*(zeros(*part.shape[:-1], count, dtype=kind, device=place) for part in self.worlds.pool))
         self.seen = self.worlds.reset().repeat(recipe.n_steps, 1, 1)  # [D, L, F]
         self.each_learner = torch.arange(self.learners, device=place)
         self.played = Graphed(self.play_here, place)
@@ -80,7 +81,7 @@ class CudaVineModel(VineModel):
 
     def new_policy(self) -> nn.Module:
         actor = super().new_policy().to(self.worlds.device)
-        assert isinstance(actor, Actor)
+        assert isinstance(actor, ClippedActor)
         actor.new_optimizer(self.recipe.learning_rate.at(1.0))
         return actor
 
@@ -96,13 +97,13 @@ class CudaVineModel(VineModel):
         if isinstance(rate, Tensor):
             group["lr"] = rate.fill_(group["lr"])
 
-    def learn(self, *given: Any, **more: Any) -> Self:
+    def learn(self, *arguments: Any, **options: Any) -> Self:
         with enough_memory(sizes(self.recipe)):
-            return super().learn(*given, **more)
+            return super().learn(*arguments, **options)
 
-    def act(self, seen: Tensor) -> Tensor:
-        outputs: Tensor = self.policy.learning(seen.flatten(0, 1))
-        return outputs.clamp(-1.0, 1.0).view(seen.shape[:2])
+    def act(self, observations: Tensor) -> Tensor:
+        outputs: Tensor = self.policy.learning(observations.flatten(0, 1))
+        return outputs.clamp(-1.0, 1.0).view(observations.shape[:2])
 
     @torch.no_grad()
     def collect(self, callback: BaseCallback) -> tuple[Tensor, Stored]:
@@ -118,22 +119,22 @@ class CudaVineModel(VineModel):
         self.num_timesteps += self.n_envs * self.recipe.n_steps
         return self.seen.flatten(0, 1), self.visited
 
-    def improve(self, seen: Any, states: Any) -> None:
+    def improve(self, observations: Any, states: Any) -> None:
         """Measure gradients at some of the decisions that ``collect`` visited, and update the actor with them."""
-        self.train_actor(self.measure(seen))
+        self.train_actor(self.measure(observations))
 
     @torch.no_grad()
-    def measure(self, seen: Tensor) -> Tried:
+    def measure(self, observations: Tensor) -> Tried:
         """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's.
 
-        ``seen`` [D L, F]: observations at all visited decisions.
+        ``observations`` [D L, F]: observations at all visited decisions.
         """
         place = self.worlds.device
-        branches = self.draw_branches(np.arange(len(seen)))
-        own = seen[torch.from_numpy(branches.decisions(self.learners)).to(place)]
+        branches = self.draw_branches(np.arange(len(observations)))
+        sample = observations[torch.from_numpy(branches.decisions(self.learners)).to(place)]
         gained, moved = self.played(*(torch.from_numpy(column).to(place) for column in branches))
         self.branches.check()
-        return Tried(own, self.policy.learning(own)[:, 0], self.measured_gradient(gained, moved))
+        return Tried(sample, self.policy.learning(sample)[:, 0], self.measured_gradient(gained, moved))
 
     def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
         """Simulate branches; return what learners gained and how far their actions were moved, [2, 2B].
@@ -141,18 +142,18 @@ class CudaVineModel(VineModel):
         Arguments [2B]: visited decision, learner, distance of the action, and number of steps for which it is moved.
         """
         worlds, result = self.branches, torch.zeros(2, len(world), dtype=size.dtype, device=size.device)
-        seen, its, discount = worlds.put(self.visited, world), learner[:, None] == self.each_learner, 1.0
+        observations, mask, discount = worlds.put(self.visited, world), learner[:, None] == self.each_learner, 1.0
         for number in range(self.worlds.longest):
-            actions = self.act(seen)
+            actions = self.act(observations)
             if number < max(self.recipe.holds):
                 held = (number < steps) & (worlds.now.clock[ENDED] == 0.0)
-                other = torch.where(its & held[:, None], (actions + size[:, None]).clamp(-1.0, 1.0).float(), actions)
-                result[1] += (other.double() - actions.double()).sum(dim=1)
-                actions = other
+                trial = torch.where(mask & held[:, None], (actions + size[:, None]).clamp(-1.0, 1.0).float(), actions)
+                result[1] += (trial.double() - actions.double()).sum(dim=1)
+                actions = trial
             result[0] += discount * worlds.step(actions, renew=False).reward
             discount *= self.recipe.gamma
         return result
 
-    def descend(self, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        loss: Tensor = self.descended(seen, target, weight)
+    def descend(self, observations: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        loss: Tensor = self.descended(observations, target, weight)
         return loss.clone()

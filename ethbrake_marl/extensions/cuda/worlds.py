@@ -20,7 +20,7 @@ from ethbrake_marl.extensions.cuda.kernels import (
     NO_ACTION,
     PHYSICS_FAILED,
     RENEW,
-    STEP,
+    STEP_MODE,
     Looking,
     Results,
     Ruling,
@@ -104,7 +104,7 @@ class Worlds:
         L, F = len(self.game.settings.learners), len(self.view.names)
         with enough_memory(f"n = {n} worlds, and a pool of {first.n}, on device {str(self.device)!r}"):
             self.pool = self.stored(first)
-            self.now = Stored(*(self._zeros(*each.shape[:-1], n) for each in self.pool))
+            self.now = Stored(*(self._zeros(*array.shape[:-1], n) for array in self.pool))
             self.following = self._zeros(n, kind=torch.int64)
             self.results = Results(
                 self._zeros(OUT_ROWS, n),
@@ -120,13 +120,13 @@ class Worlds:
 
     def stored(self, state: State) -> Stored:
         arrays = (state.line, state.car, state.clock, state.know, state.wanted)
-        return Stored(*(torch.from_numpy(np.moveaxis(each, 0, -1).copy()).to(self.device) for each in arrays))
+        return Stored(*(torch.from_numpy(np.moveaxis(array, 0, -1).copy()).to(self.device) for array in arrays))
 
     @property
     def observations(self) -> Tensor:
         """Present observations of the learners, [n, L, F] float32; the next step overwrites them."""
-        seen: Tensor = self.results.observations
-        return seen
+        observations: Tensor = self.results.observations
+        return observations
 
     def reset(self) -> Tensor:
         """Begin all episodes, in the first n worlds of the pool; return the observations, [n, L, F]."""
@@ -149,7 +149,7 @@ class Worlds:
             raise InvalidInput(f"actions = {what:.80}: must be a dense torch tensor, float32, of shape {tuple(shape)}")
         if actions.device != self.device:
             raise InvalidInput(f"actions: are on the device {actions.device}, the worlds on {self.device}")
-        self._launch(actions.detach().resolve_neg().contiguous(), RENEW if renew else STEP)
+        self._launch(actions.detach().resolve_neg().contiguous(), RENEW if renew else STEP_MODE)
         out, reward, observations, _ = self.results
         ends = out[TERMINATED] == 1.0, out[TRUNCATED] == 1.0
         return Stepped(observations, reward, *ends, out[HARM], out[TOTAL_HARM])
@@ -165,8 +165,8 @@ class Worlds:
         if stored.know.shape[:-1] != self.now.know.shape[:-1]:
             bodies = len(stored.know), len(self.now.know)
             raise InvalidInput(f"stored: has {bodies[0]} bodies in each world; must have {bodies[1]}")
-        for mine, other in zip(self.now, stored, strict=True):
-            mine.copy_(other.index_select(-1, rows))
+        for target, source in zip(self.now, stored, strict=True):
+            target.copy_(source.index_select(-1, rows))
         self._launch(self._no_actions, LOOK)
         return self.observations
 
@@ -178,7 +178,7 @@ class Worlds:
 
     def state(self) -> State:
         """Episodes as the core's ``State`` on the processor."""
-        line, car, clock, know, wanted = (np.moveaxis(each.cpu().numpy(), -1, 0).copy() for each in self.now)
+        line, car, clock, know, wanted = (np.moveaxis(array.cpu().numpy(), -1, 0).copy() for array in self.now)
         return State(line, car, clock, know, wanted, {})
 
     def check(self) -> None:

@@ -27,7 +27,7 @@ from ethbrake_marl.files.store import check_target, new_file
 from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.game import AnyScenario
 
-AT_ONCE = 500  # number of worlds simulated together; it limits memory and has no effect on the episodes
+EPISODES_AT_ONCE = 500  # number of worlds simulated together; it limits memory and has no effect on the episodes
 
 
 def to_parquet(
@@ -69,19 +69,19 @@ def to_parquet(
 
     def tables() -> Iterator[Any]:
         for name, team in teams.items():
-            for first in range(0, episodes, AT_ONCE):
-                alert = loaded.sample(min(AT_ONCE, episodes - first), seed, first=first)
+            for first in range(0, episodes, EPISODES_AT_ONCE):
+                alert = loaded.sample(min(EPISODES_AT_ONCE, episodes - first), seed, first=first)
                 rows = list(decisions(game, alert, rounded_actions(team, game, alert)))
-                columns = {column: np.concatenate([each[column] for each in rows]) for column in rows[0]}
+                columns = {column: np.concatenate([row[column] for row in rows]) for column in rows[0]}
                 order = np.argsort(columns["world"], kind="stable")  # one episode after the other
                 table = {"agent": np.full(len(order), name)} | {key: values[order] for key, values in columns.items()}
                 yield pyarrow.table(table, metadata={"ethbrake_marl": json.dumps(about)})
 
     with new_file(check_target(path, force=force)) as partial:
-        each = tables()
-        table = next(each)
+        batches = tables()
+        table = next(batches)
         with ParquetWriter(partial, table.schema) as writer:
-            for following in chain([table], each):
+            for following in chain([table], batches):
                 writer.write_table(following)
 
 
@@ -102,7 +102,7 @@ def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator
     """
     state, learners = game.reset(alert), game.settings.learners.tolist()
     while not state.ended.all():
-        rows, seen = ~state.ended, game.observe(state, game.settings.learners)
+        rows, observations = ~state.ended, game.observe(state, game.settings.learners)
         t = int(state.steps.max())
         action = actions[min(t, len(actions) - 1)]
         after, step = game.step(state, action.astype(np.float64))
@@ -114,7 +114,7 @@ def decisions(game: Game, alert: State, actions: list[Observations]) -> Iterator
         columns |= {f"gap_{p}_m": gap[rows] for p, gap in enumerate(state.gaps_m.T, 1)}
         columns |= {f"speed_{i}_mps": speed[rows] for i, speed in enumerate(state.speeds_mps.T, 1)}
         for c, i in enumerate(learners):
-            features = zip(game.views[i].names, seen[c][rows].T, strict=True)
+            features = zip(game.views[i].names, observations[c][rows].T, strict=True)
             columns |= {f"observation_{i}.{name}": column for name, column in features}
             columns |= {f"action_{i}": action[rows, c], f"reward_{i}": step.reward[rows, i - 1]}
         yield columns | {"terminated": step.terminated[rows], "truncated": step.truncated[rows]}

@@ -21,7 +21,7 @@ from ethbrake_marl.files.yaml import parse_numeral
 from ethbrake_marl.motion.layout import FAR_M, FORCE, GAP, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 
-TOUCHING_M = 1e-6  # least gap for a law, because laws divide by the gap
+LEAST_GAP_M = 1e-6  # least gap for a law, because laws divide by the gap
 SAME_S = 1e-9  # tolerance for rounding of an elapsed time (s)
 
 
@@ -35,7 +35,7 @@ class Parameters:
         raise AttributeError(name)
 
 
-class Seen(NamedTuple):
+class KnownMotion(NamedTuple):
     """What one vehicle knows in n worlds: its own motion, and the motion of what is ahead: a vehicle or the obstacle.
 
     If nothing is ahead, or nothing is known of it, the gap is infinite.
@@ -49,12 +49,12 @@ class Seen(NamedTuple):
     step_s: float  # time until the next decision (s)
 
     @classmethod
-    def of(cls, state: State, body: int, step_s: float) -> Seen:
+    def of(cls, state: State, body: int, step_s: float) -> KnownMotion:
         """What vehicle ``body`` knows. ``state``: the worlds as the vehicle estimates them."""
         line, ahead = state.line, body - 1
-        known = state.know[:, body, ahead] <= state.time_s if ahead else line[:, GAP, 0] < FAR_M
-        front, force = np.where(known, line[:, [SPEED, FORCE], ahead].T, 0.0)
-        gap = np.where(known, np.maximum(line[:, GAP, ahead], TOUCHING_M), np.inf)
+        is_known = state.know[:, body, ahead] <= state.time_s if ahead else line[:, GAP, 0] < FAR_M
+        front, force = np.where(is_known, line[:, [SPEED, FORCE], ahead].T, 0.0)
+        gap = np.where(is_known, np.maximum(line[:, GAP, ahead], LEAST_GAP_M), np.inf)
         return cls(gap, line[:, SPEED, body], front, force, line[:, FORCE, body], step_s)
 
     @property
@@ -78,48 +78,48 @@ class Seen(NamedTuple):
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
-def _idm(seen: Seen, p: Parameters) -> Floats:
-    wanted = p.s0 + np.maximum(
-        0.0, seen.speed_mps * p.T + seen.speed_mps * seen.closing_mps / (2 * math.sqrt(p.a * p.b))
+def _idm(motion: KnownMotion, p: Parameters) -> Floats:
+    desired_gap_m = p.s0 + np.maximum(
+        0.0, motion.speed_mps * p.T + motion.speed_mps * motion.closing_mps / (2 * math.sqrt(p.a * p.b))
     )
-    return p.a * (1.0 - np.square(np.square(seen.speed_mps / p.v0)) - np.square(wanted / seen.gap_m))
+    return p.a * (1.0 - np.square(np.square(motion.speed_mps / p.v0)) - np.square(desired_gap_m / motion.gap_m))
 
 
-def _is_free(seen: Seen, p: Parameters) -> Bools:
-    return seen.gap_m > p.free * np.maximum(seen.speed_mps, 1.0) + p.s0
+def _is_free(motion: KnownMotion, p: Parameters) -> Bools:
+    return motion.gap_m > p.free * np.maximum(motion.speed_mps, 1.0) + p.s0
 
 
-def _acc(seen: Seen, p: Parameters) -> Floats:
-    gap = p.gap * (seen.gap_m - p.s0 - p.T * seen.speed_mps) - p.rate * seen.closing_mps
-    return np.where(_is_free(seen, p), p.speed * (p.v0 - seen.speed_mps), gap)
+def _acc(motion: KnownMotion, p: Parameters) -> Floats:
+    gap = p.gap * (motion.gap_m - p.s0 - p.T * motion.speed_mps) - p.rate * motion.closing_mps
+    return np.where(_is_free(motion, p), p.speed * (p.v0 - motion.speed_mps), gap)
 
 
-def _cacc(seen: Seen, p: Parameters) -> Floats:
-    wide = seen.gap_m - p.s0 - p.T * seen.speed_mps
-    rate = -seen.closing_mps - p.T * seen.own_mps2
+def _cacc(motion: KnownMotion, p: Parameters) -> Floats:
+    wide = motion.gap_m - p.s0 - p.T * motion.speed_mps
+    rate = -motion.closing_mps - p.T * motion.own_mps2
     keeps, closes = p.gap * wide + p.rate * rate, 0.005 * wide + 0.05 * rate
     change = np.where(wide < 0.0, p.gap * wide + 0.05 * rate, np.where(wide < 0.2, keeps, closes))
-    return np.where(_is_free(seen, p), p.speed * (p.v0 - seen.speed_mps), change / seen.step_s)
+    return np.where(_is_free(motion, p), p.speed * (p.v0 - motion.speed_mps), change / motion.step_s)
 
 
-def _safe_distance(seen: Seen, p: Parameters) -> Floats:
-    speed = np.maximum(seen.speed_mps, 0.0)
-    ahead = np.square(np.maximum(seen.front_mps, 0.0)) / (2.0 * p.b_max)
+def _safe_distance(motion: KnownMotion, p: Parameters) -> Floats:
+    speed = np.maximum(motion.speed_mps, 0.0)
+    ahead = np.square(np.maximum(motion.front_mps, 0.0)) / (2.0 * p.b_max)
     way = speed * p.rho + 0.5 * p.a * p.rho * p.rho + np.square(speed + p.rho * p.a) / (2.0 * p.b_min)
     return np.maximum(way - ahead, 0.0)
 
 
-def _rss(seen: Seen, p: Parameters) -> Floats:
-    return np.where(seen.gap_m < _safe_distance(seen, p), -p.b_min, 0.0)
+def _rss(motion: KnownMotion, p: Parameters) -> Floats:
+    return np.where(motion.gap_m < _safe_distance(motion, p), -p.b_min, 0.0)
 
 
-def _human(seen: Seen, p: Parameters) -> Floats:
-    return seen.built_up(np.full_like(seen.gap_m, -p.most), p.jerk)
+def _human(motion: KnownMotion, p: Parameters) -> Floats:
+    return motion.built_up(np.full_like(motion.gap_m, -p.most), p.jerk)
 
 
-def _human_notices(seen: Seen, p: Parameters) -> Bools:
-    brakes = (seen.front_mps2 < -p.front) & (seen.headway_s < p.headway)
-    return brakes | (seen.until_contact_s < p.ttc)
+def _human_notices(motion: KnownMotion, p: Parameters) -> Bools:
+    brakes = (motion.front_mps2 < -p.front) & (motion.headway_s < p.headway)
+    return brakes | (motion.until_contact_s < p.ttc)
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
@@ -128,42 +128,42 @@ def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
 
-def fuzzy(seen: Seen, p: Parameters) -> tuple[Floats, Floats]:
+def fuzzy_criteria(motion: KnownMotion, p: Parameters) -> tuple[Floats, Floats]:
     """The proactive and the critical criterion of UN R157's fuzzy safety model, [n] each: danger from 0 to 1.
 
     ``p``: parameters of the law ``r157_fsm``.
     """
-    speed, front = np.maximum(seen.speed_mps, 0.0), np.maximum(seen.front_mps, 0.0)
+    speed, front = np.maximum(motion.speed_mps, 0.0), np.maximum(motion.front_mps, 0.0)
     ahead, reacting = np.square(front) / (2.0 * p.b_front), speed * p.reaction
     proactive = _share(
-        seen.gap_m - p.margin,
+        motion.gap_m - p.margin,
         reacting + np.square(speed) / (2.0 * p.b_min) - ahead + p.margin_safe,
         reacting + np.square(speed) / (2.0 * p.b_max) - ahead,
     )
-    own = np.maximum(seen.own_mps2, -p.b_min)
-    after = speed + p.reaction * own - front
-    way = (speed + 0.5 * own * p.reaction - front) * p.reaction
-    critical = _share(seen.gap_m, way + np.square(after) / (2.0 * p.b_min), way + np.square(after) / (2.0 * p.b_max))
-    slows = (after < 0.0) & (own < 0.0)  # slower than the vehicle ahead after the reaction time
-    until = np.square(speed - front) / (2.0 * np.where(slows, -seen.own_mps2, 1.0))
-    critical = np.where(slows, np.where(seen.gap_m < until, 1.0, 0.0), critical)
+    ego_mps2 = np.maximum(motion.own_mps2, -p.b_min)
+    after = speed + p.reaction * ego_mps2 - front
+    way = (speed + 0.5 * ego_mps2 * p.reaction - front) * p.reaction
+    critical = _share(motion.gap_m, way + np.square(after) / (2.0 * p.b_min), way + np.square(after) / (2.0 * p.b_max))
+    slows = (after < 0.0) & (ego_mps2 < 0.0)  # slower than the vehicle ahead after the reaction time
+    until = np.square(speed - front) / (2.0 * np.where(slows, -motion.own_mps2, 1.0))
+    critical = np.where(slows, np.where(motion.gap_m < until, 1.0, 0.0), critical)
     return proactive, np.where(speed > front, critical, 0.0)
 
 
-def _fsm_notices(seen: Seen, p: Parameters) -> Bools:
-    proactive, critical = fuzzy(seen, p)
-    return (seen.closing_mps > 0.0) & (proactive + critical > 0.0)
+def _fsm_notices(motion: KnownMotion, p: Parameters) -> Bools:
+    proactive, critical = fuzzy_criteria(motion, p)
+    return (motion.closing_mps > 0.0) & (proactive + critical > 0.0)
 
 
-def _fsm(seen: Seen, p: Parameters) -> Floats:
-    proactive, critical = fuzzy(seen, p)
-    wanted = np.where(critical > 0.0, critical * (p.b_max - p.b_min) + p.b_min, proactive * p.b_min)
-    return seen.built_up(-np.minimum(wanted, p.most), p.jerk)
+def _fsm(motion: KnownMotion, p: Parameters) -> Floats:
+    proactive, critical = fuzzy_criteria(motion, p)
+    deceleration = np.where(critical > 0.0, critical * (p.b_max - p.b_min) + p.b_min, proactive * p.b_min)
+    return motion.built_up(-np.minimum(deceleration, p.most), p.jerk)
 
 
-def _aeb(seen: Seen, p: Parameters) -> Floats:
-    required = np.square(np.maximum(seen.closing_mps, 0.0)) / (2.0 * seen.gap_m)
-    return np.where((seen.until_contact_s < p.ttc) | (required > p.required), -np.inf, 0.0)
+def _aeb(motion: KnownMotion, p: Parameters) -> Floats:
+    required = np.square(np.maximum(motion.closing_mps, 0.0)) / (2.0 * motion.gap_m)
+    return np.where((motion.until_contact_s < p.ttc) | (required > p.required), -np.inf, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,14 +171,14 @@ class Law:
     about: str  # name of the controller
     source: str  # publication of the formula
     parameters: Mapping[str, float]  # default value of each parameter, in SI units
-    command: Callable[[Seen, Parameters], Floats]  # function that returns the acceleration, [n] m/s2
+    command: Callable[[KnownMotion, Parameters], Floats]  # function that returns the acceleration, [n] m/s2
     # Function that returns for each world whether there is a danger, [n] bool. None: the law acts from the start.
-    notices: Callable[[Seen, Parameters], Bools] | None = None
+    notices: Callable[[KnownMotion, Parameters], Bools] | None = None
     stays: bool = False  # whether the reaction continues after the danger is over
 
 
 MAY_BE_ZERO = ("T", "s0", "rho", "reaction", "perception", "release")  # parameters; all others must be above 0
-MOST = 0.774 * 9.81  # m/s2
+LARGEST_BRAKING_MPS2 = 0.774 * 9.81  # m/s2
 
 FREE = {"free": 2.0, "speed": 0.4, "v0": 33.3}  # speed control to v0 beyond the headway `free` (s)
 
@@ -201,13 +201,13 @@ LAWS: dict[str, Law] = {
     ),
     "r157_human": Law(
         "competent and careful human driver of UN R157", "UN R157, annex 3, and its performance model of the JRC",
-        {"perception": 0.4, "reaction": 0.75, "release": 0.4, "jerk": 12.65, "most": MOST, "front": 5.0,
+        {"perception": 0.4, "reaction": 0.75, "release": 0.4, "jerk": 12.65, "most": LARGEST_BRAKING_MPS2, "front": 5.0,
          "headway": 2.0, "ttc": 2.0}, _human, _human_notices, stays=True,
     ),
     "r157_fsm": Law(
         "fuzzy safety model of UN R157", "Mattas et al. 2022, doi:10.1016/j.aap.2022.106743",
         {"reaction": 0.75, "b_min": 4.0, "b_max": 6.0, "b_front": 7.0, "margin": 2.0, "margin_safe": 2.0,
-         "jerk": 12.65, "most": MOST}, _fsm, _fsm_notices,
+         "jerk": 12.65, "most": LARGEST_BRAKING_MPS2}, _fsm, _fsm_notices,
     ),
     "aeb": Law(
         "automatic emergency braking: full braking where time to collision or required deceleration pass a limit",
@@ -242,15 +242,15 @@ class Controller:
         return np.full(alert.n, np.nan)
 
     def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
-        seen, p = Seen.of(state, body, self.step_s), self.parameters
-        command = self.law.command(seen, p)
+        motion, p = KnownMotion.of(state, body, self.step_s), self.parameters
+        command = self.law.command(motion, p)
         if self.law.notices is not None:
             now = np.where(np.isnan(memory), 0.0, state.time_s)
             before = np.where(np.isnan(memory), np.inf, memory)
             gone = before if self.law.stays else np.inf
-            memory = np.where(self.law.notices(seen, p), np.minimum(before, now), gone)
+            memory = np.where(self.law.notices(motion, p), np.minimum(before, now), gone)
             elapsed, perceiving = state.time_s - memory + SAME_S, getattr(p, "perception", 0.0)
-            waiting = np.where(elapsed < perceiving, 0.0, np.minimum(seen.own_mps2, -getattr(p, "release", 0.0)))
+            waiting = np.where(elapsed < perceiving, 0.0, np.minimum(motion.own_mps2, -getattr(p, "release", 0.0)))
             command = np.where(elapsed < perceiving + p.reaction, waiting, command)
         braking, driving = state.braking_capacity_mps2, state.driving_capacity_mps2
         return np.clip(command, -braking[:, body - 1], driving[:, body - 1]), memory

@@ -43,7 +43,7 @@ from ethbrake_marl.motion.layout import (
 from ethbrake_marl.registry import Part
 
 FORECAST_S = 10.0
-COMMANDS = {"brake": "full braking", "coast": "coasting", "drive": "full driving"}
+FORECAST_COMMANDS = {"brake": "full braking", "coast": "coasting", "drive": "full driving"}
 SIDES = {"front": "the vehicle ahead", "rear": "the vehicle behind"}
 # places of the features of `contact` for one command: those of an impact, for each side, then the harm
 IMPACT_TIME, IMPACT_CLOSING, IMPACT_FRACTION, IMPACT_STEPS, PER_SIDE = range(5)
@@ -78,16 +78,17 @@ def _far(command: str, held: str) -> list[Feature]:
     ]
 
 
-CONTACT = tuple(feature for command, held in COMMANDS.items() for feature in _near(command, held))
-CONTACT_FAR = tuple(feature for command, held in COMMANDS.items() for feature in _far(command, held))
+CONTACT = tuple(feature for command, held in FORECAST_COMMANDS.items() for feature in _near(command, held))
+CONTACT_FAR = tuple(feature for command, held in FORECAST_COMMANDS.items() for feature in _far(command, held))
 
 
 @kernel
-def known_line(line, car, know, time, i, known, parameters, commands):
+def known_line(line, car, know, time, i, observer_line, parameters, commands):
     """Copy a world at ``time`` (s) as body i knows it, with assumed commands of the others.
 
     Return the first and last known body. ``line``, ``car`` and ``know`` of the world, as in ``State``, are copied to
-    ``known`` and ``parameters``; the ``commands`` [N + 1] are in m/s2. Unknown bodies are at rest and out of reach.
+    ``observer_line`` and ``parameters``; the ``commands`` [N + 1] are in m/s2. Unknown bodies are at rest and out of
+    reach.
     """
     first, last = i, i
     while first > 1 and time >= know[i, first - 1]:
@@ -98,10 +99,10 @@ def known_line(line, car, know, time, i, known, parameters, commands):
         for row in range(CAR_ROWS):
             parameters[row, j] = car[row, j]
         inside, force = first <= j <= last, line[FORCE, j]
-        known[SPEED, j] = line[SPEED, j] if inside else 0.0
-        known[FORCE, j] = force if inside else 0.0
-        known[GAP, j] = line[GAP, j] if first <= j < last else FAR_M
-        known[HIT, j] = line[HIT, j]
+        observer_line[SPEED, j] = line[SPEED, j] if inside else 0.0
+        observer_line[FORCE, j] = force if inside else 0.0
+        observer_line[GAP, j] = line[GAP, j] if first <= j < last else FAR_M
+        observer_line[HIT, j] = line[HIT, j]
         parameters[LATENCY, j], commands[j] = 0.0, force if inside else 0.0
         if j == i or force == 0.0:
             parameters[LATENCY, j] = max(car[OWN_LATENCY, j] - time, 0.0)
@@ -109,7 +110,7 @@ def known_line(line, car, know, time, i, known, parameters, commands):
         elif inside and force < 0.0 and car[BRAKE_RATE, j] < math.inf:
             commands[j] = -capacity(car, BRAKING, j, time)
     if first == 1 and line[GAP, 0] < FAR_M:
-        known[GAP, 0], first = line[GAP, 0], 0
+        observer_line[GAP, 0], first = line[GAP, 0], 0
     return first, last
 
 
@@ -120,22 +121,22 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
     Returns the row of a world whose simulation failed, or -1. ``line``, ``car``, ``clock``, ``know``: as in ``State``.
     ``observers``: their bodies. ``memory``: arrays that are overwritten.
     """
-    scratch, here, known, parameters, commands = memory
+    scratch, here, observer_line, parameters, commands = memory
     near, failed = 3 * PER_COMMAND, -1
     for k in range(len(out)):
         for o in range(len(observers)):
             i = observers[o]
-            first, last = known_line(line[k], car[k], know[k], clock[k, TIME], i, known, parameters, commands)
+            first, last = known_line(line[k], car[k], know[k], clock[k, TIME], i, observer_line, parameters, commands)
             for c in range(3):
                 for row in range(LINE_ROWS):
                     for j in range(here.shape[1]):
-                        here[row, j] = known[row, j]
+                        here[row, j] = observer_line[row, j]
                 commands[i] = command_of(car[k], i, c - 1.0, clock[k, TIME])
-                met = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
-                if met == FAILED:
+                outcome = move_line(here, parameters, commands, scratch, 0.0, FORECAST_S)
+                if outcome == FAILED:
                     failed = k
                 value = out[k, o, c * PER_COMMAND : (c + 1) * PER_COMMAND]
-                write_features(scratch, met == MET, i, first, last, time_step_s, value)
+                write_features(scratch, outcome == MET, i, first, last, time_step_s, value)
                 far = near + c * FAR_PER_COMMAND
                 out[k, o, far], out[k, o, far + 1] = value[IMPACT_TIME], value[PER_SIDE + IMPACT_TIME]
                 out[k, o, far + 2] = math.sqrt(value[FIRST_HARM])
@@ -144,26 +145,26 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
 
 
 @kernel
-def write_features(scratch, met, i, first, last, time_step_s, value):
+def write_features(scratch, has_impact, i, first, last, time_step_s, value):
     """Write the features of one forecast for body i to ``value``; they are 0 for a pair that is not known.
 
-    ``scratch``: results of the simulation. ``met``: whether it had an impact. ``first``, ``last``: known bodies. An
-    impact exactly at the end of a time step belongs to this step, as in the episode.
+    ``scratch``: results of the simulation. ``has_impact``: whether it had an impact. ``first``, ``last``: known bodies.
+    An impact exactly at the end of a time step belongs to this step, as in the episode.
     """
     for side in range(2):
         p, impact = i - 1 + side, value[side * PER_SIDE : (side + 1) * PER_SIDE]
         impact[:] = 0.0
         if first <= p < last:
-            time = scratch[NEXT_TIME, p] if met else math.inf
+            time = scratch[NEXT_TIME, p] if has_impact else math.inf
             hit = time < math.inf
             steps = (time if hit else FORECAST_S) / time_step_s
-            whole = max(math.ceil(steps) - 1.0, 0.0)
+            full_steps = max(math.ceil(steps) - 1.0, 0.0)
             impact[IMPACT_TIME] = time if hit else FORECAST_S
             impact[IMPACT_CLOSING] = scratch[NEXT_CLOSING, p] if hit else 0.0
-            impact[IMPACT_FRACTION] = steps - whole if hit else 0.0
-            impact[IMPACT_STEPS] = whole
+            impact[IMPACT_FRACTION] = steps - full_steps if hit else 0.0
+            impact[IMPACT_STEPS] = full_steps
     value[FIRST_HARM] = value[TOTAL_HARM] = 0.0
-    for p in range(first, last if met else first):
+    for p in range(first, last if has_impact else first):
         value[FIRST_HARM] += scratch[NEW_FIRST, p]
         value[TOTAL_HARM] += scratch[NEW_TOTAL, p]
 
@@ -172,8 +173,8 @@ def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
     check_exact(state, "a forecast of contacts")
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))
-    line, known, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))
-    memory = scratch_for(bodies), line, known, parameters, np.zeros(bodies)
+    line, observer_line, parameters = (np.zeros((rows, bodies)) for rows in (LINE_ROWS, LINE_ROWS, CAR_ROWS))
+    memory = scratch_for(bodies), line, observer_line, parameters, np.zeros(bodies)
     failed = forecast_worlds(state.line, state.car, state.clock, state.know, observers, time_step_s, memory, out)
     if failed >= 0:
         raise PhysicsError({failed: f"a forecast of contacts failed before the end of its {FORECAST_S:g} s"})

@@ -15,7 +15,7 @@ from ethbrake_marl.motion.layout import FRONT_CHANGE, IMPACTS, MASS, REAR_CHANGE
 from ethbrake_marl.registry import Part
 
 
-class Curve(NamedTuple):
+class InjuryCurve(NamedTuple):
     """Probability of an injury in a rear-end impact, as a function of the vehicle's change of speed dv (m/s)."""
 
     severity: str  # on the abbreviated injury scale
@@ -33,15 +33,15 @@ def _power(share: Floats) -> Floats:
 
 _GEISSLINGER = "Geisslinger, Poszler and Lienkamp 2023, doi:10.1038/s42256-022-00607-z, parameters of its code"
 CURVES = {
-    "lr4s": Curve(
+    "lr4s": InjuryCurve(
         "MAIS3+", "1 / (1 + exp(4.457 - 0.177 dv - c)), with c = 0 if the front is hit, c = -0.431 if the rear is hit",
         _GEISSLINGER, lambda dv: logistic(-4.457 + 0.177 * dv), lambda dv: logistic(-4.888 + 0.177 * dv),
     ),
-    "reference": Curve(
+    "reference": InjuryCurve(
         "MAIS3+", "min((dv / s)^1.531, 1), with s = 51.287 m/s if the front is hit, s = 66.956 m/s if the rear is hit",
         _GEISSLINGER, lambda dv: _power(dv / 51.287), lambda dv: _power(dv / 66.956),
     ),
-    "gidas": Curve(
+    "gidas": InjuryCurve(
         "MAIS2+", "1 / (1 + exp(5.820 - 0.292 dv))", "GIDAS, from the code of Geisslinger et al. 2023",
         lambda dv: logistic(-5.820 + 0.292 * dv), lambda dv: logistic(-5.820 + 0.292 * dv),
     ),
@@ -54,11 +54,11 @@ def risks(changes: Floats, curve: str) -> Floats:
     ``changes`` [n, 2, N] are the vehicle's changes of speed there (m/s). Where it was not hit the probability is 0.
     ``curve`` is a name in ``CURVES``.
     """
-    each = [CURVES[curve].front(changes[:, 0].copy()), CURVES[curve].rear(changes[:, 1].copy())]
-    return np.where(changes > 0.0, np.stack(each, axis=1), 0.0)
+    side_risks = [CURVES[curve].front(changes[:, 0].copy()), CURVES[curve].rear(changes[:, 1].copy())]
+    return np.where(changes > 0.0, np.stack(side_risks, axis=1), 0.0)
 
 
-def injured_by_harm(harm: Harm, vehicle: int, curve: str) -> Floats:
+def expected_injuries_by_harm(harm: Harm, vehicle: int, curve: str) -> Floats:
     """Expected injuries in 1,000 lines, as if a single impact had done each pair's harm.
 
     A vehicle that is hit on both sides counts with the larger of its two risks. Exact for first impacts of two
@@ -66,10 +66,10 @@ def injured_by_harm(harm: Harm, vehicle: int, curve: str) -> Floats:
     """
     rebound = (1.0 + harm.car[:, RESTITUTION, :-1]) * np.sqrt(harm.pairs[:, :-1])
     mass = harm.car[:, MASS, 1:]
-    both = mass[:, :-1] + mass[:, 1:]
+    pair_mass = mass[:, :-1] + mass[:, 1:]
     changes = np.stack([rebound, np.zeros(mass.shape)], axis=1)  # front, rear
-    changes[:, 1, :-1] = mass[:, 1:] / both * rebound[:, 1:]
-    changes[:, 0, 1:] *= mass[:, :-1] / both
+    changes[:, 1, :-1] = mass[:, 1:] / pair_mass * rebound[:, 1:]
+    changes[:, 0, 1:] *= mass[:, :-1] / pair_mass
     return np.asarray(np.cumsum(1_000.0 * risks(changes, curve).max(axis=1), axis=1)[:, -1])
 
 
@@ -85,7 +85,7 @@ def speed_changes(before: State, after: State) -> Floats:
     return out
 
 
-def injured(changes: Floats, curve: str) -> Floats:
+def expected_injuries(changes: Floats, curve: str) -> Floats:
     """Expected injuries of each vehicle in 1,000 lines, [n, N], from ``speed_changes`` [n, 2, N] (m/s).
 
     Only the side (front or rear) with the larger change counts.
@@ -94,4 +94,4 @@ def injured(changes: Floats, curve: str) -> Floats:
     return np.asarray(1_000.0 * np.where(changes[:, 1] >= changes[:, 0], rear, front))
 
 
-OBJECTIVE = Part(injured_by_harm, arguments=tuple(CURVES))
+INJURY_OBJECTIVE = Part(expected_injuries_by_harm, arguments=tuple(CURVES))

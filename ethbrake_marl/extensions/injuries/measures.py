@@ -14,7 +14,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.evaluation.measures import Given
-from ethbrake_marl.extensions.injuries.curves import CURVES, injured, speed_changes
+from ethbrake_marl.extensions.injuries.curves import CURVES, expected_injuries, speed_changes
 from ethbrake_marl.registry import Part
 
 
@@ -29,8 +29,8 @@ class Injuries:
 
     def result(self, last: State) -> Given:
         """Injuries of the line, and of each vehicle, [n]."""
-        each = injured(self.changes, self.curve)
-        return {"": each.sum(axis=1), **{f"{i + 1}": column for i, column in enumerate(each.T)}}
+        injuries = expected_injuries(self.changes, self.curve)
+        return {"": injuries.sum(axis=1), **{f"{i + 1}": column for i, column in enumerate(injuries.T)}}
 
 
 def _part(curve: str) -> Part:

@@ -26,8 +26,8 @@ class Vine(Algorithm):
         assert isinstance(recipe, VineRecipe)
         model = self.new_model(training, environment)
         if recipe.start is not None:
-            policy, wanted = starting_policy(recipe.start, recipe.name), recipe.network_spec(len(model.features))
-            tensors = start_weights(policy, wanted, model.features, recipe.name)
+            policy, network = starting_policy(recipe.start, recipe.name), recipe.network_spec(len(model.features))
+            tensors = start_weights(policy, network, model.features, recipe.name)
             for name, weight in model.policy.weights("policy").items():
                 weight.copy_(torch.from_numpy(tensors[name]))
             model.policy.learning.load_state_dict(model.policy.average.state_dict())
@@ -37,8 +37,8 @@ class Vine(Algorithm):
         return VineModel(training, environment)
 
     def tensors(self, actor: Any, network: NetworkSpec) -> dict[str, Float32s]:
-        one = {"policy.log_std": np.full(1, -3.0, np.float32)}  # which never counts, because vine does not explore
-        return dict(actor.tensors("policy") | one)
+        log_std = {"policy.log_std": np.full(1, -3.0, np.float32)}  # which never counts, because vine does not explore
+        return dict(actor.tensors("policy") | log_std)
 
 
 class RolloutClassification(Algorithm):

@@ -49,7 +49,7 @@ class BranchingModel(BaseAlgorithm):
         """New networks with random weights."""
 
     @abstractmethod
-    def improve(self, seen: Any, states: Any) -> None:
+    def improve(self, observations: Any, states: Any) -> None:
         """Learn from the result of ``collect``."""
 
     def learn(
@@ -65,20 +65,20 @@ class BranchingModel(BaseAlgorithm):
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total:
             callback.on_rollout_start()
-            seen, states = self.collect(callback)
+            observations, states = self.collect(callback)
             callback.on_rollout_end()
             self._update_current_progress_remaining(self.num_timesteps, total)
-            self.improve(seen, states)
+            self.improve(observations, states)
         callback.on_training_end()
         return self
 
     def collect(self, callback: BaseCallback) -> tuple[Any, Any]:
         """Drive all worlds for ``n_steps`` decisions; return their observations, [decisions L, F], and states."""
-        seen, states, every = [], [], np.arange(self.rows.n)
+        all_observations, states, all_rows = [], [], np.arange(self.rows.n)
         for _ in range(self.recipe.n_steps):
             observations: Any = self._last_obs
-            seen.append(observations)
-            states.append(self.rows.episode.take(every))
+            all_observations.append(observations)
+            states.append(self.rows.episode.take(all_rows))
             new_obs, rewards, dones, infos = self.rows.step(self.policy.act(observations)[:, np.newaxis])
             self.num_timesteps += self.n_envs
             ended = [infos[row] for row in np.flatnonzero(dones)]  # only these have statistics
@@ -86,7 +86,7 @@ class BranchingModel(BaseAlgorithm):
             self._last_obs, self._last_episode_starts = new_obs, dones  # type: ignore[assignment]
             callback.update_locals(locals())
             callback.on_step()
-        return np.concatenate(seen), State.join(states)
+        return np.concatenate(all_observations), State.join(states)
 
     def dump_logs(self) -> None:
         self.logger.dump(step=self.num_timesteps)

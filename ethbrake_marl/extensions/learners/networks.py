@@ -16,7 +16,7 @@ from ethbrake_marl.policies.layers import Float32s
 from ethbrake_marl.policies.network import Activation
 from ethbrake_marl.training.algorithm import ACTIVATIONS
 
-PARTS = ("weight", "bias")
+LAYER_PARTS = ("weight", "bias")
 
 
 class Adam(torch.optim.Adam):
@@ -31,7 +31,7 @@ def perceptron(inputs: int, outputs: int, hidden: Sequence[int], activation: Act
     return nn.Sequential(*create_mlp(inputs, outputs, list(hidden), ACTIVATIONS[activation]))
 
 
-def silent(network: nn.Sequential) -> nn.Sequential:
+def zero_last_layer(network: nn.Sequential) -> nn.Sequential:
     last = linear_layers(network)[-1]
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)
@@ -82,13 +82,13 @@ class Averaged(nn.Module):
         linear = linear_layers(self.average)
         places = [f"{name}.{k}" for k in range(len(linear) - 1)] + [f"{name}.output"]
         layers = zip(places, linear, strict=True)
-        return {f"{place}.{part}": getattr(layer, part).detach() for place, layer in layers for part in PARTS}
+        return {f"{place}.{part}": getattr(layer, part).detach() for place, layer in layers for part in LAYER_PARTS}
 
     def tensors(self, name: str) -> dict[str, Float32s]:
         return {place: weight.cpu().numpy().copy() for place, weight in self.weights(name).items()}
 
 
-class Memory(nn.Module):
+class ReplayBuffer(nn.Module):
     """Ring buffer of the latest ``size`` decisions of a training; checkpoints save it.
 
     ``columns``: name -> a zero tensor with the shape and type of one entry.
@@ -114,7 +114,7 @@ class Memory(nn.Module):
         return min(int(self.known), self.size)
 
 
-def drawn(rows: Ints, count: int) -> Ints:
+def draw_rows(rows: Ints, count: int) -> Ints:
     """``count`` of the ``rows``, each at most once, in random order."""
-    some: Ints = rows[torch.randperm(len(rows))[:count].numpy()]
-    return some
+    sample: Ints = rows[torch.randperm(len(rows))[:count].numpy()]
+    return sample

@@ -16,14 +16,14 @@ from ethbrake_marl.training.recipe import (
     ACTOR_LAYERS,
     BATCH_SIZE,
     NETWORK,
-    Layers,
+    LayerSizes,
     NonNegative,
     Positive,
     Rate,
     TrainingRecipe,
 )
 
-MOST_DECISIONS = 2**22  # of one update whose states fit into memory
+MOST_STORED_DECISIONS = 2**22  # of one update whose states fit into memory
 
 Text = Annotated[str, Field(max_length=4096)]
 Action = Annotated[float, Field(ge=-1.0, le=1.0)]
@@ -63,8 +63,8 @@ class BranchingRecipe(TrainingRecipe):
             right = "must be 0: this algorithm plays tried actions to the end of the episode, so shaping has no effect"
             refuse(("reward", "shaping"), self.reward.shaping, right)
         visited = self.n_envs * self.n_steps
-        if not visited <= MOST_DECISIONS:
-            right = f"n_envs x n_steps = {visited} decisions per update are too many (at most {MOST_DECISIONS})"
+        if not visited <= MOST_STORED_DECISIONS:
+            right = f"n_envs x n_steps = {visited} decisions per update are too many (at most {MOST_STORED_DECISIONS})"
             refuse(("n_envs",), self.n_envs, right)
         if not self.tried <= visited:
             refuse(("tried",), self.tried, f"must be at most n_envs x n_steps = {visited}")
@@ -72,7 +72,7 @@ class BranchingRecipe(TrainingRecipe):
 
 
 class ActorShape(FileModel):
-    policy: Layers = Field(description=ACTOR_LAYERS)
+    policy: LayerSizes = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"
     initial_action: Annotated[Action | None, Field(exclude_if=lambda action: action is None)] = Field(
         None, description="approximate action of the untrained network, -1 to 1; left out: 0, which coasts"
@@ -99,7 +99,7 @@ class VineRecipe(BranchingRecipe):
 class ChoosingShape(FileModel):
     """The network that scores actions, which are evenly spaced from -1 to 1."""
 
-    policy: Layers = Field(description=ACTOR_LAYERS)
+    policy: LayerSizes = Field(description=ACTOR_LAYERS)
     activation: Activation = "relu"
     choices: int = Field(ge=2, le=4096, description="number of actions that the network scores")
 

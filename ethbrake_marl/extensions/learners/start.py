@@ -26,15 +26,15 @@ def starting_policy(name: str, recipe: str) -> Policy:
     return driver.policy
 
 
-def start_weights(policy: Policy, wanted: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
-    """Weights of ``policy`` for a network ``wanted`` that observes ``features``.
+def start_weights(policy: Policy, network: NetworkSpec, features: Sequence[str], recipe: str) -> dict[str, Float32s]:
+    """Weights of ``policy`` for a network ``network`` that observes ``features``.
 
     Raises ``InvalidInput`` for other layers, and if ``features`` lack one that the policy observes.
     """
     for name in ("policy_hidden", "activation", "output"):
-        if getattr(policy.manifest.network, name) != getattr(wanted, name):
+        if getattr(policy.manifest.network, name) != getattr(network, name):
             raise InvalidInput(
-                f"recipe {recipe!r}: network.{name} is {getattr(wanted, name)}, but must be"
+                f"recipe {recipe!r}: network.{name} is {getattr(network, name)}, but must be"
                 f" {getattr(policy.manifest.network, name)}, as in the policy that the key start names"
             )
     missing = [name for name in policy.observation.names if name not in features]

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
-from ethbrake_marl.extensions.learners.networks import Averaged, drawn, linear_layers, perceptron
+from ethbrake_marl.extensions.learners.networks import Averaged, draw_rows, linear_layers, perceptron
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
 
 
-class Actor(Averaged):
+class ClippedActor(Averaged):
     """A deterministic policy: the network's output, clipped to [-1, 1]."""
 
     def __init__(self, inputs: int, recipe: VineRecipe) -> None:
@@ -67,28 +67,28 @@ class Tried(NamedTuple):
 
 
 class VineModel(BranchingModel):
-    policy: Actor
+    policy: ClippedActor
     recipe: VineRecipe
 
     def new_policy(self) -> nn.Module:
-        return Actor(len(self.features), self.recipe)
+        return ClippedActor(len(self.features), self.recipe)
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", "policy.optimizer"], []
 
-    def improve(self, seen: Any, states: Any) -> None:
-        self.train_actor(self.try_out(seen, states))
+    def improve(self, observations: Any, states: Any) -> None:
+        self.train_actor(self.try_out(observations, states))
 
-    def try_out(self, seen: Float32s, states: State) -> Tried:
+    def try_out(self, observations: Float32s, states: State) -> Tried:
         """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's."""
         branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
         gained, moved = self.play(states, branches)
-        own = seen[branches.decisions(self.learners)]
+        sample = observations[branches.decisions(self.learners)]
         gradient = self.measured_gradient(torch.from_numpy(gained), torch.from_numpy(moved))
-        return Tried(torch.from_numpy(own), torch.from_numpy(self.policy.means(own)), gradient)
+        return Tried(torch.from_numpy(sample), torch.from_numpy(self.policy.means(sample)), gradient)
 
     def draw_branches(self, decisions: Ints) -> Branches:
-        rows, offset = drawn(decisions, self.recipe.tried), self.recipe.offset
+        rows, offset = draw_rows(decisions, self.recipe.tried), self.recipe.offset
         ratio = offset.largest / offset.smallest
         sizes: Floats = offset.smallest * ratio ** torch.rand(len(rows), dtype=torch.float64).numpy()
         world, learner = np.divmod(np.tile(rows, 2), self.learners)
@@ -104,11 +104,11 @@ class VineModel(BranchingModel):
 
         def decide(now: Moment) -> Floats:
             actions = now.ask(self.policy.act)
-            some = np.flatnonzero(now.number < steps[now.rows]) if now.number < longest else steps[:0]
-            row = now.rows[some]
-            before = actions[some, learner[row]]
+            held = np.flatnonzero(now.number < steps[now.rows]) if now.number < longest else steps[:0]
+            row = now.rows[held]
+            before = actions[held, learner[row]]
             after = np.clip(before + size[row], -1.0, 1.0)
-            actions[some, learner[row]] = after
+            actions[held, learner[row]] = after
             moved[row] += after - before
             return actions
 
@@ -120,35 +120,35 @@ class VineModel(BranchingModel):
         (up, down), (higher, lower) = gained.chunk(2), moved.chunk(2)
         measured = (up - down) / (higher - lower)
         gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)
-        whole = float(measured.abs().sum())
-        self.logger.record("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / whole if whole else 0.0)
+        total = float(measured.abs().sum())
+        self.logger.record("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / total if total else 0.0)
         return gradient.float()
 
-    def train_actor(self, tried: Tried) -> None:
+    def train_actor(self, results: Tried) -> None:
         recipe = self.recipe
         self._update_learning_rate(self.policy.optimizer)
-        lesson, losses = (tried.seen, *trusted_targets(tried, recipe.trust_radius, recipe.anchor)), []
+        lesson, losses = (results.seen, *trusted_targets(results, recipe.trust_radius, recipe.anchor)), []
         for _ in range(recipe.n_epochs):
-            for batch in torch.split(torch.randperm(len(tried.seen)).to(tried.seen.device), recipe.batch_size):
+            for batch in torch.split(torch.randperm(len(results.seen)).to(results.seen.device), recipe.batch_size):
                 losses.append(self.descend(*(part[batch] for part in lesson)))
         self._n_updates += recipe.n_epochs
         self.logger.record("train/loss", float(np.mean([loss.item() for loss in losses])) if losses else 0.0)
-        self.logger.record("train/gradient", float(tried.gradient.abs().mean()) if losses else 0.0)
-        self.logger.record("train/tried", len(tried.seen))
+        self.logger.record("train/gradient", float(results.gradient.abs().mean()) if losses else 0.0)
+        self.logger.record("train/tried", len(results.seen))
 
-    def descend(self, seen: Tensor, target: Tensor, weight: Tensor) -> Tensor:
-        loss = (weight * (self.policy.learning(seen)[:, 0] - target) ** 2).mean()
+    def descend(self, observations: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        loss = (weight * (self.policy.learning(observations)[:, 0] - target) ** 2).mean()
         return self.policy.descend(loss, self.recipe.averaging)
 
 
-def trusted_targets(tried: Tried, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
+def trusted_targets(results: Tried, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
     """Targets of the actor's outputs, and the weights of the squared errors in the loss, [B] each.
 
     Let m be the present output and g the slope of the return at m. Then ``weight = |g| / radius + anchor`` and ``target
     = m + g / weight``: the target is less than ``radius`` away, and ``(weight / 2) (output - target)^2`` has the slope
     ``-g`` at m. An output at or beyond 1 is not moved farther out, because actions are clipped to [-1, 1].
     """
-    outward = ((tried.mean >= 1.0) & (tried.gradient > 0.0)) | ((tried.mean <= -1.0) & (tried.gradient < 0.0))
-    gradient = tried.gradient.masked_fill(outward, 0.0)
+    outward = ((results.mean >= 1.0) & (results.gradient > 0.0)) | ((results.mean <= -1.0) & (results.gradient < 0.0))
+    gradient = results.gradient.masked_fill(outward, 0.0)
     weight = gradient.abs() / radius + anchor
-    return tried.mean + gradient / weight, weight
+    return results.mean + gradient / weight, weight

@@ -11,8 +11,8 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.messages.links import (
     AT,
     INTENT,
-    NAME,
-    NUMBER,
+    MESSAGE_NUMBER,
+    MESSAGES_KEY,
     P_ACCELERATION,
     P_BRAKING,
     P_INTENT,
@@ -21,9 +21,9 @@ from ethbrake_marl.extensions.messages.links import (
     P_PLACE,
     P_SPEED,
     PIECES,
-    Memory,
+    MessageMemory,
     estimated,
-    newest,
+    newest_samples,
 )
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
@@ -59,13 +59,13 @@ def known_pieces(state: State, observer: int) -> Bools:
     obstacle. The observer knows what the messages of a vehicle contain, its intent only after the first message; and
     place, speed and acceleration of a neighbour in sight. Of itself and of the obstacle it knows everything.
     """
-    memory: Memory = state.memories[NAME]
+    memory: MessageMemory = state.memories[MESSAGES_KEY]
     time = state.time_s[:, np.newaxis]
     known = state.know[:, observer] <= time
     if memory.is_periodic:
         known &= memory.news[:, AT, observer] >= 0.0
     pieces = memory.contents.copy()
-    pieces[:, :, P_INTENT] &= (memory.links[:, NUMBER, observer] > 0.0) | (memory.heard_s[:, observer] <= time)
+    pieces[:, :, P_INTENT] &= (memory.links[:, MESSAGE_NUMBER, observer] > 0.0) | (memory.heard_s[:, observer] <= time)
     pieces[:, :, [P_PLACE, P_SPEED, P_ACCELERATION]] |= (memory.seen_s[:, observer] <= time)[:, :, np.newaxis]
     pieces &= known[:, :, np.newaxis]
     pieces[:, [0, observer]] = True
@@ -80,7 +80,7 @@ def believed(state: State, observer: int) -> State:
     known place.
     """
     known = known_pieces(state, observer)
-    news = newest(state, observer)
+    news = newest_samples(state, observer)
     line, car = estimated(state, observer, known, news), state.car.copy()
     for rows, array in ((LINE_PIECES, line), (CAR_PIECES, car)):
         for row, piece in rows.items():
@@ -98,7 +98,7 @@ def believed_whole(state: State, observer: int) -> State:
     It can predict a vehicle of which it knows all quantities but the intent. For the others ``know`` is infinite.
     """
     known = known_pieces(state, observer)
-    line, whole = estimated(state, observer, known, newest(state, observer)), known[:, :, :P_INTENT].all(axis=2)
+    line, whole = estimated(state, observer, known, newest_samples(state, observer)), known[:, :, :P_INTENT].all(axis=2)
     return state._replace(line=line, know=_known_if(state, observer, np.asarray(whole)))
 
 
@@ -114,7 +114,7 @@ def ages_s(state: State) -> Floats:
     Body 0 is the obstacle. Without periodic messages it is 0, because then i knows the present state, from
     ``state.know`` on.
     """
-    memory: Memory = state.memories[NAME]
+    memory: MessageMemory = state.memories[MESSAGES_KEY]
     if not memory.is_periodic:
         return np.zeros(state.know.shape)
     at = memory.news[:, AT]
@@ -136,8 +136,8 @@ def require_pieces(
     vehicles needs their messages, too.
     """
     senders = range(1, state.vehicles + 1) if senders is None else senders
-    for sender in senders if NAME in state.memories else ():
-        contents = state.memories[NAME].contents[:, sender]
+    for sender in senders if MESSAGES_KEY in state.memories else ():
+        contents = state.memories[MESSAGES_KEY].contents[:, sender]
         missing = [piece for piece in needs if not contents[:, PIECES.index(piece)].all()]
         if missing and tuple(observers) != (sender,):
             raise InvalidInput(

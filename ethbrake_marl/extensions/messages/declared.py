@@ -17,9 +17,9 @@ from ethbrake_marl.extensions.messages.links import (
     LOSS_ENDS,
     PERIOD,
     PIECES,
-    Memory,
+    MessageMemory,
+    memory_at_alert,
     samples_kept,
-    silent,
 )
 from ethbrake_marl.files.model import UNSHOWN, require, suggestion
 from ethbrake_marl.motion.layout import Bools, Floats
@@ -30,7 +30,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 LATER_LOSSES = (5,)  # stream of the numbers that decide which messages after the first are lost
 MOST_SAMPLES = 1_000  # that a vehicle may keep for delayed messages
-USUAL = PIECES[:-1]  # what a message contains unless the scenario says otherwise
+DEFAULT_CONTENT = PIECES[:-1]  # what a message contains unless the scenario says otherwise
 _LISTED = {"type": "array", "items": {"enum": list(PIECES)}, "uniqueItems": True}
 
 
@@ -95,7 +95,7 @@ class Messages(Extension):
         )
         require(kept <= MOST_SAMPLES, ("v2x",), v2x, right)
 
-    def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> Memory:
+    def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> MessageMemory:
         N, v2x = scenario.vehicles, scenario.v2x
         heard, seen = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
         channel: Floats = np.zeros((n, CHANNEL_COLUMNS))
@@ -103,7 +103,7 @@ class Messages(Extension):
             channel[:, PERIOD], channel[:, DELAY] = v2x.message_period_s, _delay_s(v2x)
             channel[:, LOSS_BEGINS], channel[:, LOSS_ENDS] = v2x.loss_begins, v2x.loss_ends
             channel[:, KEY] = numbers(OF_WORLD, LATER_LOSSES)[:, 0] * 2.0**53
-        return silent(_contents(scenario), heard, seen, channel, _kept(scenario))
+        return memory_at_alert(_contents(scenario), heard, seen, channel, _kept(scenario))
 
     def layer(self, v2x: V2X) -> Layer:
         return MESSAGES_LAYER
@@ -131,9 +131,9 @@ def _contents(scenario: Scenario) -> Bools:
     each = (
         tells
         if isinstance(tells, Mapping)
-        else dict.fromkeys(scenario.vehicle_names, USUAL if tells is None else tells)
+        else dict.fromkeys(scenario.vehicle_names, DEFAULT_CONTENT if tells is None else tells)
     )
-    return np.array([[piece in each.get(name, USUAL) for piece in PIECES] for name in scenario.vehicle_names])
+    return np.array([[piece in each.get(name, DEFAULT_CONTENT) for piece in PIECES] for name in scenario.vehicle_names])
 
 
-MESSAGES = Messages()
+DEFAULT_MESSAGES = Messages()

@@ -9,14 +9,14 @@ import numpy as np
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.belief import ages_s, known_pieces
-from ethbrake_marl.extensions.messages.links import NAME, PIECES
+from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, PIECES
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 
 
 def age(state: State, body: int, other: int) -> Floats:
     """Age of the newest sample received from the neighbour; 0 if its present state, or nothing, is known."""
-    if NAME not in state.memories:
+    if MESSAGES_KEY not in state.memories:
         return np.zeros(state.n)
     ages = ages_s(state)[:, body, other]
     return np.where(np.isfinite(ages), ages, 0.0)
@@ -24,12 +24,12 @@ def age(state: State, body: int, other: int) -> Floats:
 
 def intent(state: State, body: int, other: int) -> Floats:
     """Command that the neighbour chose at its last decision, if its messages contain it; else 0."""
-    return state.wanted[:, other] if NAME in state.memories else np.zeros(state.n)
+    return state.wanted[:, other] if MESSAGES_KEY in state.memories else np.zeros(state.n)
 
 
 def _known(piece: str) -> Part:
     def known(state: State, body: int, other: int) -> Floats:
-        if NAME not in state.memories:
+        if MESSAGES_KEY not in state.memories:
             return np.full(state.n, float(piece != "intent"))
         return known_pieces(state, body)[:, other, PIECES.index(piece)].astype(np.float64)
 
@@ -42,5 +42,5 @@ def _of_neighbour(function: Callable[..., Floats], unit: str, scale: float, low:
 
 
 AGE = _of_neighbour(age, "s", 1.0, 0.0, 8.0)
-INTENT = _of_neighbour(intent, "m/s2", 10.0, -2.0, 2.0)
+INTENT_FEATURE = _of_neighbour(intent, "m/s2", 10.0, -2.0, 2.0)
 KNOWN = SimpleNamespace(**{piece: _known(piece) for piece in PIECES})

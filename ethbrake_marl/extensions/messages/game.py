@@ -14,7 +14,7 @@ from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.belief import ages_s, believed, believed_whole, known_pieces, require_pieces
 from ethbrake_marl.extensions.messages.links import (
-    NAME,
+    MESSAGES_KEY,
     P_ACCELERATION,
     P_BRAKING,
     P_LATENCY,
@@ -22,9 +22,9 @@ from ethbrake_marl.extensions.messages.links import (
     P_PLACE,
     P_SPEED,
     PIECES,
-    Memory,
+    MessageMemory,
     after_step,
-    begin,
+    begin_messages,
 )
 from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
@@ -47,13 +47,13 @@ class MessagesLayer(Layer):
     stage = 1
 
     def first_decision(self, game: Game, alert: State, state: State) -> State:
-        if not alert.memories[NAME].is_periodic:
+        if not alert.memories[MESSAGES_KEY].is_periodic:
             return state
         sent = partial(game.seen, body=0, before=self)
-        return _remembering(state, begin(alert, state.time_s, game.settings.time_step_s, sent))
+        return _remembering(state, begin_messages(alert, state.time_s, game.settings.time_step_s, sent))
 
     def after(self, game: Game, before: State, state: State) -> State:
-        if not before.memories[NAME].is_periodic:
+        if not before.memories[MESSAGES_KEY].is_periodic:
             return state
         return _remembering(state, after_step(before, state, partial(game.seen, body=0, before=self)))
 
@@ -62,7 +62,7 @@ class MessagesLayer(Layer):
 
     def hides(self, alert: State, body: int) -> Bools:
         """Bodies (0: obstacle) that vehicle ``body`` does not fully know at its first decision, [n, N + 1]."""
-        memory: Memory = alert.memories[NAME]
+        memory: MessageMemory = alert.memories[MESSAGES_KEY]
         unseen = memory.seen_s[:, body] > alert.car[:, LATENCY, body, np.newaxis]
         lacks = ~memory.contents[:, :, [P_BRAKING, P_LATENCY, P_MASS]].all(axis=2)
         old = memory.is_periodic | ~memory.contents[:, :, [P_PLACE, P_SPEED, P_ACCELERATION]].all(axis=2)
@@ -76,7 +76,7 @@ class MessagesLayer(Layer):
         """
         infos: dict[str, Any] = {}
         reports = {"known_from_s": state.know}
-        if state.memories[NAME].is_periodic:
+        if state.memories[MESSAGES_KEY].is_periodic:
             reports["age_s"] = ages_s(state)
         for name, values in reports.items():
             infos |= {f"{name}_vehicle_{j}": values[:, 1:, j] for j in range(1, values.shape[2])}
@@ -92,8 +92,8 @@ class MessagesLayer(Layer):
 MESSAGES_LAYER = MessagesLayer()
 
 
-def _remembering(state: State, memory: Memory) -> State:
-    return state._replace(memories={**state.memories, NAME: memory})
+def _remembering(state: State, memory: MessageMemory) -> State:
+    return state._replace(memories={**state.memories, MESSAGES_KEY: memory})
 
 
 class BelievedView(LayeredView):
@@ -137,7 +137,7 @@ class Believer(LayeredScript):
         A script may have ``needs_ahead``: quantities of the vehicle ahead that messages must contain until it is in
         sight.
         """
-        if self.needs_ahead and body > 1 and np.isinf(alert.memories[NAME].seen_s[:, body, body - 1]).any():
+        if self.needs_ahead and body > 1 and np.isinf(alert.memories[MESSAGES_KEY].seen_s[:, body, body - 1]).any():
             require_pieces(alert, [body], f"agent {self.name!r}", self.needs_ahead, [body - 1])
         return super().begin(alert, body)
 

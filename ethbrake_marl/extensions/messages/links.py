@@ -34,7 +34,7 @@ from ethbrake_marl.motion.layout import (
     Floats,
 )
 
-NAME = "messages"  # of the memory in `State.memories`
+MESSAGES_KEY = "messages"  # of the memory in `State.memories`
 
 PIECES = ("place", "speed", "acceleration", "braking_capacity", "latency", "mass", "intent")  # parts of a message
 P_PLACE, P_SPEED, P_ACCELERATION, P_BRAKING, P_LATENCY, P_MASS, P_INTENT = range(len(PIECES))
@@ -58,15 +58,15 @@ CHANNEL_COLUMNS = 5
 
 # rows of `Memory.links`
 SENT = 0  # time at which the next message is sent (s); infinite: none
-NUMBER = 1  # its number; message 0 always arrives
+MESSAGE_NUMBER = 1  # its number; message 0 always arrives
 BAD = 2  # 1 while the link is bad
 LINK_ROWS = 3
 
-POST_M = 1e6  # gap to a post ahead of the line, out of reach; what the gap loses is the way of Vehicle 1
-ON_GRID = 1e-9  # two moments that are closer are the same (s)
+FRONT_POST_M = 1e6  # gap to a post ahead of the line, out of reach; what the gap loses is the way of Vehicle 1
+SAME_MOMENT_S = 1e-9  # two moments that are closer are the same (s)
 
 
-class Memory(NamedTuple):
+class MessageMemory(NamedTuple):
     """What the vehicles of n worlds have sent and received. In arrays of links, [.., i, j] is what i has of body j."""
 
     contents: Bools  # [n, N + 1, PIECES] whether messages of a body contain the piece
@@ -85,15 +85,15 @@ class Memory(NamedTuple):
 
 def samples_kept(delay_s: float, time_step_s: float) -> int:
     """Number of samples to store so that a delayed message finds its own: those of one delay, and three more."""
-    return math.ceil(delay_s / time_step_s - ON_GRID) + 3
+    return math.ceil(delay_s / time_step_s - SAME_MOMENT_S) + 3
 
 
-def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, kept: int) -> Memory:
+def memory_at_alert(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, kept: int) -> MessageMemory:
     """Memory at the alert, before any message.
 
     ``contents`` [N, PIECES]: what messages of each vehicle contain. ``heard_s`` and ``seen_s`` [n, N, N]: when vehicle
-    i can use the first message of j, and when it begins to measure j (s). ``channel``: as in ``Memory``. ``kept``:
-    number of samples to store.
+    i can use the first message of j, and when it begins to measure j (s). ``channel``: as in ``MessageMemory``.
+    ``kept``: number of samples to store.
     """
     n, N = heard_s.shape[:2]
     whole = np.ones((n, N + 1, len(PIECES)), np.bool_)
@@ -104,7 +104,7 @@ def silent(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, ke
     links, news = np.zeros((n, LINK_ROWS, N + 1, N + 1)), np.zeros((n, SAMPLE_ROWS, N + 1, N + 1))
     samples = np.zeros((n, kept, SAMPLE_ROWS, N + 1))
     links[:, SENT], news[:, AT], samples[:, :, AT] = heard - channel[:, DELAY, np.newaxis, np.newaxis], -1.0, np.inf
-    return Memory(whole, heard, seen, channel, links, news, samples)
+    return MessageMemory(whole, heard, seen, channel, links, news, samples)
 
 
 def present(state: State) -> Floats:
@@ -121,12 +121,12 @@ def present(state: State) -> Floats:
     return sample
 
 
-def begin(alert: State, start_s: Floats, time_step_s: float, sent: Callable[[State], State]) -> Memory:
+def begin_messages(alert: State, start_s: Floats, time_step_s: float, sent: Callable[[State], State]) -> MessageMemory:
     """Memory at the first decision, ``start_s`` [n], with what has been received since the alert.
 
     Until then vehicles execute ``alert.wanted``. ``sent``: the state that vehicles send and measure, from the true one.
     """
-    memory, line = _own(alert.memories[NAME]), alert.line.copy()
+    memory, line = _own(alert.memories[MESSAGES_KEY]), alert.line.copy()
     force = np.where(alert.car[:, LATENCY] <= 0.0, alert.wanted, 0.0)
     rate = np.where(force < line[:, FORCE], alert.car[:, BRAKE_RATE], alert.car[:, RELEASE_RATE])
     line[:, FORCE] = np.where(np.isinf(rate), force, line[:, FORCE])
@@ -141,27 +141,27 @@ def begin(alert: State, start_s: Floats, time_step_s: float, sent: Callable[[Sta
     return memory
 
 
-def after_step(before: State, after: State, sent: Callable[[State], State]) -> Memory:
-    """Return the memory after a step, with what has been received in it; ``sent``: as for ``begin``."""
-    memory = _own(before.memories[NAME])
+def after_step(before: State, after: State, sent: Callable[[State], State]) -> MessageMemory:
+    """Return the memory after a step, with what has been received in it; ``sent``: as for ``begin_messages``."""
+    memory = _own(before.memories[MESSAGES_KEY])
     _, way = _advanced(before._replace(wanted=after.wanted), after.time_s)
     _sample(memory, sent(after), way, after.time_s > before.time_s)
     return memory
 
 
-def _own(memory: Memory) -> Memory:
+def _own(memory: MessageMemory) -> MessageMemory:
     return memory._replace(links=memory.links.copy(), news=memory.news.copy(), samples=memory.samples.copy())
 
 
 def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
     """State at ``until_s`` [n], and the way of Vehicle 1, [n] m: how much nearer a fixed post is."""
     line = state.line.copy()
-    line[line[:, GAP, 0] >= FAR_M, GAP, 0] = POST_M
+    line[line[:, GAP, 0] >= FAR_M, GAP, 0] = FRONT_POST_M
     after = advanced(state._replace(line=line), until_s)
     return after, line[:, GAP, 0] - after.line[:, GAP, 0]
 
 
-def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:
+def _sample(memory: MessageMemory, state: State, way_m: Floats, rows: Bools) -> None:
     """Add a sample in the worlds ``rows`` (a mask [n]) to ``memory`` and receive what arrives, in place.
 
     ``way_m`` [n]: way of Vehicle 1 since the last sample.
@@ -174,9 +174,9 @@ def _sample(memory: Memory, state: State, way_m: Floats, rows: Bools) -> None:
     receive_worlds(rows, state.time_s.copy(), memory.channel, memory.seen_s, samples, memory.links, memory.news)
 
 
-def newest(state: State, observer: int) -> Floats:
+def newest_samples(state: State, observer: int) -> Floats:
     """Newest sample of each body that the body ``observer`` has, [n, SAMPLE_ROWS, N + 1]."""
-    memory: Memory = state.memories[NAME]
+    memory: MessageMemory = state.memories[MESSAGES_KEY]
     if not memory.is_periodic:
         return present(state)
     news = memory.news[:, :, observer].copy()
@@ -185,7 +185,7 @@ def newest(state: State, observer: int) -> Floats:
 
 
 def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats:
-    line, bodies, aged = state.line.copy(), known.shape[1], state.memories[NAME].is_periodic
+    line, bodies, aged = state.line.copy(), known.shape[1], state.memories[MESSAGES_KEY].is_periodic
     working = np.empty(bodies), np.empty(bodies, np.bool_)
     estimate_worlds(observer, state.time_s.copy(), state.car[:, LIMIT].copy(), known, news, aged, line, *working)
     return line
@@ -195,21 +195,22 @@ def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats
 def receive_worlds(rows, time, channel, seen, samples, links, news):
     """Receive all messages that can be used by ``time`` [n] (s), and measure vehicles in sight, in the worlds ``rows``.
 
-    ``rows`` is a mask [n]; the other arguments are arrays of ``Memory``, of which ``links`` and ``news`` are changed.
+    ``rows`` is a mask [n]; the other arguments are arrays of ``MessageMemory``, of which ``links`` and ``news`` are
+    changed.
     """
     bodies = news.shape[3]
     for k in range(len(rows)):
         for link in range(bodies * bodies if rows[k] else 0):
             i, j = link // bodies, link % bodies
-            while links[k, SENT, i, j] + channel[k, DELAY] <= time[k] + ON_GRID:
-                number, bad = links[k, NUMBER, i, j], links[k, BAD, i, j] == 1.0
+            while links[k, SENT, i, j] + channel[k, DELAY] <= time[k] + SAME_MOMENT_S:
+                number, bad = links[k, MESSAGE_NUMBER, i, j], links[k, BAD, i, j] == 1.0
                 if number > 0.0:
-                    u = chance(channel[k, KEY], (i - 1) * (bodies - 1) + j - 1, number)
+                    u = loss_number(channel[k, KEY], (i - 1) * (bodies - 1) + j - 1, number)
                     bad = u >= channel[k, LOSS_ENDS] if bad else u < channel[k, LOSS_BEGINS]
                 if not bad:
                     take_sample(samples[k], news[k], i, j, links[k, SENT, i, j], SAMPLE_ROWS)
                 links[k, BAD, i, j] = 1.0 if bad else 0.0
-                links[k, NUMBER, i, j] += 1.0
+                links[k, MESSAGE_NUMBER, i, j] += 1.0
                 links[k, SENT, i, j] += channel[k, PERIOD]
             if seen[k, i, j] <= time[k]:
                 take_sample(samples[k], news[k], i, j, time[k], INTENT)
@@ -222,14 +223,14 @@ def take_sample(samples, news, i, j, sent, rows):
     One world: ``samples`` [L, SAMPLE_ROWS, N + 1], newest first; ``news`` [SAMPLE_ROWS, N + 1, N + 1].
     """
     for s in range(samples.shape[0]):
-        if samples[s, AT, j] <= sent + ON_GRID:
+        if samples[s, AT, j] <= sent + SAME_MOMENT_S:
             for row in range(rows):
                 news[row, i, j] = samples[s, row, j]
             return
 
 
 @kernel
-def chance(key, link, number):
+def loss_number(key, link, number):
     """Random number in [0, 1) that decides whether message ``number`` of a link is lost: a SplitMix64 hash.
 
     ``key``: of the world, as in ``Memory.channel``. ``link``: number of the link.

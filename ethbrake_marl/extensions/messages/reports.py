@@ -15,7 +15,7 @@ import numpy as np
 
 from ethbrake_marl.episode.layer import Layer
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.messages.links import chance
+from ethbrake_marl.extensions.messages.links import loss_number
 from ethbrake_marl.files.model import UNSHOWN, require, suggestion
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.elementary import normal_quantile_each
@@ -37,7 +37,7 @@ def chances(keys, steps, out):
     """Write random numbers in [0, 1) to ``out`` [n, N], one for each vehicle, from the ``keys`` and ``steps`` [n]."""
     for k in range(out.shape[0]):
         for i in range(out.shape[1]):
-            out[k, i] = chance(keys[k], i, steps[k])
+            out[k, i] = loss_number(keys[k], i, steps[k])
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ AVOIDABLE, EARLY, FRONT, REAR = range(4)
 REASONS = ("", "early", "front", "rear")
 
 REASON, MARGIN, SPARE, DRIVE, TOUCH, FOLLOW, VERDICT = range(7)  # columns of a verdict, and their number
-COVERED = ((3, 2), (2, 1), (2, 2))  # number of vehicles, body of the controlled vehicle
+COVERED_LINES = ((3, 2), (2, 1), (2, 2))  # number of vehicles, body of the controlled vehicle
 PROVEN_FOR = "9c34cfada8195d65"  # digest of the physics; docs/internals/model.md says when to renew it
 
 
@@ -101,12 +101,12 @@ def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
     """
     w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
     if relief > 0.0 and v_l > 0.0:
-        both = u + a_f
-        root = math.sqrt(both * relief * (w * w + 2.0 * closing * gap))
+        command_range = u + a_f
+        root = math.sqrt(command_range * relief * (w * w + 2.0 * closing * gap))
         if w > 0.0:
-            drive = max(2.0 * relief * gap - w * w, 0.0) / (w * both + root)
+            drive = max(2.0 * relief * gap - w * w, 0.0) / (w * command_range + root)
         else:
-            drive = (root - w * both) / (closing * both)
+            drive = (root - w * command_range) / (closing * command_range)
         touch = drive + (w + closing * drive) / relief
         if touch * a_l <= v_l:
             return drive, touch, True
@@ -150,7 +150,7 @@ def lowest_while_coasting(at):
 
 
 @kernel
-def met(gap, closing):
+def had_impact(gap, closing):
     """Whether a pair with this gap (m) and closing speed (m/s) has or had an impact."""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > TOUCH_MPS)
 
@@ -185,7 +185,7 @@ def decide(at, out):
         v_l, way, _ = solo(at[V_L], -at[A_L], at[ONSET_L], math.inf, start)
         ahead = at[GAP_L] + (way - v_f * start)
         out[REASON], out[MARGIN] = EARLY, ahead
-        if met(ahead, v_f - v_l):
+        if had_impact(ahead, v_f - v_l):
             return
         spare = spare_gap(max(ahead, 0.0), v_l, at[A_L], v_f, at[A_F])
         out[REASON] = FRONT if spare < -ROUNDING_M else AVOIDABLE
@@ -195,7 +195,7 @@ def decide(at, out):
     lowest = lowest_while_coasting(at)
     v_r, way, _ = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, start)
     behind = at[GAP_R] + (v_f * start - way)
-    if met(lowest, 0.0) or met(behind, v_r - v_f):
+    if had_impact(lowest, 0.0) or had_impact(behind, v_r - v_f):
         out[REASON], out[MARGIN] = EARLY, lowest
     if out[REASON] != AVOIDABLE:
         return
@@ -251,7 +251,7 @@ def _check_covered(state: State, body: int) -> None:
             f"avoidability, lower_bound: proven for other physics ({PROVEN_FOR!r}) than this installation's"
             f" ({physics_digest()!r}), so nothing is claimed here"
         )
-    if (state.vehicles, body) not in COVERED:
+    if (state.vehicles, body) not in COVERED_LINES:
         raise InvalidInput(
             f"avoidability: vehicle_{body} of {state.vehicles} vehicles is controlled, but the proof covers only"
             " vehicle_2 in a line of 3 vehicles, and both vehicles in a line of 2"

@@ -19,7 +19,7 @@ from ethbrake_marl.motion.compiling import kernel, large
 PRECISION = 1e-3  # relative and absolute (m2/s2) precision of a minimum
 CELLS = 600  # size of the memory for cells, which limits the number of divisions
 _SPLITS = 64  # largest number of cells at the start of the search, one for each decision step
-_TRIED = 8  # number of first contacts evaluated before the search
+_FIRST_SAMPLES = 8  # number of first contacts evaluated before the search
 
 # columns of a cell: bound (m2/s2); range of times (s); range of closing speeds (m/s)
 HARM, EARLY, LATE, SOFT, HARD = range(5)
@@ -55,7 +55,7 @@ def decision_around(at, early, late):
 
 
 @large
-def lacking(kind, at, early, late, softest, hard, begin):
+def command_deviation(kind, at, early, late, softest, hard, begin):
     """Least difference (m/s2) between the command at a first contact and the best command after it.
 
     Braking makes a contact with the front vehicle gentle, but driving softens the impact from behind that follows; at
@@ -63,7 +63,7 @@ def lacking(kind, at, early, late, softest, hard, begin):
     (s), so it cannot be the best one both before and after the contact. ``softest`` is the smallest closing speed (m/s)
     of a first contact between ``early`` and ``late`` under any command. Other arguments: see ``proofs``.
     """
-    whole = at[U_F] + at[A_F]
+    command_range = at[U_F] + at[A_F]
     turn = gentlest(kind, at, early)[1]
     # A speed limit or a standstill may hide which command is in force.
     hidden = leader(at, early)[0] + hard >= at[LIMIT_F] if kind == FRONT_FIRST else follower(at, late)[0] <= hard
@@ -72,9 +72,9 @@ def lacking(kind, at, early, late, softest, hard, begin):
     softer = max(hard - softest, 0.0) / (early - begin)
     if turn >= begin:
         share = (turn - begin) / (early - begin)
-        return max(whole - 2.0 * softer - whole * share * share, 0.0)
+        return max(command_range - 2.0 * softer - command_range * share * share, 0.0)
     steep = (late - begin) / (begin - turn)
-    return max(whole - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0)
+    return max(command_range - softer * (1.0 + steep) / (1.0 + 0.5 * steep), 0.0)
 
 
 @large
@@ -87,13 +87,13 @@ def harm_of(kind, at, early, late, soft, hard, floor):
     begin, end = decision_around(at, early, late)
     lack = 0.0
     if end > late:
-        lack = lacking(kind, at, early, late, gentlest_between(kind, at, early, late), hard, begin)
+        lack = command_deviation(kind, at, early, late, gentlest_between(kind, at, early, late), hard, begin)
     follows = after(kind, at, early, late, hard, max(end, late), lack)
     return soft * soft + max(follows, floor)
 
 
 @large
-def put(kind, at, floor, cells, count, least, early, late, soft, hard):
+def put_cell(kind, at, floor, cells, count, least, early, late, soft, hard):
     """Add a cell to ``cells``, after the first ``count``, and return the new number of cells.
 
     Its bound is at least ``least`` (m2/s2). Other arguments: as for ``harm_of``.
@@ -114,7 +114,7 @@ def lowest(cells, count):
 
 
 @large
-def divide(kind, at, floor, count, row, cells):
+def halve_cell(kind, at, floor, count, row, cells):
     """Split the cell in ``row`` of ``cells``, of which ``count`` are in use, into two halves.
 
     Return the new number of cells, and the bound (m2/s2) for one first contact in the cell; the smallest bound of all
@@ -130,26 +130,26 @@ def divide(kind, at, floor, count, row, cells):
         closing = max(soft, gentlest(kind, at, middle)[0])
         reached = harm_of(kind, at, middle, middle, closing, closing, floor)
         if soft < hard:
-            count = put(kind, at, floor, cells, count, harm, middle, late, soft, hard)
+            count = put_cell(kind, at, floor, cells, count, harm, middle, late, soft, hard)
         soft, late = max(soft, gentlest_between(kind, at, early, middle)), middle
     else:
         middle = 0.5 * (soft + hard)
         reached = harm_of(kind, at, late, late, middle, middle, floor)
-        count = put(kind, at, floor, cells, count, harm, early, late, middle, hard)
+        count = put_cell(kind, at, floor, cells, count, harm, early, late, middle, hard)
         hard = middle
     if soft < hard:
-        count = put(kind, at, floor, cells, count, harm, early, late, soft, hard)
+        count = put_cell(kind, at, floor, cells, count, harm, early, late, soft, hard)
     return count, reached
 
 
 @large
-def least_harm(kind, at, first, last, floor, best, enough, cells):
+def least_contact_harm(kind, at, first, last, floor, best, enough, cells):
     """Lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s).
 
     Arguments: see ``proofs``.
     """
-    for k in range(_TRIED):
-        time = first + (last - first) * k / (_TRIED - 1)
+    for k in range(_FIRST_SAMPLES):
+        time = first + (last - first) * k / (_FIRST_SAMPLES - 1)
         closing = gentlest(kind, at, time)[0]
         best = min(best, harm_of(kind, at, time, time, closing, closing, floor))
     # the contacts between both times with closing speeds up to `hard`: one cell for each decision step
@@ -159,13 +159,13 @@ def least_harm(kind, at, first, last, floor, best, enough, cells):
         until = next_split(kind, at, begin, last) if count < _SPLITS else last
         soft = gentlest_between(kind, at, begin, until)
         if soft < hard:
-            count = put(kind, at, floor, cells, count, 0.0, begin, until, soft, hard)
+            count = put_cell(kind, at, floor, cells, count, 0.0, begin, until, soft, hard)
         begin = until
     row, least = lowest(cells, count)
     for _ in range(len(cells) - _SPLITS - 2):
         if best <= enough or least >= best - PRECISION * (1.0 + best):
             break
-        count, reached = divide(kind, at, floor, count, row, cells)
+        count, reached = halve_cell(kind, at, floor, count, row, cells)
         best = min(best, reached)
         row, least = lowest(cells, count)
     return min(best, least) if best > enough else 0.0

@@ -52,10 +52,10 @@ def best_flight(pair, opening):
     if reach == math.inf:
         return math.inf
     slope = reach - share * press
-    left = slope * slope - reach * (reach - press)
-    if left <= 0.0:
+    radicand = slope * slope - reach * (reach - press)
+    if radicand <= 0.0:
         return math.inf
-    root = math.sqrt(left)
+    root = math.sqrt(radicand)
     return max(reach * opening / (root * (slope + root)), 2.0 * opening / press)
 
 
@@ -72,8 +72,11 @@ def lead(pair, opening, shortest, longest, lost):
     opening = min(opening, 0.5 * press * longest)
     flight = best_flight(pair, opening)
     if lost > 0.0:
-        both = opening + lost
-        flight = max(flight, (both + math.sqrt(max(both * both - press * lost * lost / reach, 0.0))) / press)
+        total_opening = opening + lost
+        flight = max(
+            flight,
+            (total_opening + math.sqrt(max(total_opening * total_opening - press * lost * lost / reach, 0.0))) / press,
+        )
     flight = min(max(flight, shortest), longest)
     most = share * press * flight - lost
     if flight < longest:

@@ -42,7 +42,7 @@ LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)
 
 
 @kernel
-def value_of(line, time):
+def value_at(line, time):
     """Value at ``time`` of a piecewise linear function, a tuple (start, slope, turn, bend, turn, bend).
 
     ``start + slope t + bend max(t - turn, 0) + bend max(t - turn, 0)``; each turn has its own bend.
@@ -53,9 +53,9 @@ def value_of(line, time):
 
 @kernel
 def least_of_line(line, since, until):
-    """Smallest value of a piecewise linear function (see ``value_of``) from ``since`` to ``until``."""
+    """Smallest value of a piecewise linear function (see ``value_at``) from ``since`` to ``until``."""
     first, second = min(max(line[2], since), until), min(max(line[4], since), until)
-    return min(value_of(line, since), value_of(line, until), value_of(line, first), value_of(line, second))
+    return min(value_at(line, since), value_at(line, until), value_at(line, first), value_at(line, second))
 
 
 @large
@@ -63,7 +63,7 @@ def least_closing(line, pair, opening, lost, late, end, until):
     """Smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
 
     It is a difference v - d: v is the closing speed of the second neighbour relative to the centre of mass of the pair,
-    which ``line`` describes as a function of time (``value_of``; a bend may be negative); d, from ``largest_lead``, is
+    which ``line`` describes as a function of time (``value_at``; a bend may be negative); d, from ``largest_lead``, is
     the largest difference between the controlled vehicle and this centre. ``until`` is the latest time of the contact.
     Times are in s after the first contact. Other arguments: see ``flights``.
     """
@@ -93,7 +93,7 @@ def pushed_by_leader(at, early, late, closing, end, lack):
     """Lower bound (m/s) on the rear pair's closing speed after a first contact with the leader.
 
     1. The *block*, leader and controlled vehicle together, moves like its centre of mass: at first with ``speed`` and
-       the acceleration ``push``, until the leader stands at ``stand``.
+       the acceleration ``add_push``, until the leader stands at ``stand``.
     2. The rear vehicle has reached the block by the time ``until``. 0 is returned if it need not.
     3. The bound is the speed at which the rear vehicle closes in on the block, minus the largest amount by which the
        controlled vehicle may then be faster than the block.

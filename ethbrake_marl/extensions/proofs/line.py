@@ -25,7 +25,7 @@ FRONT_SHARE = 13  # m_l / (m_l + m_f), with the masses m
 REAR_SHARE = 14  # m_r / (m_f + m_r)
 BOUNCE = 15  # coefficient of restitution
 TIME_STEP = 16  # time between decisions, the first of which is now (s); 0: commands may change at any time
-COLUMNS = 17
+LINE_COLUMNS = 17
 
 FRONT_FIRST, REAR_FIRST = 0.0, 1.0  # neighbour of the first contact; floats: numba compiles again for each integer
 
@@ -61,7 +61,7 @@ def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
 
     ``time_step_s``: time between decisions; 0: commands may change at any time.
     """
-    line, car, at = state.line, state.car, np.zeros((state.n, COLUMNS))
+    line, car, at = state.line, state.car, np.zeros((state.n, LINE_COLUMNS))
     onset = np.maximum(car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0)
     at[:, [GAP_L, GAP_R]] = FAR_M
     braking, driving = (capacities(car, row, state.time_s) for row in (BRAKING, DRIVING))
@@ -69,9 +69,9 @@ def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
     at[:, LIMIT_F], at[:, ONSET_F] = car[:, LIMIT, body], onset[:, body]
     at[:, BOUNCE], at[:, TIME_STEP] = state.restitution, time_step_s
     sides = [(body - 1, body - 1, GAP_L, FRONT_SHARE), (body + 1, body, GAP_R, REAR_SHARE)]
-    for other, pair, first, share in sides:
-        if 1 <= other <= state.vehicles:
-            columns = line[:, GAP, pair], line[:, SPEED, other], braking[:, other], onset[:, other]
+    for neighbour, pair, first, share in sides:
+        if 1 <= neighbour <= state.vehicles:
+            columns = line[:, GAP, pair], line[:, SPEED, neighbour], braking[:, neighbour], onset[:, neighbour]
             at[:, first : first + 4] = np.stack(columns, axis=1)
-            at[:, share] = car[:, MASS, other] / (car[:, MASS, other] + car[:, MASS, body])
+            at[:, share] = car[:, MASS, neighbour] / (car[:, MASS, neighbour] + car[:, MASS, body])
     return at

@@ -17,7 +17,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import advanced
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability, largest_behind, spare_gap
-from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, least_harm
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, least_contact_harm
 from ethbrake_marl.extensions.proofs.followers import after
 from ethbrake_marl.extensions.proofs.line import (
     A_F,
@@ -187,7 +187,7 @@ def front_first(at, floor, best, enough, cells):
     if first == math.inf or not stays_ahead(at, first, first):
         return best
     last, end, leans = last_meeting(at, first)
-    best = least_harm(FRONT_FIRST, at, first, end, floor, best, enough, cells)
+    best = least_contact_harm(FRONT_FIRST, at, first, end, floor, best, enough, cells)
     if leans:
         best = soft_harm(FRONT_FIRST, at, last, last, floor, best)
         stand = at[V_L] / at[A_L]
@@ -223,7 +223,7 @@ def rear_first(at, floor, best, enough, cells):
                 low = middle
         last = meet_rear(at, top)
     end = last_first(REAR_FIRST, at, first, last)
-    best = least_harm(REAR_FIRST, at, first, end, floor, best, enough, cells)
+    best = least_contact_harm(REAR_FIRST, at, first, end, floor, best, enough, cells)
     if not avoids or end < last:
         return best
     # no first contact is possible after both have come to rest, or after the rear vehicle would reach the front one

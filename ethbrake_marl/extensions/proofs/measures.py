@@ -21,11 +21,11 @@ def avoidable(game: Game, alert: State, last: State) -> Given:
     The commands are those of Vehicle 2 of three (or of Vehicles 2 and 3 together) or of either of two vehicles; all
     others brake fully. The result is the same for every agent.
     """
-    verdict = avoidability(alert, _controlled(game, alert, together=True))
+    verdict = avoidability(alert, _controlled_body(game, alert, together=True))
     return {"": verdict.avoidable, "reason": verdict.reason_name}
 
 
-_known: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: all agents drive the same ones
+_bound_cache: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: all agents drive the same ones
 
 
 def proven_harm(game: Game, alert: State, last: State) -> Given:
@@ -33,21 +33,24 @@ def proven_harm(game: Game, alert: State, last: State) -> Given:
 
     ``impact``: whether the bound is above 0. The result is the same for every agent.
     """
-    body, settings = _controlled(game, alert), game.settings
+    body, settings = _controlled_body(game, alert), game.settings
     ends = np.array([body, settings.horizon_s, settings.time_step_s])
-    asked = ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
-    if asked not in _known:
+    request = ends.tobytes() + alert.line.tobytes() + alert.car.tobytes()
+    if request not in _bound_cache:
         bound = lower_bound(alert, body, horizon_s=settings.horizon_s, time_step_s=settings.time_step_s)
-        _known.clear()
-        _known[asked] = bound
-    return {"": _known[asked].harm, "impact": _known[asked].impact_proven}
+        _bound_cache.clear()
+        _bound_cache[request] = bound
+    return {"": _bound_cache[request].harm, "impact": _bound_cache[request].impact_proven}
 
 
-def _controlled(game: Game, alert: State, *, together: bool = False) -> int:
+def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int:
     """Controlled vehicle, or 2 for Vehicles 2 and 3 together. Raises ``InvalidInput`` for other learners."""
     learners = game.settings.learners.tolist()
-    others = [body for body in range(1, alert.vehicles + 1) if body not in learners]
-    if game.scripts or (alert.wanted[:, others] != -capacities(alert.car, BRAKING, alert.time_s)[:, others]).any():
+    scripted_bodies = [body for body in range(1, alert.vehicles + 1) if body not in learners]
+    if (
+        game.scripts
+        or (alert.wanted[:, scripted_bodies] != -capacities(alert.car, BRAKING, alert.time_s)[:, scripted_bodies]).any()
+    ):
         raise InvalidInput(
             "avoidable, proven_harm: a vehicle that does not learn does not brake fully; all others must"
         )

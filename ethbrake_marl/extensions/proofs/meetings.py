@@ -68,10 +68,14 @@ def braked_then_driven(at, brake, time):
     slow = max(v - a * brake, 0.0)
     cap = time_to_limit(slow, u, at[LIMIT_F])
     drive = u if cap > 0.0 else 0.0
-    left = time - brake
-    beyond = max(left - cap, 0.0)
-    way = (v - 0.5 * a * braked) * braked + (slow + 0.5 * drive * left) * left - 0.5 * drive * beyond * beyond
-    return way, slow + drive * (left - beyond)
+    driving_time = time - brake
+    beyond = max(driving_time - cap, 0.0)
+    way = (
+        (v - 0.5 * a * braked) * braked
+        + (slow + 0.5 * drive * driving_time) * driving_time
+        - 0.5 * drive * beyond * beyond
+    )
+    return way, slow + drive * (driving_time - beyond)
 
 
 @large

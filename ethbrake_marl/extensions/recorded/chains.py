@@ -47,17 +47,17 @@ def cut_chains(recording: Recording, vehicles: int) -> Chains:
         members = np.column_stack(chain)
         counts = (members >= 0).sum(axis=1)
         longest = max(longest, (len(chains) - 1) * vehicles + int(counts.max()))
-        whole = counts == vehicles
-        left_out["vehicles that were too few, or left over, at the end of a queue"] += int(counts[~whole].sum())
-        chains.append(members[whole])
-        queues.append(fronts[whole])
+        is_complete = counts == vehicles
+        left_out["vehicles that were too few, or left over, at the end of a queue"] += int(counts[~is_complete].sum())
+        chains.append(members[is_complete])
+        queues.append(fronts[is_complete])
         starts, more = behind[members[:, -1]], behind[members[:, -1]] >= 0
         starts, fronts = starts[more], fronts[more]
     members = np.concatenate(chains)[np.argsort(np.concatenate(queues), kind="stable")]
     numbers = np.column_stack([gaps[members[:, 1:]], states["speed"].to_numpy()[members]])
     name_of = {number: recording.name(number) for number in states["vehicle"].unique()}
     names = states["vehicle"].map(name_of).to_numpy()[members]
-    return Chains(numbers, ["-".join(each) for each in names], longest, left_out)
+    return Chains(numbers, ["-".join(chain_names) for chain_names in names], longest, left_out)
 
 
 def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
@@ -70,9 +70,9 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
     if entry.by_lane:
         ordered = states.sort_values(["moment", "lane", "front"], ascending=[True, True, False], kind="stable")
         states["ahead"] = ordered.groupby(["moment", "lane"])["vehicle"].shift(1).fillna(-1.0)
-    others = states[["moment", "vehicle", "lane", "front", "side", "dx", "dy", "length", "speed"]]
-    others = others.add_suffix("_ahead").assign(front_car=states.index)
-    pairs = states.merge(others, "left", left_on=["moment", "ahead"], right_on=["moment_ahead", "vehicle_ahead"])
+    ahead_states = states[["moment", "vehicle", "lane", "front", "side", "dx", "dy", "length", "speed"]]
+    ahead_states = ahead_states.add_suffix("_ahead").assign(front_car=states.index)
+    pairs = states.merge(ahead_states, "left", left_on=["moment", "ahead"], right_on=["moment_ahead", "vehicle_ahead"])
     along = pairs["front_ahead"] - pairs["length_ahead"] * pairs["dx_ahead"] - pairs["front"]
     across = pairs["side_ahead"] - pairs["length_ahead"] * pairs["dy_ahead"] - pairs["side"]
     gap = pairs["gap"] = along * pairs["dx"] + across * pairs["dy"]
@@ -81,15 +81,15 @@ def _links(recording: Recording, states: Any, left_out: Counter[str]) -> Any:
     same_lane = pairs["lane_ahead"] == pairs["lane"]
     missing, overlap = (pairs["ahead"] >= 0.0) & gap.isna(), (gap <= 0.0) & same_lane & ~noise
     _check_faults(recording, pairs[missing | overlap], left_out)
-    used = gap.notna() & ~overlap
+    is_valid = gap.notna() & ~overlap
     for what, odd in (
         ("links of standing cars whose gap was recorded as 0 or less", noise),
         ("links to another lane, or of a vehicle that rolls backwards", ~same_lane | (slowest < 0.0)),
         (f"links of more than {FARTHEST_M:,.0f} m", gap > FARTHEST_M),
     ):
-        left_out[what] += int((used & odd).sum())
-        used &= ~odd
-    links = pairs[used].sort_values("gap", kind="stable")
+        left_out[what] += int((is_valid & odd).sum())
+        is_valid &= ~odd
+    links = pairs[is_valid].sort_values("gap", kind="stable")
     return links.drop_duplicates("front_car").astype({"front_car": int})
 
 
@@ -98,8 +98,8 @@ def _check_faults(recording: Recording, faulty: Any, left_out: Counter[str]) -> 
     twice = states[states.duplicated(["moment", "vehicle"])]
     number = len(faulty) + len(twice)
     if number > recording.entry.impossible * len(states):
-        both = pd.concat([faulty, twice.assign(gap=math.inf)])
-        first = both.sort_values(["moment", "vehicle"], kind="stable").iloc[0]
+        all_faults = pd.concat([faulty, twice.assign(gap=math.inf)])
+        first = all_faults.sort_values(["moment", "vehicle"], kind="stable").iloc[0]
         ahead = f"vehicle {recording.name(first['ahead'])}"
         fault = f"follows {ahead}, which is not recorded at this time"
         if first["gap"] == math.inf:

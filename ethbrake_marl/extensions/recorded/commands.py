@@ -64,14 +64,14 @@ def from_data_command(
         result = scenario_from_data(
             output.stem, folder, format, columns=columns, based_on=based_on, every_s=every, progress=out.progress
         )
-        for each in result.refused:
-            out.note(f"refused: {each}")
+        for message in result.refused:
+            out.note(f"refused: {message}")
         with new_file(output) as partial:
             partial.write_text(result.text, "utf-8")
             out.write(rows, result.csv, what="rows")
         out.note(f"written: {output}; try it: ethbrake scenario validate {output}")
         lists = {"found": result.found, "refused": result.refused, "skipped": result.skipped}
-        out.result({"scenario": str(output), "rows": str(rows), **lists}, *result.found, kept=True)
+        out.result({"scenario": str(output), "rows": str(rows), **lists}, *result.found, in_file=True)
 
 
 FROM_DATA = Part(

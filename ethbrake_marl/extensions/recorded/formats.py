@@ -13,14 +13,14 @@ DataFormat = Literal["highd", "exid", "ngsim", "openacc", "table"]
 
 FOOT_M = 0.3048
 
-NUMBER = "<number>"  # placeholder for the number of a vehicle in the name of a column
+VEHICLE_PLACEHOLDER = "<number>"  # placeholder for the number of a vehicle in the name of a column
 
 
 class Format(NamedTuple):
     title: str  # name of the data set
     files: tuple[str, ...]  # patterns of the names of its files, in lower case
-    # Quantity -> name of its column. A name with ``NUMBER`` means one column for each vehicle: Speed1, Speed2, ... The
-    # quantity ``gap`` is the gap behind a vehicle.
+    # Quantity -> name of its column. A name with ``VEHICLE_PLACEHOLDER`` means one column for each vehicle: Speed1,
+    # Speed2, ... The quantity ``gap`` is the gap behind a vehicle.
     columns: dict[str, str]
     units: str  # units of lengths and speeds, for messages
     licence: str  # sentence on the licence, for the key ``source`` of the scenario
@@ -73,7 +73,8 @@ FORMATS: dict[DataFormat, Format] = {
         texts=("location",), optional=("location",),
     ),
     "openacc": Format(
-        "OpenACC", ("*.csv",), {"time": "Time", "speed": f"Speed{NUMBER}", "gap": f"IVS{NUMBER}"}, "m and m/s",
+        "OpenACC", ("*.csv",),
+        {"time": "Time", "speed": f"Speed{VEHICLE_PLACEHOLDER}", "gap": f"IVS{VEHICLE_PLACEHOLDER}"}, "m and m/s",
         "OpenACC is of the European Commission's Joint Research Centre, CC BY 4.0: name the source, and say that these"
         " rows are made from it.",
         impossible=0.01, standing_mps=0.5,
@@ -103,10 +104,10 @@ def format_of(name: DataFormat, columns: str = "") -> Format:
                 f"columns: the columns of {FORMATS[name].title} are fixed; leave out --columns, or use --format table"
             )
         return FORMATS[name]
-    pairs = [[each.strip() for each in part.partition("=")[::2]] for part in columns.split(",")]
+    pairs = [[text.strip() for text in part.partition("=")[::2]] for part in columns.split(",")]
     settings = {key: value for key, value in pairs if value}
-    known, example = (*_ROLES, "units"), ",".join(f"{key}=..." for key in _ROLES)
-    if Counter(key for key, _ in pairs) != Counter(known) or len(settings) < len(known):
+    known_keys, example = (*_ROLES, "units"), ",".join(f"{key}=..." for key in _ROLES)
+    if Counter(key for key, _ in pairs) != Counter(known_keys) or len(settings) < len(known_keys):
         raise InvalidInput(f"columns = {columns!r}: must be {example},units={'|'.join(_UNITS)}, with each key once")
     if settings["units"] not in _UNITS:
         raise InvalidInput(f"columns: units = {settings['units']!r}: must be one of {', '.join(_UNITS)}")

@@ -16,10 +16,10 @@ import pyarrow
 from pyarrow import compute, csv
 
 from ethbrake_marl.errors import InvalidInput, plain_text
-from ethbrake_marl.extensions.recorded.formats import NUMBER, Format
+from ethbrake_marl.extensions.recorded.formats import VEHICLE_PLACEHOLDER, Format
 from ethbrake_marl.files.plain import open_plain
 
-HEAD = 11  # number of first lines that may be the header
+HEADER_LINES = 11  # number of first lines that may be the header
 LONGEST_HEAD, LARGEST_BYTES = 1 << 16, 1 << 40  # limits of a line of the heading and of a file, in bytes
 OTHER_NAMES = {"preceeding": "preceding"}  # misspelt column in some files of NGSIM
 
@@ -71,16 +71,18 @@ def read_cells(file: Path, entry: Format) -> Cells:
     """
     with reading(file) as stream:
         heading, separator, names, at = _header(file, entry, stream)
-        used = [str(k) for k in at.values()]
+        column_numbers = [str(k) for k in at.values()]
         table = csv.read_csv(
             stream,
             csv.ReadOptions(column_names=[str(k) for k in range(len(names))], use_threads=False),
             csv.ParseOptions(delimiter=separator),
-            csv.ConvertOptions(include_columns=used, column_types=dict.fromkeys(used, pyarrow.string())),
+            csv.ConvertOptions(
+                include_columns=column_numbers, column_types=dict.fromkeys(column_numbers, pyarrow.string())
+            ),
         )
     columns: dict[str, Any] = {}
     cells = Cells(file, {quantity: names[k] for quantity, k in at.items()}, heading, None)
-    for quantity, name in zip(at, used, strict=True):
+    for quantity, name in zip(at, column_numbers, strict=True):
         column = table.column(name)
         if quantity in entry.texts:
             columns[quantity] = compute.utf8_trim_whitespace(column).to_pandas()
@@ -92,7 +94,7 @@ def read_cells(file: Path, entry: Format) -> Cells:
 
 def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str, Sequence[str], dict[str, int]]:
     missing = list(entry.columns.values())
-    for number in range(1, HEAD + 1):
+    for number in range(1, HEADER_LINES + 1):
         line = stream.readline(LONGEST_HEAD).decode("utf-8-sig")
         for separator in ",;\t":
             names = [cell.strip().strip('"') for cell in line.split(separator)]
@@ -107,7 +109,7 @@ def _header(file: Path, entry: Format, stream: BufferedReader) -> tuple[int, str
 def _match(file: Path, entry: Format, names: Sequence[str]) -> tuple[dict[str, int], list[str]]:
     at, missing, twice = dict[str, int](), list[str](), list[str]()
     for quantity, column in entry.columns.items():
-        pattern = re.escape(column.lower()).replace(re.escape(NUMBER), "([1-9][0-9]*)")
+        pattern = re.escape(column.lower()).replace(re.escape(VEHICLE_PLACEHOLDER), "([1-9][0-9]*)")
         matches = [re.fullmatch(pattern, OTHER_NAMES.get(name.lower(), name.lower())) for name in names]
         for k, match in enumerate(matches):
             key = "".join([quantity, *match.groups()]) if match else ""

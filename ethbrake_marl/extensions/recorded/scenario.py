@@ -30,10 +30,10 @@ with naming_extras():
     from ethbrake_marl.extensions.recorded.states import read_recording
 
 MOST_NUMBERS = 100_000  # of a scenario's table: every copy of the scenario contains it
-LISTED = 10  # largest number of skipped files that a note names
+MOST_LISTED = 10  # largest number of skipped files that a note names
 
 
-class Rows(NamedTuple):
+class ChainRows(NamedTuple):
     numbers: Floats  # [k, 2 N - 1] gaps (m) and speeds (m/s) of each row
     of: list[tuple[str, str]]  # recording and vehicles of each row
     seen: int  # number of chains in the recordings; there can be fewer rows
@@ -54,8 +54,10 @@ class Rows(NamedTuple):
         ]
         parts += [f"left out: {number:,} {what}" for what, number in sorted(self.left_out.items()) if number]
         if self.skipped:
-            more = f" and {len(self.skipped) - LISTED:,} more" if len(self.skipped) > LISTED else ""
-            parts.append(f"skipped, because they are no recordings or copies: {', '.join(self.skipped[:LISTED])}{more}")
+            more = f" and {len(self.skipped) - MOST_LISTED:,} more" if len(self.skipped) > MOST_LISTED else ""
+            parts.append(
+                f"skipped, because they are no recordings or copies: {', '.join(self.skipped[:MOST_LISTED])}{more}"
+            )
         return parts + [f"refused: {count_of(len(self.refused), 'file')}"] * bool(self.refused)
 
 
@@ -103,11 +105,11 @@ def scenario_from_data(
         raise InvalidInput(
             f"based_on = {based_on!r}: the scenario must not be a mixture, and must not draw worlds from a table"
         )
-    rows = read_rows(folder, entry, every_s, base.vehicles, progress)
+    rows = read_chains(folder, entry, every_s, base.vehicles, progress)
     rules = QUANTITIES["gaps_m"], QUANTITIES["speeds_mps"]
     headings = [rule.column_of(i) for rule in rules for i in range(rule.count(base.vehicles))] + [RECORDING]
     table = [[*row, ": ".join(of)] for row, of in zip(rows.numbers.tolist(), rows.of, strict=True)]
-    found = rows.found(base.vehicles, every_s)
+    findings = rows.found(base.vehicles, every_s)
     fastest_mps = float(rows.numbers[:, base.vehicles - 1 :].max())
     at_rest_s = np.max(base.bounds("latency_s")) + fastest_mps / np.min(base.bounds("braking_capacity_mps2"))
     replaced = ("gaps_m", "speeds_mps", "time_gaps_s", "line_speed_mps", "speed_deviations_mps")
@@ -117,7 +119,7 @@ def scenario_from_data(
         "description": f"Speeds and gaps of {rows.recordings} of {entry.title}. Brakes, masses and latencies were not"
         f" recorded; they are as in {base.name}.",
         "source": f"{entry.title}, recorded in {entry.units}, folder {plain_text(folder.resolve().name)}."
-        f" {'; '.join(found)}. {entry.licence}",
+        f" {'; '.join(findings)}. {entry.licence}",
         "horizon_s": max(base.horizon_s, math.ceil(at_rest_s) + 1.0),
         "table": {"columns": headings, "rows": table},
     }
@@ -127,48 +129,53 @@ def scenario_from_data(
     content["table"] = {"file": f"{name}.csv", "columns": headings}
     text = "".join(f"{key}: {flow_text(content[key])}\n" for key in Scenario.model_fields if key in content)
     lines = csv_text(dict(zip(headings, row, strict=True)) for row in table)
-    return FromData(text, lines, found, rows.refused, rows.skipped)
+    return FromData(text, lines, findings, rows.refused, rows.skipped)
 
 
-def read_rows(
+def read_chains(
     folder: Path, entry: Format, every_s: float, vehicles: int, progress: Callable[[str, int, int], None]
-) -> Rows:
+) -> ChainRows:
     """Read the chains of vehicles in all recordings of a folder and its subfolders, or in one file.
 
     A file with an error is refused completely. A file with the same content as another one is skipped. Raises
     ``InvalidInput`` if there is no recording of this format, or no row.
     """
     longest, left_out, refused, skipped = 0, Counter[str](), list[str](), list[str]()
-    numbers, of, seen, others = [np.empty((0, 2 * vehicles - 1))], list[tuple[str, str]](), set[bytes](), list[str]()
+    numbers, of, digests, format_errors = (
+        [np.empty((0, 2 * vehicles - 1))],
+        list[tuple[str, str]](),
+        set[bytes](),
+        list[str](),
+    )
     files = files_of(folder, entry, refused)
     if not files and not refused:
         patterns = " or ".join(entry.files)
         raise InvalidInput(f"{folder}: must be a folder with files of {entry.title}; their names match {patterns}")
-    for k, (shown, file) in enumerate(files.items()):
+    for k, (printable_name, file) in enumerate(files.items()):
         if k > 0:
             progress("files", k, len(files))
         try:
             with open_plain(file, LARGEST_BYTES) as stream:
                 content = hashlib.file_digest(stream, "sha256").digest()
-            if content in seen:
-                skipped.append(shown)
+            if content in digests:
+                skipped.append(printable_name)
                 continue
-            seen.add(content)
+            digests.add(content)
             chains = cut_chains(read_recording(file, entry, every_s), vehicles)
         except NotARecording as error:
-            others.append(str(error))
-            skipped.append(shown)
+            format_errors.append(str(error))
+            skipped.append(printable_name)
         except InvalidInput as error:
             refused.append(str(error))
         else:
             numbers.append(chains.numbers)
-            of += [(shown, each) for each in chains.vehicles]
+            of += [(printable_name, chain) for chain in chains.vehicles]
             left_out.update(chains.left_out)
             longest = max(longest, chains.longest)
     if refused and not of:
         raise InvalidInput(f"{folder}: {count_of(len(refused), 'file')} refused: {'; '.join(refused)}")
-    if len(others) == len(files):
-        raise InvalidInput(f"{folder}: contains no recording of {entry.title}: {'; '.join(others)}")
+    if len(format_errors) == len(files):
+        raise InvalidInput(f"{folder}: contains no recording of {entry.title}: {'; '.join(format_errors)}")
     if not of:
         raise InvalidInput(
             f"{folder}: the moments that were read contain no lane in which {vehicles} vehicles follow each other; the"
@@ -182,7 +189,7 @@ def read_rows(
     thinned = f"chains: a table has at most {MOST_NUMBERS:,} numbers, so one in {each_of} is used"
     left_out[thinned] = len(of) - len(chosen)
     rows = np.array([[round(number, 3) + 0.0 for number in row] for row in np.concatenate(numbers)[chosen].tolist()])
-    return Rows(rows, [of[k] for k in chosen], len(of), left_out, refused, skipped)
+    return ChainRows(rows, [of[k] for k in chosen], len(of), left_out, refused, skipped)
 
 
 def files_of(folder: Path, entry: Format, refused: list[str]) -> dict[str, Path]:

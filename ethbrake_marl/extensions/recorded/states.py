@@ -161,10 +161,10 @@ def _check(states: Any, cells: Cells, entry: Format) -> None:
 def _check_positions(recording: Recording, every_s: float) -> None:
     cells, entry, now = recording.cells, recording.entry, recording.states
     then = now[["moment", "vehicle", "lane", "front", "side", "speed"]].assign(moment=now["moment"] + 1.0)
-    both = now.merge(then, on=["moment", "vehicle", "lane"], suffixes=("", "_then"))
-    along = (both["front"] - both["front_then"]) * both["dx"] + (both["side"] - both["side_then"]) * both["dy"]
-    said = (both["speed"] + both["speed_then"]) / 2.0 * every_s
-    lanes = both.assign(said2=said * said, product=along * said, said=said).groupby("lane")
+    pairs = now.merge(then, on=["moment", "vehicle", "lane"], suffixes=("", "_then"))
+    along = (pairs["front"] - pairs["front_then"]) * pairs["dx"] + (pairs["side"] - pairs["side_then"]) * pairs["dy"]
+    said = (pairs["speed"] + pairs["speed_then"]) / 2.0 * every_s
+    lanes = pairs.assign(said2=said * said, product=along * said, said=said).groupby("lane")
     for lane, said2, product, way in lanes[["said2", "product", "said"]].sum().itertuples():
         if said2 >= LEAST_M2 and not (SLOPE[0] < product / said2 < SLOPE[1] and way > 0.0):
             raise InvalidInput(

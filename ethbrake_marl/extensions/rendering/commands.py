@@ -37,7 +37,7 @@ def watch_command(
     """
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.extensions.rendering.film import check_film, film
-    from ethbrake_marl.names import check_learners, open_game, teams_of
+    from ethbrake_marl.names import open_game, require_learner, teams_of
 
     with Out(force=force) as out:
         out.check(output)
@@ -45,7 +45,7 @@ def watch_command(
         what = "pictures" if output.suffix.lower() == ".png" else "film"
         chosen = read_settings(settings, of_command=("harm_count",))
         loaded, game = open_game(chosen.change_scenario(scenario))
-        check_learners(loaded)
+        require_learner(loaded)
         teams = teams_of(agents, loaded, harm_count=chosen.command.get("harm_count", "first"))
         titled = {f"{name}: world {world} of {loaded.name}": team for name, team in teams.items()}
         alert = loaded.sample(1, seed, first=world)

@@ -19,7 +19,7 @@ from ethbrake_marl.extensions.rendering.scene import Motion, Scene
 from ethbrake_marl.motion.layout import TOTAL
 
 FPS = 25  # scenes per second; a divisor of 100, because a GIF stores times in hundredths of a second
-COLOURS = 64
+GIF_COLOURS = 64
 ROAD = 160  # height (pixels) of title, gaps and road, the upper part of a picture
 
 
@@ -57,20 +57,20 @@ def check_film(ending: str) -> None:
 Films = Mapping[str, Sequence[Scene]]  # title -> scenes, of one world
 
 
-def stacked(films: Films) -> Iterator[Frame]:
+def stack_films(films: Films) -> Iterator[Frame]:
     for k in range(max(map(len, films.values()))):
-        each = (scenes[min(k, len(scenes) - 1)]._replace(title=title) for title, scenes in films.items())
-        yield np.concatenate([picture(scene) for scene in each])
+        frame_scenes = (scenes[min(k, len(scenes) - 1)]._replace(title=title) for title, scenes in films.items())
+        yield np.concatenate([picture(scene) for scene in frame_scenes])
 
 
 def write_gif(films: Films) -> bytes:
     from PIL import Image
 
-    first, *others = (
-        Image.fromarray(frame).quantize(COLOURS, method=Image.Quantize.FASTOCTREE) for frame in stacked(films)
+    first_frame, *later_frames = (
+        Image.fromarray(frame).quantize(GIF_COLOURS, method=Image.Quantize.FASTOCTREE) for frame in stack_films(films)
     )
     buffer = io.BytesIO()
-    first.save(buffer, "GIF", save_all=True, append_images=others, duration=1000 // FPS, loop=0)
+    first_frame.save(buffer, "GIF", save_all=True, append_images=later_frames, duration=1000 // FPS, loop=0)
     return buffer.getvalue()
 
 
@@ -81,7 +81,7 @@ def write_mp4(films: Films) -> bytes:
         path = Path(folder) / "film.mp4"
         writer = write_frames(str(path), (WIDTH, HEIGHT * len(films)), fps=FPS, quality=8)
         next(writer)
-        for frame in stacked(films):
+        for frame in stack_films(films):
             writer.send(frame)
         writer.close()
         return path.read_bytes()
@@ -99,7 +99,7 @@ def write_png(films: Films) -> bytes:
         for scene in (scenes[min(k, len(scenes) - 1)] for k in sorted({0, hardest, last})):
             rows.append(picture(scene._replace(title=f"{title}, harm {scene.line[TOTAL, :-1].sum():.1f} m2/s2"))[:ROAD])
     buffer = io.BytesIO()
-    Image.fromarray(np.concatenate(rows)).quantize(COLOURS).save(buffer, "PNG", optimize=True)
+    Image.fromarray(np.concatenate(rows)).quantize(GIF_COLOURS).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 
 

@@ -30,11 +30,11 @@ PAPER, INK, GREY, PALE = "#ffffff", "#1a1a1a", "#6b6b6b", "#eeeeee"
 ASPHALT, DASH, GLASS = "#4a4d52", "#e8e8e8", "#dfefff"
 BRAKE, DRIVE, FLASH, LIGHT = "#c1121f", "#2a7f3f", "#ffd60a", "#ff2b2b"
 # Palette of Okabe and Ito for colour-blind readers, without its yellow, which is hard to see on white.
-COLOURS = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+PALETTE = ("#000000", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 
 def vehicle_colour(body: int) -> str:
-    return COLOURS[body % len(COLOURS)]
+    return PALETTE[body % len(PALETTE)]
 
 
 @cache
@@ -42,13 +42,13 @@ def font(size: int) -> Any:
     return ImageFont.load_default(size * FINE)
 
 
-def width_of(words: str, size: int) -> float:
+def text_width(words: str, size: int) -> float:
     return float(font(size).getlength(words)) / FINE
 
 
 def fitting(choices: Sequence[str], width: float, size: int) -> str:
     """First text that is at most ``width`` pixels wide, or else the last one."""
-    return next((words for words in choices if width_of(words, size) <= width), choices[-1])
+    return next((words for words in choices if text_width(words, size) <= width), choices[-1])
 
 
 class Pen:
@@ -97,7 +97,7 @@ def picture(scene: Scene) -> Frame:
     show_impacts(pen)
     title = plain_text(scene.title)[:200]
     cut = [title, *(f"{title[:k]}..." for k in range(len(title), -1, -1))]
-    pen.write(MARGIN, 10, fitting(cut, WIDTH - 3 * MARGIN - width_of(scene.clock, 18), 15), GREY, 15)
+    pen.write(MARGIN, 10, fitting(cut, WIDTH - 3 * MARGIN - text_width(scene.clock, 18), 15), GREY, 15)
     pen.write(WIDTH - MARGIN, 8, scene.clock, INK, 18, "ra")
     pen.write(MARGIN, HEIGHT - 22, scene.harm, INK, 15)
     return pen.frame()
@@ -164,7 +164,7 @@ def write_gaps(pen: Pen) -> None:
             pen.line(x, ROAD_TOP - 10, x, ROAD_TOP - 2, GREY)
         pen.line(left, ROAD_TOP - 6, right, ROAD_TOP - 6, GREY)
         words = f"{pen.scene.line[GAP, pair]:.1f} m"
-        middle, half = (left + right) / 2, width_of(words, 14) / 2 + 3
+        middle, half = (left + right) / 2, text_width(words, 14) / 2 + 3
         high = middle + half > free
         colour = BRAKE if pen.scene.line[HIT, pair] else INK
         pen.write(middle, ROAD_TOP - (27 if high else 13), words, colour, 14, "ms")
@@ -186,7 +186,7 @@ def show_impacts(pen: Pen) -> None:
     hardest = sorted(pen.scene.impacts, key=lambda impact: -impact.closing_mps)[:2]
     if hardest:
         words = "impact of " + ", ".join(str(impact) for impact in hardest)
-        half = width_of(words, 15) / 2
+        half = text_width(words, 15) / 2
         middle = sum(x(impact) for impact in hardest) / len(hardest)
         middle = min(max(middle, MARGIN + half), WIDTH - MARGIN - half)
         pen.box(middle - half - 5, 34, middle + half + 5, 54, FLASH)

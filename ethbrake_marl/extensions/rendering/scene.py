@@ -27,11 +27,11 @@ from ethbrake_marl.motion.layout import (
 
 BODY_M = 4.5  # drawn length of a vehicle (m); in the physics, vehicles have no length
 FLASH_S = 0.3  # time for which an impact is shown (s)
-POST_M = 1e6  # place of a post far ahead, from which the way of Vehicle 1 is measured (m)
+SCENE_POST_M = 1e6  # place of a post far ahead, from which the way of Vehicle 1 is measured (m)
 BEHIND_M, AHEAD_M = 3.0, 5.0  # free road behind and ahead of the line (m)
 LEAST_WIDTH_M = 40.0  # shortest road that is shown (m)
 LATE_S = 3.0  # longest latency that counts for the length of road (s)
-COLUMNS = 100  # width of the road in characters
+ROAD_COLUMNS = 100  # width of the road in characters
 
 
 class Impact(NamedTuple):
@@ -109,9 +109,9 @@ class Scene(NamedTuple):
         left, right = self.shown_m
 
         def column(place_m: float) -> int:
-            return min(max(int((place_m - left) / (right - left) * COLUMNS), 0), COLUMNS - 1)
+            return min(max(int((place_m - left) / (right - left) * ROAD_COLUMNS), 0), ROAD_COLUMNS - 1)
 
-        road, lines, fronts = ["."] * COLUMNS, [], self.fronts_m
+        road, lines, fronts = ["."] * ROAD_COLUMNS, [], self.fronts_m
         for body in range(len(fronts), 0, -1):
             first, last = column(fronts[body - 1] - BODY_M), column(fronts[body - 1])
             road[first : last + 1] = f"[{body}>".center(last + 1 - first, "=")[: last + 1 - first]
@@ -146,7 +146,7 @@ class Motion:
     def at(self, time_s: float) -> tuple[Floats, float, tuple[Impact, ...]]:
         """Line, place of Vehicle 1 and recent impacts at a time of this motion (s after the alert)."""
         line = self.line.copy()
-        line[GAP, 0] = ahead_m = min(line[GAP, 0], POST_M)
+        line[GAP, 0] = ahead_m = min(line[GAP, 0], SCENE_POST_M)
         counts, scratch = line[IMPACTS].copy(), scratch_for(len(self.wanted))
         times = np.array([self.start_s]), np.array([time_s])
         if time_s > self.start_s:
@@ -157,7 +157,7 @@ class Motion:
         ]
         recent = tuple(impact for impact in (*self.impacts, *new) if impact.time_s > time_s - FLASH_S)
         front_m = self.front_m + float(ahead_m - line[GAP, 0])
-        if ahead_m == POST_M:
+        if ahead_m == SCENE_POST_M:
             line[GAP, 0] = self.line[GAP, 0]
         return line, front_m, recent
 

@@ -41,8 +41,8 @@ class Viewer:
 
     def render(self) -> Any:
         motions = map(self.motion, range(len(self.motions) or 1))
-        shown = [self.show(motion.scene(motion.until_s)) for motion in motions]
-        return shown if self.many else shown[0]
+        views = [self.show(motion.scene(motion.until_s)) for motion in motions]
+        return views if self.many else views[0]
 
     def show(self, scene: Scene) -> Any:
         from ethbrake_marl.extensions.rendering.picture import picture

@@ -12,9 +12,9 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.motion.layout import Bools, Floats
 
-MEASURES = ("limits", "avoidable", "proven_harm")  # names for ``evaluate(measures=...)``
+REPORT_MEASURES = ("limits", "avoidable", "proven_harm")  # names for ``evaluate(measures=...)``
 BEST = {count: f"best_known_{count}" for count in COLUMN}  # count -> column; not all lists have the honest cost
-AVOIDABLE = "avoidable"  # whether contact is proven avoidable; where it is false, proven unavoidable
+AVOIDABLE_COLUMN = "avoidable"  # whether contact is proven avoidable; where it is false, proven unavoidable
 UNAVOIDABLE = "proven_harm_impact"  # whether it is proven that no command avoids an impact
 
 
@@ -27,7 +27,9 @@ class BestKnown(NamedTuple):
     def of(cls, result: Result) -> BestKnown | None:
         columns: Mapping[str, Any] = next(iter(result.columns.values()))
         harm = {count: columns[name] for count, name in BEST.items() if name in columns}
-        return cls(harm, columns.get(AVOIDABLE), columns.get(UNAVOIDABLE)) if HARM.keys() <= harm.keys() else None
+        return (
+            cls(harm, columns.get(AVOIDABLE_COLUMN), columns.get(UNAVOIDABLE)) if HARM.keys() <= harm.keys() else None
+        )
 
     @property
     def in_words(self) -> str:
@@ -48,5 +50,7 @@ class BestKnown(NamedTuple):
 
 def shown_counts(compared: Compared) -> dict[str, str]:
     """Counts to show, count -> column: both harms, and what agents minimise if its best is known, too."""
-    known, minimised = BestKnown.of(compared.result), compared.harm_count
-    return HARM if known is not None and minimised not in known.harm else {**HARM, minimised: COLUMN[minimised]}
+    best_known, minimised = BestKnown.of(compared.result), compared.harm_count
+    return (
+        HARM if best_known is not None and minimised not in best_known.harm else {**HARM, minimised: COLUMN[minimised]}
+    )

@@ -17,14 +17,14 @@ from ethbrake_marl.evaluation.record import EpisodeRecord, record_episodes
 from ethbrake_marl.evaluation.summary import BASELINE
 from ethbrake_marl.extensions.rendering.scene import BODY_M
 from ethbrake_marl.extensions.report.best_known import BestKnown
-from ethbrake_marl.extensions.report.page import Section, data, fill, part, shown
+from ethbrake_marl.extensions.report.page import Section, data, fill, page_part, printable_text
 from ethbrake_marl.extensions.report.style import quantities
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.names import open_game
 
 DATA = "episode_data"  # id of the data in a page; no section has it
-SAMPLE_S = 0.005  # time between two samples of the motion
-SAME = 1e-8  # a sample is left out if the one before it, continued, is this close to it (m, m/s, m/s2)
+MOTION_SAMPLE_S = 0.005  # time between two samples of the motion
+SAME_SAMPLE = 1e-8  # a sample is left out if the one before it, continued, is this close to it (m, m/s, m/s2)
 MOST_SHOWN = 3  # agents that are shown at the start
 
 
@@ -34,7 +34,7 @@ def player(
     """Player of some worlds. It shows ``focus``, the agent that the page is about, and the last agent first.
 
     ``kinds``: row of a world -> heading of its group. ``records``: agent -> episode in each of these worlds, with
-    samples ``SAMPLE_S`` apart.
+    samples ``MOTION_SAMPLE_S`` apart.
     """
     result, agents, worlds = compared.result, list(records), list[dict[str, Any]]()
     for (row, kind), *episodes in zip(kinds.items(), *records.values(), strict=True):
@@ -42,8 +42,8 @@ def player(
         worlds.append(
             {
                 "number": int(result.worlds["world"][row]),
-                "kind": shown(kind),
-                "why": shown(f"{focus}: harm {first:.2f} first-impact, {total:.2f} total"),
+                "kind": printable_text(kind),
+                "why": printable_text(f"{focus}: harm {first:.2f} first-impact, {total:.2f} total"),
                 "conditions": quantities(episodes[0].initial),
                 "episodes": [episode_data(record) for record in episodes],
             }
@@ -51,7 +51,7 @@ def player(
     order = dict.fromkeys([agents.index(focus), 0, *reversed(range(len(agents)))])
     content = {
         "vehicles": compared.scenario.vehicles,
-        "agents": [shown(agent) for agent in agents],
+        "agents": [printable_text(agent) for agent in agents],
         "shown": sorted([*order][:MOST_SHOWN]),
         "worlds": worlds,
     }
@@ -94,14 +94,14 @@ def pieces_of(record: EpisodeRecord) -> Floats:
     for k in np.unique(struck).tolist():
         rates[k] = rates[k - 1] if k else 0.0
     rows = np.column_stack([time_s, record.positions_m[:, 0], record.gaps_m, speeds, rates])
-    goes_on = (np.abs(moved(rows[:-1], np.diff(time_s), N) - rows[1:, 1:]) <= SAME).all(axis=1)
+    goes_on = (np.abs(extrapolate(rows[:-1], np.diff(time_s), N) - rows[1:, 1:]) <= SAME_SAMPLE).all(axis=1)
     later = rows[struck + 1]
-    begun = np.column_stack([struck_s, moved(later, struck_s - later[:, 0], N)])
+    begun = np.column_stack([struck_s, extrapolate(later, struck_s - later[:, 0], N)])
     pieces: Floats = np.concatenate([rows[np.append(True, ~goes_on)], begun])
     return pieces[np.argsort(pieces[:, 0], kind="stable")]
 
 
-def moved(pieces: Floats, t: Floats, N: int) -> Floats:
+def extrapolate(pieces: Floats, t: Floats, N: int) -> Floats:
     """Pieces of motion of N vehicles (``pieces_of``), without times, ``t`` [k] seconds after they begin."""
     speeds, rates, t = pieces[:, 1 + N : 1 + 2 * N], pieces[:, 1 + 2 * N :], t[:, np.newaxis]
     ways = (speeds + 0.5 * rates * t) * t
@@ -130,28 +130,28 @@ def _impacts(record: EpisodeRecord) -> list[list[float]]:
 
 
 MOST_WORLDS = 50
-WORST = 10
-EACH = 5  # worlds of every kind except the worst and the random ones
+WORST_WORLDS = 10
+WORLDS_PER_KIND = 5  # worlds of every kind except the worst and the random ones
 TYPICAL = (0.5, 0.6, 0.7, 0.8, 0.9)  # quantiles of the harm
 
 
 def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
     """Choose at most ``MOST_WORLDS`` worlds in which to show the agent ``focus``; return row -> why it is shown."""
     result, column = compared.result, COLUMN[compared.harm_count]
-    cost, known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
+    cost, best_known, chosen = result[focus][column], BestKnown.of(result), dict[int, str]()
 
-    def add(kind: str, rows: Iterable[int] | Ints, most: int = EACH) -> None:
+    def add(kind: str, rows: Iterable[int] | Ints, most: int = WORLDS_PER_KIND) -> None:
         fresh = [int(row) for row in rows if int(row) not in chosen]
         chosen.update(dict.fromkeys(fresh[: min(most, MOST_WORLDS - len(chosen))], kind))
 
-    add(f"Where {focus} did worst", worst_rows(compared, focus), WORST)
-    if known is not None and known.avoidable is not None:
-        avoidable = result[focus]["collided"] & known.avoidable
-        add(f"Avoidable, and {focus} collided", largest(cost, avoidable))
+    add(f"Where {focus} did worst", worst_rows(compared, focus), WORST_WORLDS)
+    if best_known is not None and best_known.avoidable is not None:
+        avoidable = result[focus]["collided"] & best_known.avoidable
+        add(f"Avoidable, and {focus} collided", rows_by_value(cost, avoidable))
     if BASELINE in result.columns and focus != BASELINE:
         saved = result[BASELINE][column] - cost
-        add(f"Where {focus} saved most against {BASELINE}", largest(saved, saved > 0.0))
-        add(f"Where {focus} did worse than {BASELINE}", largest(-saved, saved < 0.0))
+        add(f"Where {focus} saved most against {BASELINE}", rows_by_value(saved, saved > 0.0))
+        add(f"Where {focus} did worse than {BASELINE}", rows_by_value(-saved, saved < 0.0))
     order = np.argsort(cost, kind="stable")
     add(f"Typical of {focus}", [order[int(q * (result.n - 1))] for q in TYPICAL])
     add("Drawn at random", np.random.default_rng(0).permutation(result.n), MOST_WORLDS)
@@ -160,13 +160,13 @@ def shown_worlds(compared: Compared, focus: str) -> dict[int, str]:
 
 def worst_rows(compared: Compared, focus: str) -> Ints:
     """At most ten rows in which ``focus`` did worst, by what agents minimise, minus the best known if any."""
-    result, count, known = compared.result, compared.harm_count, BestKnown.of(compared.result)
-    best = 0.0 if known is None else known.harm.get(count, 0.0)
+    result, count, best_known = compared.result, compared.harm_count, BestKnown.of(compared.result)
+    best = 0.0 if best_known is None else best_known.harm.get(count, 0.0)
     value = result[focus][COLUMN[count]] - best
-    return largest(value, value > 0.0)[:WORST]
+    return rows_by_value(value, value > 0.0)[:WORST_WORLDS]
 
 
-def largest(value: Floats, among: Bools) -> Ints:
+def rows_by_value(value: Floats, among: Bools) -> Ints:
     order: Ints = np.argsort(-value, kind="stable")
     return order[among[order]]
 
@@ -178,7 +178,7 @@ def episodes_section(compared: Compared, focus: str, kinds: dict[int, str]) -> S
     in the evaluation.
     """
     rows, worlds, (_, game) = [*kinds], compared.worlds(kinds), open_game(compared.scenario)
-    records = {agent: record_episodes(worlds, team, game, SAMPLE_S) for agent, team in compared.teams.items()}
+    records = {agent: record_episodes(worlds, team, game, MOTION_SAMPLE_S) for agent, team in compared.teams.items()}
     moving = sum(not all(record.at_rest for record in world) for world in zip(*records.values(), strict=True))
     until = "from the alert until all vehicles are at rest"
     if moving:
@@ -188,10 +188,12 @@ def episodes_section(compared: Compared, focus: str, kinds: dict[int, str]) -> S
         )
     n = compared.result.n
     body: list[str] = [f"{f'{len(rows)} of the {n:,}' if len(rows) < n else f'All {n}'} worlds, {until}."]
-    for agent, own in records.items():
-        again = np.array([[record.last.harm(count)[0] for count in HARM] for record in own])
-        before = np.column_stack([compared.result[agent][harm][rows] for harm in HARM.values()])
-        if other := int((again != before).any(axis=1).sum()):
-            text = f"In {count_of(other, 'world')} of these, {agent} drove differently the second time: the player"
-            body.append(part("paragraph", f"{text} shows another episode than the tables.", "note"))
+    for agent, episodes in records.items():
+        repeated_harm = np.array([[record.last.harm(count)[0] for count in HARM] for record in episodes])
+        evaluated_harm = np.column_stack([compared.result[agent][harm][rows] for harm in HARM.values()])
+        if changed_count := int((repeated_harm != evaluated_harm).any(axis=1).sum()):
+            text = (
+                f"In {count_of(changed_count, 'world')} of these, {agent} drove differently the second time: the player"
+            )
+            body.append(page_part("paragraph", f"{text} shows another episode than the tables.", "note"))
     return Section("Episodes", [*body, player(compared, focus, kinds, records)])

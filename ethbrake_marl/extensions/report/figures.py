@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, FuncFormatter, MaxNLocator, PercentFormatter
 
 from ethbrake_marl.agents.e_v2x_bm import coupled
-from ethbrake_marl.agents.pairwise import pairwise, predicted_harm
+from ethbrake_marl.agents.pairwise import harm_of_deceleration, pairwise
 from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import NUMBER, State
@@ -22,7 +22,7 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.evaluate import Result
 from ethbrake_marl.evaluation.record import EpisodeRecord
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.rendering.picture import COLOURS, Frame, picture, vehicle_colour
+from ethbrake_marl.extensions.rendering.picture import PALETTE, Frame, picture, vehicle_colour
 from ethbrake_marl.extensions.rendering.scene import AHEAD_M, Scene
 from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.style import (
@@ -35,7 +35,7 @@ from ethbrake_marl.extensions.report.style import (
     label_text,
     new_figure,
     new_panels,
-    plain,
+    plain_number,
     quantities,
     series_style,
     write_picture,
@@ -47,14 +47,14 @@ from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.describe import quantities_of
 from ethbrake_marl.worlds.game import AnyScenario
 from ethbrake_marl.worlds.quantities import QUANTITIES, Rule
-from ethbrake_marl.worlds.sampling import Drawn
+from ethbrake_marl.worlds.sampling import DrawnWorlds
 from ethbrake_marl.worlds.scenario import Scenario
 
 LONG = 30  # characters of a label that make a legend narrow
-Curve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
+EstimateCurve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
 
 
-def over_seeds(trainings: Sequence[Mapping[Any, float]]) -> Curve:
+def mean_over_seeds(trainings: Sequence[Mapping[Any, float]]) -> EstimateCurve:
     """Mean of several training runs, plus and minus one standard deviation over the seeds.
 
     ``trainings``: for each run, step or progress -> value. The curve has the steps that all runs have.
@@ -69,7 +69,7 @@ def over_seeds(trainings: Sequence[Mapping[Any, float]]) -> Curve:
 
 @in_our_style
 def curves_figure(
-    panels: Mapping[str, Mapping[str, Curve]],
+    panels: Mapping[str, Mapping[str, EstimateCurve]],
     x_label: str,
     caption: str,
     *,
@@ -81,13 +81,13 @@ def curves_figure(
     ``panels``: title -> label of a curve -> curve; the first panel must have all labels, for the legend. ``lines``:
     value of a horizontal line, title -> label -> value. ``y_label``: shared by all panels; "": each has its own.
     """
-    figure, every = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
+    figure, all_axes = new_panels((5.0 * len(panels), 4.2), columns=len(panels), sharey=bool(y_label))
     labels = [*dict.fromkeys(label for curves in panels.values() for label in curves)]
-    for axes, (title, curves) in zip(every, panels.items(), strict=True):
+    for axes, (title, curves) in zip(all_axes, panels.items(), strict=True):
         for label, curve in curves.items():
             style, x = series_style(labels.index(label)), list(curve)
-            axes.plot(x, [each.value for each in curve.values()], label=label_text(label), **style)
-            low, high = zip(*(each.ends for each in curve.values()), strict=True)
+            axes.plot(x, [estimate.value for estimate in curve.values()], label=label_text(label), **style)
+            low, high = zip(*(estimate.ends for estimate in curve.values()), strict=True)
             band(axes, x, low, high, style)
         for number, (label, value) in enumerate((lines or {}).get(title, {}).items(), len(labels)):
             style = series_style(number) | {"marker": ""}
@@ -95,12 +95,12 @@ def curves_figure(
         axes.set(title=title, xlabel=x_label)
         if axes.dataLim.xmax >= 1000.0:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    for axes in every:  # after all curves are drawn
+    for axes in all_axes:  # after all curves are drawn
         if axes.dataLim.ymin >= 0.0:
             axes.set_ylim(bottom=0.0)
-    every[0].set_ylabel(y_label)
+    all_axes[0].set_ylabel(y_label)
     narrow = len(panels) == 1 or max(map(len, labels), default=0) > LONG
-    return finish(figure, caption, every[0], columns=3 if narrow else 5)
+    return finish(figure, caption, all_axes[0], columns=3 if narrow else 5)
 
 
 SLIM_IN = 3.8  # a figure of this width can be read on a phone without scrolling
@@ -109,23 +109,23 @@ BINS = 12  # groups of worlds with similar gaps
 
 
 @in_our_style
-def harm_by_agent(compared: Compared, others: Mapping[str, Compared]) -> Figure:
+def harm_by_agent(compared: Compared, tests: Mapping[str, Compared]) -> Figure:
     """Draw the mean harm of each agent as a bar with its 95 % interval.
 
     A vertical line shows the mean best known harm. Marks show the agents' means in other tests, title -> results.
     """
-    count, result, known = compared.harm_count, compared.result, BestKnown.of(compared.result)
+    count, result, best_known = compared.harm_count, compared.result, BestKnown.of(compared.result)
     agents = list(result.columns)
     figure, (axes,) = new_panels((SLIM_IN, 0.9 + 0.24 * len(agents)))
     for k, agent in enumerate(agents):
         harm = mean(result[agent][COLUMN[count]], result.clusters)
-        axes.barh(k, harm.value, height=0.62, color=COLOURS[2])
-        axes.hlines(k, *harm.ends, color=COLOURS[0], linewidth=1.6)
-    if known is not None and count in known.harm:
-        best = float(known.harm[count].mean())
-        axes.axvline(best, color=COLOURS[3], linewidth=1.6, linestyle="--", label="best known")
-    for number, (title, other) in enumerate(others.items(), 4):
-        means = {agent: own[COLUMN[count]].mean() for agent, own in other.result.columns.items()}
+        axes.barh(k, harm.value, height=0.62, color=PALETTE[2])
+        axes.hlines(k, *harm.ends, color=PALETTE[0], linewidth=1.6)
+    if best_known is not None and count in best_known.harm:
+        best = float(best_known.harm[count].mean())
+        axes.axvline(best, color=PALETTE[3], linewidth=1.6, linestyle="--", label="best known")
+    for number, (title, comparison) in enumerate(tests.items(), 4):
+        means = {agent: columns[COLUMN[count]].mean() for agent, columns in comparison.result.columns.items()}
         places = [k for k, agent in enumerate(agents) if agent in means]
         style = series_style(number) | {"linestyle": "none", "markersize": 6.0}
         axes.plot([means[agents[k]] for k in places], places, label=label_text(title.lower(), 22), **style)
@@ -141,18 +141,18 @@ def harm_by_agent(compared: Compared, others: Mapping[str, Compared]) -> Figure:
 @in_our_style
 def harm_above(compared: Compared) -> Figure:
     """Draw, for every x, the share of worlds in which an agent's regret (or harm, if no best is known) is above x."""
-    result, known, counts = compared.result, BestKnown.of(compared.result), shown_counts(compared)
+    result, best_known, counts = compared.result, BestKnown.of(compared.result), shown_counts(compared)
     figure, panels = new_panels((10.0, 3.8), columns=len(counts), sharey=True)
     for axes, (count, harm) in zip(panels, counts.items(), strict=True):
         for number, agent in enumerate(result.columns):
-            ordered = np.sort(result[agent][harm] if known is None else known.regret(result, agent, count))
+            ordered = np.sort(result[agent][harm] if best_known is None else best_known.regret(result, agent, count))
             chosen = np.linspace(0, len(ordered) - 1, min(POINTS, len(ordered))).astype(np.int64)
             at = np.append(0.0, ordered[chosen])
             share = 1.0 - np.searchsorted(ordered, at, "right") / len(ordered)
             axes.plot(at, share, label=label_text(agent), **series_style(number), markevery=40)
         axes.set_xscale("symlog", linthresh=1.0, linscale=0.4)
-        axes.xaxis.set_major_formatter(FuncFormatter(plain))
-        what = "Harm" if known is None else "Regret"
+        axes.xaxis.set_major_formatter(FuncFormatter(plain_number))
+        what = "Harm" if best_known is None else "Regret"
         axes.set(xlabel=f"{what}, {TITLES[count][0].lower()}{TITLES[count][1:]}", xlim=(0.0, None), ylim=(0.0, 1.0))
     panels[0].set_ylabel("Worlds above this value")
     panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -202,19 +202,19 @@ def harm_of_decelerations(world: State, body: int, at: Floats, horizon_s: float)
     Rows: first-impact harm predicted by the paper's closed form, and simulated first-impact and total harm.
     """
     braking, wait = np.ascontiguousarray(capacities(world.car, BRAKING, world.time_s)[0]), world.car[0, LATENCY].copy()
-    priced: Any = predicted_harm
+    priced: Any = harm_of_deceleration
     predicted = [priced(world.line[0], braking, wait, body, float(a)) for a in at]
     return np.stack([predicted, *hold(world, world.wanted, [body], -at[None, :, None], horizon_s, "first")[:, 0]])
 
 
 @in_our_style
 def deceleration_figure(
-    world: State, scenario: AnyScenario, *, known: Mapping[str, float] | None = None, title: str = ""
+    world: State, scenario: AnyScenario, *, best_known: Mapping[str, float] | None = None, title: str = ""
 ) -> Figure:
     """Draw predicted and simulated harm of one world against the constant deceleration of the scenario's learner.
 
-    Marks show the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``known``: best known harm
-    of this world over all commands, ``first`` and ``total``, drawn as lines.
+    Marks show the decelerations that E-V2X-BM chooses, by the closed form and by simulation. ``best_known``: best known
+    harm of this world over all commands, ``first`` and ``total``, drawn as lines.
 
     Raises ``InvalidInput`` unless there is one world, one learner, and no script that looks at the state.
     """
@@ -248,9 +248,11 @@ def deceleration_figure(
             [a], [least], label=f"a* = {a:.3f} m/s², coupled, least {IN_WORDS[count]}: {least:.2f}",
             **{**style, **mark, "marker": "o", "markersize": size},
         )  # fmt: skip
-        if known is not None:
+        if best_known is not None:
             axes.axhline(
-                known[count], label=f"best known {IN_WORDS[count]}: {known[count]:.2f}", **style | {"linewidth": 0.9}
+                best_known[count],
+                label=f"best known {IN_WORDS[count]}: {best_known[count]:.2f}",
+                **style | {"linewidth": 0.9},
             )
     axes.set(
         title=title or f"{loaded.name}: one world",
@@ -355,7 +357,7 @@ def _commands(axes: Axes, record: EpisodeRecord) -> None:
 
 ABREAST = 4  # distributions in a row of the figure
 MOST_NAMED = 4  # outlines in a distribution with a legend
-SHOWN = {"shortest line": 0.0, "median line": 0.5, "longest line": 1.0}  # relative rank of the sum of gaps
+LINE_RANKS = {"shortest line": 0.0, "median line": 0.5, "longest line": 1.0}  # relative rank of the sum of gaps
 PICTURE = 224  # height (pixels) of road and speeds, the upper part of a picture
 
 
@@ -364,12 +366,12 @@ def write_worlds(path: Path, scenario: Scenario, episodes: int, *, seed: int, fo
 
 
 @in_our_style
-def worlds_figure(scenario: Scenario, drawn: Drawn, *, seed: int) -> Figure:
+def worlds_figure(scenario: Scenario, drawn_worlds: DrawnWorlds, *, seed: int) -> Figure:
     """Draw the distribution of each quantity that differs between worlds, and three worlds at the alert."""
-    varying = _varying(drawn)
+    varying = _varying_quantities(drawn_worlds)
     columns = min(max(len(varying), 1), ABREAST)
     rows = -(-len(varying) // columns)
-    pictures = _pictures(scenario, drawn)
+    pictures = _pictures(scenario, drawn_worlds)
     height_in = 0.01 * len(pictures)
     figure = new_figure(8.0, 1.6 * rows + height_in + 0.4)
     grid = figure.add_gridspec(rows + 1, columns, height_ratios=[*[1.6] * rows, height_in])
@@ -379,13 +381,15 @@ def worlds_figure(scenario: Scenario, drawn: Drawn, *, seed: int) -> Figure:
     axes.imshow(pictures)
     axes.set_axis_off()
     name = label_text(scenario.name, 80)
-    return finish(figure, f"{name}, {count_of(drawn.worlds.n, 'world')} of the list of seed {seed}; shares of worlds.")
+    return finish(
+        figure, f"{name}, {count_of(drawn_worlds.worlds.n, 'world')} of the list of seed {seed}; shares of worlds."
+    )
 
 
-def _varying(drawn: Drawn) -> dict[Rule, dict[int, Floats]]:
-    columns, varying = quantities_of(drawn.worlds, drawn.friction), dict[Rule, dict[int, Floats]]()
+def _varying_quantities(drawn_worlds: DrawnWorlds) -> dict[Rule, dict[int, Floats]]:
+    columns, varying = quantities_of(drawn_worlds.worlds, drawn_worlds.friction), dict[Rule, dict[int, Floats]]()
     for rule in (rule for rule in QUANTITIES.values() if rule.column):
-        for i in range(rule.count(drawn.worlds.vehicles)):
+        for i in range(rule.count(drawn_worlds.worlds.vehicles)):
             values = columns.get(rule.column_of(i))
             if values is not None and np.nanmin(values) < np.nanmax(values):
                 varying.setdefault(rule, {})[i] = values
@@ -393,11 +397,11 @@ def _varying(drawn: Drawn) -> dict[Rule, dict[int, Floats]]:
 
 
 def _distribution(axes: Axes, rule: Rule, entries: dict[int, Floats]) -> None:
-    values = [each[~np.isnan(each)] for each in entries.values()]
+    values = [column[~np.isnan(column)] for column in entries.values()]
     axes.hist(
         values,
         np.histogram_bin_edges(np.concatenate(values), 24).tolist(),
-        weights=[np.full(each.size, 1.0 / each.size) for each in values],
+        weights=[np.full(column.size, 1.0 / column.size) for column in values],
         histtype="step",
         color=[vehicle_colour(i + 1) for i in entries],
         linestyle=[DASHES[i % len(DASHES)] for i in entries],
@@ -413,10 +417,10 @@ def _distribution(axes: Axes, rule: Rule, entries: dict[int, Floats]) -> None:
     axes.set_xlabel(name.replace("_", " ") + (f" ({unit})" if unit else ""))
 
 
-def _pictures(scenario: Scenario, drawn: Drawn) -> Frame:
-    worlds = drawn.worlds
+def _pictures(scenario: Scenario, drawn_worlds: DrawnWorlds) -> Frame:
+    worlds = drawn_worlds.worlds
     ranked = np.argsort(worlds.gaps_m.sum(axis=1), kind="stable")
-    rows = {name: int(ranked[round(rank * (worlds.n - 1))]) for name, rank in SHOWN.items()}
+    rows = {name: int(ranked[round(rank * (worlds.n - 1))]) for name, rank in LINE_RANKS.items()}
     scenes = [
         Scene(
             f"World {worlds.clock[row, NUMBER]:.0f}, {name}", scenario.learners, False, 0.0, worlds.line[row],

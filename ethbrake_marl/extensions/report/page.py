@@ -43,14 +43,14 @@ def whole_page(title: str, lead: str, opening: Sequence[Markup], sections: Seque
     return str(fill("page.html.j2", **values))
 
 
-def part(name: str, *values: object) -> Markup:
+def page_part(name: str, *values: object) -> Markup:
     macros = _environment().get_template("parts.html.j2").module
     return Markup(getattr(macros, name)(*values))
 
 
 def table(sheet: Sheet) -> Markup:
     """Table as HTML, with title and note. Pandas, which writes plain tables, is not in the extra."""
-    return part("table", sheet)
+    return page_part("table", sheet)
 
 
 def drawing(figure: Figure, title: str, description: str) -> Markup:
@@ -63,7 +63,7 @@ def drawing(figure: Figure, title: str, description: str) -> Markup:
     svg = base64.b64encode(picture_bytes(figure, "figure.svg")).decode()
     width_in = figure.get_figwidth()
     kind = "broad" if width_in > BROAD_IN else "slim" if width_in <= SLIM_IN else ""
-    return part("drawing", title, description, kind, svg, caption)
+    return page_part("drawing", title, description, kind, svg, caption)
 
 
 def data(name: str, content: object) -> Markup:
@@ -82,14 +82,14 @@ def fill(file: str, **values: Any) -> Markup:
     return Markup(_environment().get_template(file).render(values))
 
 
-def shown(value: object) -> str:
+def printable_text(value: object) -> str:
     """``value`` as text; control characters, and characters that change the writing direction, are escaped."""
     return value if isinstance(value, Markup) else plain_text(str(value), keep=_STAY)
 
 
 def breakable(name: str) -> Markup:
     """Text with places for line breaks after signs, as in ``e_v2x_bm:pairwise``; HTML stays unchanged."""
-    return name if isinstance(name, Markup) else Markup("<wbr>").join(map(shown, _AFTER_SIGN.split(name)))
+    return name if isinstance(name, Markup) else Markup("<wbr>").join(map(printable_text, _AFTER_SIGN.split(name)))
 
 
 @cache
@@ -105,7 +105,7 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=shown,
+        finalize=printable_text,
     )
     environment.filters |= {"sha256": _sha256, "breakable": breakable}
     environment.filters["anchor"] = lambda title: title.lower().replace(" ", "-")

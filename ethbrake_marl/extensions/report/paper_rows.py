@@ -70,12 +70,12 @@ def is_papers_test(scenario: Scenario) -> bool:
 
 def printed_sheet(rows: tuple[PaperRow, ...]) -> Sheet:
     columns = ("Strategy", Column("Collisions"), Column("Rate"), Column("Average harm"), Column("Decrease"))
-    shown = [
+    printed_rows = [
         (
             *(row.agent, f"{row.collisions:,}", f"{100.0 * row.collision_rate:.4g} %", f"{row.average_harm:g}"),
             None if row.harm_decrease is None else f"{100.0 * row.harm_decrease:.4g} %",
         )
         for row in rows
     ]
-    sheet = Sheet(f"The paper's {rows[0].episodes:,} worlds, as printed", columns, shown, f"{PARAMETERS[rows]}.")
+    sheet = Sheet(f"The paper's {rows[0].episodes:,} worlds, as printed", columns, printed_rows, f"{PARAMETERS[rows]}.")
     return sheet.only(sheet.filled())

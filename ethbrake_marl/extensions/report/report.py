@@ -20,12 +20,12 @@ from ethbrake_marl.evaluation.summary_row import SummaryRow
 from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
-from ethbrake_marl.extensions.report.page import Section, drawing, part, table, whole_page
+from ethbrake_marl.extensions.report.page import Section, drawing, page_part, table, whole_page
 from ethbrake_marl.files.sheet import Column, Sheet, Shown
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
 
-LEARNED = ("trained policy", "trained team")  # names that get an article
+LEARNED_AGENTS = ("trained policy", "trained team")  # names that get an article
 COUNTED_WORDS = {  # count -> verb, noun, and what is counted
     "first": ("does", " harm", "first impacts"),
     "total": ("does", " harm", "all impacts"),
@@ -40,10 +40,14 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
     of the same agents in another test.
     """
     count, harm = compared.harm_count, COLUMN[compared.harm_count]
-    rows, known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
+    rows, best_known = {row.agent: row for row in compared.table}, BestKnown.of(compared.result)
     row, before = rows[focus], rows.get(BASELINE)
-    name = "Full braking" if focus == BASELINE else f"The {focus}" if focus in LEARNED else focus
-    best = "" if known is None or count not in known.harm else f"; best known {known.harm[count].mean():.2f}"
+    name = "Full braking" if focus == BASELINE else f"The {focus}" if focus in LEARNED_AGENTS else focus
+    best = (
+        ""
+        if best_known is None or count not in best_known.harm
+        else f"; best known {best_known.harm[count].mean():.2f}"
+    )
     does, of_harm, what = COUNTED_WORDS[count]
     if before is None or row is before:
         total = f"; total harm: {value(row, HARM['total'])}" if count == "honest" else ""
@@ -57,13 +61,13 @@ def first_sentence(compared: Compared, focus: str, tests: Mapping[str, Compared]
     if count == "honest":
         numbers += f"; total harm: {value(row, HARM['total'])} instead of {value(before, HARM['total'])}"
     fails = []
-    for title, other in tests.items():
-        there = {each.agent: each for each in other.table}
+    for title, comparison in tests.items():
+        there = {test_row.agent: test_row for test_row in comparison.table}
         if {focus, BASELINE} <= there.keys() and (worse := change_of(there[focus], harm)) != "less":
             instead = f"{value(there[focus], harm)} instead of {value(there[BASELINE], harm)}"
             fails.append(f"{worse} in the {title.lower()} ({instead})")
-    joined = ", but " if change == "less" else ", and "
-    return f"{name} {does} {words} full braking ({numbers}){joined * bool(fails)}{' and '.join(fails)}."
+    conjunction = ", but " if change == "less" else ", and "
+    return f"{name} {does} {words} full braking ({numbers}){conjunction * bool(fails)}{' and '.join(fails)}."
 
 
 def change_of(row: SummaryRow, harm: str) -> Literal["less", "more", "as much"]:
@@ -80,7 +84,7 @@ def value(row: SummaryRow, key: str) -> str:
 
 
 SHORT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the first table, if they are shown
-WORDS = {
+GLOSSARY = {
     "Contact": "Two vehicles, or Vehicle 1 and an obstacle, touch: the gap between them is 0.",
     "Impact": "A contact with a closing speed above 0. The square of that speed is its harm.",
     "Collision": "A world with at least one impact.",
@@ -93,7 +97,7 @@ class Test(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportPage:
     """Content of the page. Its agents drive some worlds again when the page is made."""
 
     title: str
@@ -111,27 +115,27 @@ class Report:
         compared, rows = self.compared, self.compared.table
         focus = self.focus or [row.agent for row in rows if row.policies or row is rows[-1]][-1]
         kinds = shown_worlds(compared, focus)
-        others = {title: test.compared for title, test in self.tests.items()}
+        test_results = {title: test.compared for title, test in self.tests.items()}
         about = rows.parameters
         versions = {**about["versions"], **{key: about[key] for key in IDENTITY[:3]}}
         sections = [
-            Section("Results", [self.summary, part("box", "Three words", WORDS), *measured(rows)]),
+            Section("Results", [self.summary, page_part("box", "Three words", GLOSSARY), *measure_parts(rows)]),
             *self.sections,
             episodes_section(compared, focus, kinds),
             worst_section(compared, focus, kinds),
             avoidable_section(compared),
             Section("Figures", self.figures),
-            *(Section(title, _tested(test)) for title, test in self.tests.items()),
-            Section("How to read the tables", [part("facts", rows.meanings())]),
-            Section("Settings and seeds", [part("facts", self.settings)]),
-            Section("Versions", [part("facts", versions)]),
+            *(Section(title, _test_body(test)) for title, test in self.tests.items()),
+            Section("How to read the tables", [page_part("facts", rows.meanings())]),
+            Section("Settings and seeds", [page_part("facts", self.settings)]),
+            Section("Versions", [page_part("facts", versions)]),
         ]
-        marks = "; marks: the other tests" if others else ""
-        bars = harm_by_agent(compared, others)
+        marks = "; marks: the other tests" if test_results else ""
+        bars = harm_by_agent(compared, test_results)
         words = IN_WORDS[compared.harm_count].capitalize()
         harm = drawing(bars, f"{words} of each agent", f"Mean and 95 % interval{marks}.")
-        opening = [part("remarks", [*self.remarks, *rows.notes()]), part("beside", harm, short_table(rows))]
-        lead = first_sentence(compared, focus, others)
+        opening = [page_part("remarks", [*self.remarks, *rows.notes()]), page_part("beside", harm, short_table(rows))]
+        lead = first_sentence(compared, focus, test_results)
         return whole_page(self.title, lead, opening, [section for section in sections if section.body])
 
     def write(self, path: Path, *, force: bool = False) -> None:
@@ -144,31 +148,31 @@ def short_table(agents: SummaryTable) -> Markup:
     return table(replace(some, title="Means with 95 % intervals, m²/s²"))
 
 
-def measured(agents: SummaryTable) -> list[Markup]:
-    sheet, more = agents.sheet(), agents.measures()
-    whole = replace(sheet.only(sheet.filled()), title="All measures with a column")
-    tables = [table(each) for each in (whole, more) if each is not None]
-    line = part("paragraph", f"{caption(agents.parameters)}. Harm in m²/s².", "quiet")
-    return [line, part("folded", "Every measure", tables)]
+def measure_parts(agents: SummaryTable) -> list[Markup]:
+    sheet, measures_sheet = agents.sheet(), agents.measures()
+    full_sheet = replace(sheet.only(sheet.filled()), title="All measures with a column")
+    tables = [table(chosen_sheet) for chosen_sheet in (full_sheet, measures_sheet) if chosen_sheet is not None]
+    line = page_part("paragraph", f"{caption(agents.parameters)}. Harm in m²/s².", "quiet")
+    return [line, page_part("folded", "Every measure", tables)]
 
 
 def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> Section:
     """Worlds in which ``focus`` did worst, at most ten. Those that the player shows have a button."""
-    result, known, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
+    result, known_best, minimised = compared.result, BestKnown.of(compared.result), compared.harm_count
     counts = {**HARM, minimised: COLUMN[minimised]}
     columns = {IN_WORDS[count].capitalize(): result[focus][column] for count, column in counts.items()}
-    if known is not None:
-        columns |= {f"Best known, {count}": known.harm[count] for count in counts if count in known.harm}
-        if known.unavoidable is not None:
-            columns["An impact is"] = np.where(known.unavoidable, "unavoidable", "perhaps avoidable")
+    if known_best is not None:
+        columns |= {f"Best known, {count}": known_best.harm[count] for count in counts if count in known_best.harm}
+        if known_best.unavoidable is not None:
+            columns["An impact is"] = np.where(known_best.unavoidable, "unavoidable", "perhaps avoidable")
     columns["Impacts"] = result[focus]["impacts"]
     rows = []
     for k in worst_rows(compared, focus).tolist():
         number = int(result.worlds["world"][k])
-        name = Shown(part("watch", number)) if k in watched else number
-        rows.append([name, *(each[k].item() for each in columns.values())])
+        name = Shown(page_part("watch", number)) if k in watched else number
+        rows.append([name, *(values[k].item() for values in columns.values())])
     by = IN_WORDS[minimised]
-    if known is not None and minimised in known.harm:
+    if known_best is not None and minimised in known_best.harm:
         by = f"{by} minus the best known {by}"
     sheet = Sheet(f"Worlds of {focus}", list(map(Column, ("World", *columns))), rows)
     return Section(
@@ -177,32 +181,36 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
 
 
 def avoidable_section(compared: Compared) -> Section:
-    result, known, figure = compared.result, BestKnown.of(compared.result), harm_above(compared)
-    if known is None:
+    result, best_known, figure = compared.result, BestKnown.of(compared.result), harm_above(compared)
+    if best_known is None:
         words = "For each harm x: share of the worlds in which an agent did more harm than x."
         return Section("World by world", [drawing(figure, "Harm", words)])
     body: list[str] = []
-    if known.unavoidable is not None:
-        share = rate(known.unavoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
+    if best_known.unavoidable is not None:
+        share = rate(best_known.unavoidable, result.clusters).in_words(digits=1, scale=100.0, unit=" %")
         body.append(
             f"An impact is unavoidable in {share} of the worlds: it is proven for each of them that no command avoids"
             " an impact."
         )
-        for where, among in (("Impact unavoidable", known.unavoidable), ("Other worlds", ~known.unavoidable)):
+        for where, among in (("Impact unavoidable", best_known.unavoidable), ("Other worlds", ~best_known.unavoidable)):
             if among.any():
-                body.append(table(_harm_among(compared, known, where, among)))
+                body.append(table(_harm_among(compared, best_known, where, among)))
     words = "For each value x: share of the worlds in which an agent's harm minus the best known harm is above x."
     return Section("What was avoidable", [*body, drawing(figure, "Regret", words)])
 
 
-def _harm_among(compared: Compared, known: BestKnown, where: str, among: Bools) -> Sheet:
+def _harm_among(compared: Compared, best_known: BestKnown, where: str, among: Bools) -> Sheet:
     result, counts = compared.result, shown_counts(compared)
     some, rows = result.take(among), []
-    for agent, own in some.columns.items():
-        regrets = (known.regret(result, agent, count)[among] for count in counts)
-        harms = (own[column] for column in counts.values())
+    for agent, harm_columns in some.columns.items():
+        regrets = (best_known.regret(result, agent, count)[among] for count in counts)
+        harms = (harm_columns[column] for column in counts.values())
         rows.append(
-            (agent, rate(own["collided"], some.clusters), *(mean(x, some.clusters) for x in (*harms, *regrets)))
+            (
+                agent,
+                rate(harm_columns["collided"], some.clusters),
+                *(mean(x, some.clusters) for x in (*harms, *regrets)),
+            )
         )
     headings = [IN_WORDS[count] for count in counts]
     columns: list[Column | str] = [
@@ -214,17 +222,17 @@ def _harm_among(compared: Compared, known: BestKnown, where: str, among: Bools) 
     return Sheet(f"{where}: {count_of(some.n, 'world')}", columns, rows)
 
 
-def _tested(test: Test) -> list[str]:
+def _test_body(test: Test) -> list[str]:
     rows = test.compared.table
-    notes = [part("paragraph", text, "note") for text in rows.notes()]
-    return [test.about, short_table(rows), *notes, *measured(rows)]
+    notes = [page_part("paragraph", text, "note") for text in rows.notes()]
+    return [test.about, short_table(rows), *notes, *measure_parts(rows)]
 
 
 def write_evaluation(path: Path, compared: Compared, command: str, *, force: bool = False) -> None:
     scenario, agents = compared.scenario, [row.agent for row in compared.table]
     names = ", ".join(agents)
     scripts = ", ".join(f"{vehicle} by {role}" for vehicle, role in scenario.roles.items() if role != "learner")
-    Report(
+    ReportPage(
         f"{scenario.name}: {names}" if len(names) <= 60 else f"{scenario.name}: {len(agents)} agents compared",
         compared,
         scenario.title or "Agents on the same worlds.",

@@ -19,7 +19,7 @@ from ethbrake_marl.evaluation.record import record_episode
 from ethbrake_marl.evaluation.results import write_results
 from ethbrake_marl.evaluation.statistics import difference, mean
 from ethbrake_marl.evaluation.summary import BASELINE
-from ethbrake_marl.extensions.report.best_known import MEASURES
+from ethbrake_marl.extensions.report.best_known import REPORT_MEASURES
 from ethbrake_marl.extensions.report.figures import curves_figure, harm_against_total_gap, trajectories
 from ethbrake_marl.extensions.report.page import Section, drawing, table
 from ethbrake_marl.extensions.report.paper_rows import (
@@ -29,9 +29,9 @@ from ethbrake_marl.extensions.report.paper_rows import (
     is_papers_test,
     printed_sheet,
 )
-from ethbrake_marl.extensions.report.report import Report, Test
+from ethbrake_marl.extensions.report.report import ReportPage, Test
 from ethbrake_marl.extensions.report.style import TITLES, write_picture
-from ethbrake_marl.extensions.report.three_tests import TESTS, brief, other_tests, title_of
+from ethbrake_marl.extensions.report.three_tests import TESTS, other_tests, short_sheet, title_of
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Estimate, Row, Sheet
 from ethbrake_marl.names import open_game
@@ -39,43 +39,48 @@ from ethbrake_marl.progress import OnProgress, Progress
 from ethbrake_marl.training.experiment import HYBRID, SHIELDED, TEAM, TEAM_BASELINES, Experiment, Tables, without
 from ethbrake_marl.training.run import RunFolder
 
-PAGE = "report.html"
+REPORT_FILE = "report.html"
 
 
 class RunReport:
-    measures: tuple[str, ...] = (*Tables.measures, *MEASURES)
+    measures: tuple[str, ...] = (*Tables.measures, *REPORT_MEASURES)
 
     def write(self, experiment: Experiment, tell: OnProgress) -> tuple[Sequence[Any], str]:
         """Write the results in the other tests, pictures and page. Return tables to print, and where the page is."""
         compared, folder = experiment.compared, experiment.trained.directory
         single = experiment.learned != TEAM
-        tests, done = other_tests(compared.scenario) if single else [], count()
+        tests, stage_numbers = other_tests(compared.scenario) if single else [], count()
 
         def begin(stage: str) -> None:
-            tell(Progress(f"report{stage and ': '}{stage}", next(done), 2 + len(tests)))
+            tell(Progress(f"report{stage and ': '}{stage}", next(stage_numbers), 2 + len(tests)))
 
-        others: dict[str, Compared] = {}
+        test_results: dict[str, Compared] = {}
         for test in tests:
             begin(f"the same policy in {test.name}")
             with warnings.catch_warnings():  # the page says that the policy was not trained for this test
                 warnings.simplefilter("ignore", Unfamiliar)
-                others[test.name] = experiment.in_another(test, compared.result.n, TEAM_BASELINES, Tables.measures)
-            write_results(folder, others[test.name].table, name=f"results-{test.name}.json", force=True)
+                test_results[test.name] = experiment.in_another(
+                    test, compared.result.n, TEAM_BASELINES, Tables.measures
+                )
+            write_results(folder, test_results[test.name].table, name=f"results-{test.name}.json", force=True)
         learners = [] if single else learners_sheets(compared)
         begin("figures")
         figures = write_figures(experiment)
         begin("page and episodes")
-        page_of(experiment, others, figures, learners).write(folder / PAGE, force=True)
+        report_page(experiment, test_results, figures, learners).write(folder / REPORT_FILE, force=True)
         begin("")
         more = " and the paper's rows" if is_papers_test(compared.scenario) else ""
-        return [brief(compared, others), *learners], f"report with all measures{more}: {folder / PAGE}"
+        return [
+            short_sheet(compared, test_results),
+            *learners,
+        ], f"report with all measures{more}: {folder / REPORT_FILE}"
 
 
 def write_figures(experiment: Experiment) -> list[Markup]:
     compared, learned, trained = experiment.compared, experiment.learned, experiment.trained
     recipe, (_, game) = trained.training.recipe, open_game(compared.scenario)
-    shown = telling_row(compared, learned)
-    world, number = compared.worlds([shown]), int(compared.result.worlds["world"][shown])
+    typical_row = telling_row(compared, learned)
+    world, number = compared.worlds([typical_row]), int(compared.result.worlds["world"][typical_row])
     plan = recipe.evaluation
     counts = dict.fromkeys([*HARM, compared.harm_count])
     curves = {**{TITLES[count]: COLUMN[count] for count in counts}, "Share of collisions": "collision_rate"}
@@ -85,7 +90,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
     )
     references = [row for row in compared.table if row.agent in TEAM_BASELINES]
     beside = [agent for agent in compared.teams if agent in (*TEAM_BASELINES, learned)]
-    drawn = {
+    figures = {
         "learning_curve.png": (
             "Learning curve",
             "Harm and collisions on a fixed list of worlds during the training. The horizontal lines are baselines.",
@@ -97,7 +102,7 @@ def write_figures(experiment: Experiment) -> list[Markup]:
                 "Training steps",
                 course,
                 lines={
-                    title: {row.agent: each.value for row in references if (each := row[key]) is not None}
+                    title: {row.agent: estimate.value for row in references if (estimate := row[key]) is not None}
                     for title, key in curves.items()
                 },
             ),
@@ -114,9 +119,9 @@ def write_figures(experiment: Experiment) -> list[Markup]:
             trajectories({agent: record_episode(world, compared.teams[agent], game) for agent in beside}),
         ),
     }  # fmt: skip
-    for name, (_, _, figure) in drawn.items():
+    for name, (_, _, figure) in figures.items():
         write_picture(trained.directory / name, figure, force=True)
-    return [drawing(figure, title, description) for title, description, figure in drawn.values()]
+    return [drawing(figure, title, description) for title, description, figure in figures.values()]
 
 
 def telling_row(compared: Compared, learned: str) -> int:
@@ -130,9 +135,9 @@ def telling_row(compared: Compared, learned: str) -> int:
     return int(rows[np.argsort(saved, kind="stable")[(len(rows) - 1) // 2]])
 
 
-def page_of(
-    experiment: Experiment, others: Mapping[str, Compared], figures: Sequence[Markup], learners: Sequence[Sheet]
-) -> Report:
+def report_page(
+    experiment: Experiment, test_results: Mapping[str, Compared], figures: Sequence[Markup], learners: Sequence[Sheet]
+) -> ReportPage:
     trained, compared, learned = experiment.trained, experiment.compared, experiment.learned
     training, recipe, name = trained.training, trained.training.recipe, compared.scenario.name
     steps = next(iter(trained.policies.values())).manifest.steps
@@ -159,14 +164,14 @@ def page_of(
         summary += " In the agent “all but” a vehicle, this vehicle brakes fully instead."
     else:
         summary += f" The agent “{HYBRID}” is the trained policy with the paper's shield."
-    if others:
+    if test_results:
         summary += f" {TESTS[name]} The results of the other two tests are further below."
     sections = [Section("Several learners", [table(sheet) for sheet in learners])]
     if is_papers_test(compared.scenario):
         printed = [table(printed_sheet(rows)) for rows in (RANDOM_TEST, HYBRID_TEST)]
         sections.append(Section("The paper's rows", [*printed, PAPER_NOTE]))
     stopped = f"The training was interrupted. This is the {learned} after {steps:,} steps."
-    return Report(
+    return ReportPage(
         f"ethbrake run: {name}",
         compared,
         summary,
@@ -174,38 +179,40 @@ def page_of(
         focus=learned,
         sections=sections,
         figures=figures,
-        tests={title_of(test): Test(TESTS[test], other) for test, other in others.items()},
+        tests={title_of(test): Test(TESTS[test], comparison) for test, comparison in test_results.items()},
         remarks=[stopped] if trained.status == "interrupted" else (),
     )
 
 
 def learners_sheets(compared: Compared) -> list[Sheet]:
-    return [*(_borne(compared, count) for count in _counts(compared)), _added(compared)]
+    return [*(_borne_sheet(compared, count) for count in _counts(compared)), _added_sheet(compared)]
 
 
 def _counts(compared: Compared) -> list[str]:
     return [*dict.fromkeys([*HARM, compared.harm_count])]
 
 
-def _borne(compared: Compared, count: str) -> Sheet:
+def _borne_sheet(compared: Compared, count: str) -> Sheet:
     scenario, by = compared.scenario, compared.result.clusters
     names = [name.replace("_", " ").capitalize() for name in scenario.vehicle_names]
     columns = [Column("Agent", "agent", text=True)]
     columns += [Column(heading, interval="hidden") for heading in (*names, "Whole line")]
     endings = [*(f"_{i + 1}" for i in range(len(names))), ""]
     rows: list[Row] = [
-        (agent, *(mean(own[COLUMN[count] + ending], by) for ending in endings))
-        for agent, own in compared.result.columns.items()
+        (agent, *(mean(harm_columns[COLUMN[count] + ending], by) for ending in endings))
+        for agent, harm_columns in compared.result.columns.items()
     ]
     learn = ", ".join(names[body - 1] for body in scenario.learners)
     return Sheet(f"Who bears what: {IN_WORDS[count]}, mean per world (m²/s²)", columns, rows, f"{learn} learn.")
 
 
-def _added(compared: Compared) -> Sheet:
+def _added_sheet(compared: Compared) -> Sheet:
     result, counts, rows = compared.result, _counts(compared), list[Row]()
     for name in (compared.scenario.vehicle_names[body - 1] for body in compared.scenario.learners):
         pairs = ((result[without(name)][COLUMN[count]], result[TEAM][COLUMN[count]]) for count in counts)
-        rows.append((name, *(difference(less, whole, result.clusters) for less, whole in pairs)))
+        rows.append(
+            (name, *(difference(harm_without, team_harm, result.clusters) for harm_without, team_harm in pairs))
+        )
     columns = [Column("Learner", text=True)]
     columns += [Column(IN_WORDS[count].capitalize(), sign="+") for count in counts]
     about = (

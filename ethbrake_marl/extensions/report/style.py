@@ -19,7 +19,7 @@ from ethbrake_marl.episode.counts import IN_WORDS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, plain_text
 from ethbrake_marl.evaluation.captions import caption, ranges_of
-from ethbrake_marl.extensions.rendering.picture import COLOURS
+from ethbrake_marl.extensions.rendering.picture import PALETTE
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.worlds.describe import quantities_of
@@ -92,8 +92,8 @@ def new_panels(size_in: tuple[float, float], rows: int = 1, columns: int = 1, **
 
 def series_style(number: int) -> dict[str, Any]:
     """Style of curve ``number`` (from 0) for matplotlib's ``plot``. After the last style they repeat."""
-    k = number % len(COLOURS)
-    return {"color": COLOURS[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
+    k = number % len(PALETTE)
+    return {"color": PALETTE[k], "marker": MARKERS[k], "linestyle": DASHES[k], "linewidth": 1.6, "markersize": 4.5}
 
 
 def label_text(text: str, most: int = 40) -> str:
@@ -150,7 +150,7 @@ def write_picture(path: str | Path, figure: Figure, *, force: bool = False) -> N
     write_output(path, picture_bytes(figure, path), force=force)
 
 
-def plain(value: float, _: int) -> str:
+def plain_number(value: float, _: int) -> str:
     """Number of an axis label as text such as 1000, not as a power of ten."""
     return f"{value:g}"
 

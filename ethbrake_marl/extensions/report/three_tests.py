@@ -12,7 +12,7 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.extensions.report.best_known import BestKnown
 from ethbrake_marl.files.sheet import Estimate, Sheet
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.mixture import WORDS
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from ethbrake_marl.worlds.scenario import Scenario
 
 TESTS = {
@@ -23,12 +23,12 @@ TESTS = {
     "paper-random-obstacle": "Obstacle test: the same worlds with an obstacle 1.7 m beyond the place where Vehicle 1"
     " stops by itself. An impact of Vehicle 1 with the obstacle is harm.",
 }
-KEPT = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the short table, if they are shown
+SHORT_TABLE = ("collision_rate", *COLUMN.values(), "pushed_mps")  # columns of the short table, if they are shown
 
 
 def is_as_shipped(scenario: Scenario) -> bool:
     """Whether a scenario equals the shipped one of its name, except title, description and source."""
-    return scenario.content(without=WORDS) == load_scenario(scenario.name).content(without=WORDS)
+    return scenario.content(without=DESCRIPTIVE_KEYS) == load_scenario(scenario.name).content(without=DESCRIPTIVE_KEYS)
 
 
 def other_tests(scenario: Scenario) -> list[Scenario]:
@@ -42,21 +42,25 @@ def title_of(name: str) -> str:
     return TESTS[name].partition(":")[0]
 
 
-def brief(compared: Compared, others: Mapping[str, Compared]) -> Sheet:
+def short_sheet(compared: Compared, test_results: Mapping[str, Compared]) -> Sheet:
     """Short table: collision rate, both harms and, if agents minimise it, the honest cost with the push.
 
-    ``others``: results in other tests, name -> results; their means follow below.
+    ``test_results``: results in other tests, name -> results; their means follow below.
     """
     table = compared.table
-    whole = table.terminal()
-    short = whole.only(k for k, name in enumerate(whole.names) if k == 0 or name in KEPT)
+    full_sheet = table.terminal()
+    short = full_sheet.only(k for k, name in enumerate(full_sheet.names) if k == 0 or name in SHORT_TABLE)
     rows, line = list(short.rows), "Harm: mean over the worlds in m²/s², with the 95 % interval below."
-    known = BestKnown.of(compared.result)
-    notes = [f"{caption(table.parameters)}. {line}", *table.notes(), *([] if known is None else [known.in_words])]
-    for test, other in others.items():
-        rows.append(f"{title_of(test)}: {count_of(other.result.n, 'world')}")
-        for row in other.table:
+    best_known = BestKnown.of(compared.result)
+    notes = [
+        f"{caption(table.parameters)}. {line}",
+        *table.notes(),
+        *([] if best_known is None else [best_known.in_words]),
+    ]
+    for test, comparison in test_results.items():
+        rows.append(f"{title_of(test)}: {count_of(comparison.result.n, 'world')}")
+        for row in comparison.table:
             means = [row[name] for name in short.names[1:]]
-            rows.append((row.marked, *(each and Estimate(each.value, None) for each in means)))
-        notes.append(" ".join([TESTS[test], *other.table.notes()]))
+            rows.append((row.marked, *(mean and Estimate(mean.value, None) for mean in means)))
+        notes.append(" ".join([TESTS[test], *comparison.table.notes()]))
     return replace(short, rows=rows, note="\n".join(notes), keep=None)

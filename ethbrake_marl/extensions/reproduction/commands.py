@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.registry import Part
 
-REMAINS = "finished trainings remain; repeat the command to continue"
+AFTER_STOPPED_REPRODUCTION = "finished trainings remain; repeat the command to continue"
 
 
 def reproduce_command(
@@ -39,7 +39,7 @@ def reproduce_command(
     cost: Annotated[
         bool, typer.Option("--cost", help="Print how much work is left and how long it will take, and exit.")
     ] = False,
-    listed: Annotated[bool, typer.Option("--list", help="List all figures and tables, and exit.")] = False,
+    list_only: Annotated[bool, typer.Option("--list", help="List all figures and tables, and exit.")] = False,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -50,30 +50,30 @@ def reproduce_command(
     LaTeX) of each. An item is a figure or a table of the paper. After an interruption, repeat the command: trainings go
     on where they were.
     """
-    with Out(as_json=as_json, force=force, remains=REMAINS) as out:
+    with Out(as_json=as_json, force=force, remains=AFTER_STOPPED_REPRODUCTION) as out:
         from ethbrake_marl.extensions.reproduction import items
-        from ethbrake_marl.extensions.reproduction.made import Settings
+        from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
         from ethbrake_marl.extensions.studies.machine import this_machine
 
         if quick and full:
             raise InvalidInput("--quick and --full cannot be combined; give only one of them")
         chosen = items.choose_items(names or ())
-        if listed:
-            known = [(item.name, ", ".join(item.labels), item.title) for item in chosen]
-            sheet = Sheet("", ("Item", "Label in the paper", "What"), known)
+        if list_only:
+            rows = [(item.name, ", ".join(item.labels), item.title) for item in chosen]
+            sheet = Sheet("", ("Item", "Label in the paper", "What"), rows)
             out.result(sheet.json(), sheet)
             return
-        settings = Settings(output, full, episodes, out.show_progress, chosen_policies(policies))
+        settings = ReproductionSettings(output, full, episodes, out.show_progress, chosen_policies(policies))
         out.note(items.cost(settings, chosen))
         if cost:
             return
         results = items.reproduce(settings, chosen, this_machine(), force=out.force)
         if results is None:
-            out.interrupted(f"interrupted; {REMAINS}")
-        out.result(items.plain(results), items.overview(results), kept=True)
+            out.interrupted(f"interrupted; {AFTER_STOPPED_REPRODUCTION}")
+        out.result(items.plain_results(results), items.overview(results), in_file=True)
         if not full:
-            out.note(items.QUICK)
-        out.note(f"page: {output / items.PAGE}")
+            out.note(items.QUICK_NOTE)
+        out.note(f"page: {output / items.RESULTS_FILE}")
 
 
 def chosen_policies(text: str) -> dict[str, str]:
@@ -81,23 +81,23 @@ def chosen_policies(text: str) -> dict[str, str]:
 
     Raises ``InvalidInput`` if one cannot drive here.
     """
-    from ethbrake_marl.extensions.reproduction.random_test import SHIPPED, WORLDS, drive_all
+    from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS, WORLD_FIELDS, drive_all
     from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
 
     replaced = dict[str, str]()
     for part in filter(None, text.split(",")):
         name, _, spec = part.partition("=")
-        if name.upper() not in SHIPPED or name.upper() in replaced or not spec:
+        if name.upper() not in SHIPPED_SPECS or name.upper() in replaced or not spec:
             raise InvalidInput(
                 f"--policies {text}: {part!r}: must be ppo=AGENT or sac=AGENT, each once, for instance ppo=policy@RUN"
             )
         try:  # so that what cannot drive is refused before a training
             for reading in (STATED, NEAREST):
-                drive_all(reading.only(*WORLDS), spec, "first", 2)
+                drive_all(reading.only(*WORLD_FIELDS), spec, "first", 2)
         except InvalidInput as error:
             raise InvalidInput(f"--policies {part}: {error}") from None
         replaced[name.upper()] = spec
-    return {**SHIPPED, **replaced}
+    return {**SHIPPED_SPECS, **replaced}
 
 
 REPRODUCE = Part(reproduce_command, epilog=example("reproduce random-table harm-distance --quick --output runs/paper"))

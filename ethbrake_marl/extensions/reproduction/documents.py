@@ -8,19 +8,19 @@ from __future__ import annotations
 from ethbrake_marl.files.sheet import Sheet
 
 LATEX = str.maketrans({
-    **{each: rf"\{each}" for each in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
+    **{character: rf"\{character}" for character in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}", "²": "$^2$", "–": "--", "[": "{[}", "]": "{]}",
 })  # fmt: skip
 
 
-def lines_of(sheet: Sheet) -> list[list[str]]:
+def sheet_texts(sheet: Sheet) -> list[list[str]]:
     """Texts of headings and rows."""
     return [sheet.headings, *([cell.in_words for cell in row if not isinstance(cell, str)] for row in sheet.shown())]
 
 
 def markdown(sheet: Sheet) -> str:
     """Table as Markdown, without title and note."""
-    heads, *rows = lines_of(sheet)
+    heads, *rows = sheet_texts(sheet)
     rule = ["---" if column.text else "---:" for column in sheet.formats]
     escaped = [[text.replace("|", "\\|") for text in row] for row in rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in (heads, rule, *escaped))
@@ -28,7 +28,7 @@ def markdown(sheet: Sheet) -> str:
 
 def latex(sheet: Sheet) -> str:
     """LaTeX ``tabular`` for the package ``booktabs``, without title and note."""
-    heads, *rows = (" & ".join(text.translate(LATEX) for text in line) + r" \\" for line in lines_of(sheet))
+    heads, *rows = (" & ".join(text.translate(LATEX) for text in line) + r" \\" for line in sheet_texts(sheet))
     kinds = "".join("l" if column.text else "r" for column in sheet.formats)
     begin, end = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule"], [r"\bottomrule", r"\end{tabular}"]
     return "\n".join([*begin, heads, r"\midrule", *rows, *end])

@@ -22,9 +22,9 @@ from ethbrake_marl.extensions.reproduction.learning import (
     STOPPED,
     reproduce_curves,
     seconds_left,
-    train,
+    train_groups,
 )
-from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Drawn, Item, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, DrawnFigure, Item, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.register import reproduce_gaps
 from ethbrake_marl.extensions.reproduction.tables import reproduce_hybrid_table, reproduce_random_table
 from ethbrake_marl.extensions.reproduction.trajectories import reproduce_accelerations, reproduce_trajectories
@@ -87,7 +87,7 @@ ITEMS = (
     ),
 )  # fmt: skip
 
-PAGE = "README.md"
+RESULTS_FILE = "README.md"
 
 PAPER = "*How to Brake? Ethical Emergency Braking with Deep Reinforcement Learning*"
 
@@ -98,23 +98,23 @@ LEAD = (
     " 3.0 % off, so it is a hypothesis. *Why* begins with the verdict on the row as stated: agrees (within 2 %),"
     " differs because, cannot be because (with a proof), undecided (too few worlds, or our choice decides)."
 )
-QUICK = "Figures 2 and 3 and the paper's own process need --full."
+QUICK_NOTE = "Figures 2 and 3 and the paper's own process need --full."
 
 
 def choose_items(names: Sequence[str]) -> list[Item]:
-    known = {item.name: item for item in ITEMS}
+    items_by_name = {item.name: item for item in ITEMS}
     for name in names:
-        if name not in known:
-            raise unknown_name("item", name, known)
+        if name not in items_by_name:
+            raise unknown_name("item", name, items_by_name)
     return [item for item in ITEMS if not names or item.name in names]
 
 
-def groups_of(settings: Settings, items: Sequence[Item]) -> list[str]:
-    every = [name for item in items for name in item.trained if settings.full or name == STOPPED]
-    return list(dict.fromkeys(every))
+def groups_of(settings: ReproductionSettings, items: Sequence[Item]) -> list[str]:
+    training_groups = [name for item in items for name in item.trained if settings.full or name == STOPPED]
+    return list(dict.fromkeys(training_groups))
 
 
-def cost(settings: Settings, items: Sequence[Item]) -> str:
+def cost(settings: ReproductionSettings, items: Sequence[Item]) -> str:
     training_s = seconds_left(settings.folder, groups_of(settings, items))
     more_s = {item.name: PROCESS_S for item in items if RANDOM in item.trained}
     seconds = sum(item.most_s + (more_s.get(item.name, 0.0) if settings.full else 0.0) for item in items)
@@ -123,7 +123,7 @@ def cost(settings: Settings, items: Sequence[Item]) -> str:
 
 
 def reproduce(
-    settings: Settings, items: Sequence[Item], machine: str, *, force: bool = False
+    settings: ReproductionSettings, items: Sequence[Item], machine: str, *, force: bool = False
 ) -> dict[Item, Made] | None:
     """Train what is missing, and write figures, tables and a page. Return None if Ctrl-C stopped a training.
 
@@ -131,67 +131,77 @@ def reproduce(
     false.
     """
     folder, results = settings.folder, {}
-    check_folder(folder, (PAGE,), force=force)
-    if not train(settings, groups_of(settings, items)):
+    check_folder(folder, (RESULTS_FILE,), force=force)
+    if not train_groups(settings, groups_of(settings, items)):
         return None
     for number, item in enumerate(items):
         settings.tell(Progress(f"items: {item.name}", number, len(items)))
-        results[item] = made = item.make(settings)
-        write_item(folder / item.name, made.sheets, made.figures)
+        results[item] = result = item.make(settings)
+        write_item(folder / item.name, result.sheets, result.figures)
     write_item(folder, [overview(results)])
     today = datetime.now(UTC).date().isoformat()
-    made_by = f"`{command(settings, items)}` on {today} ({machine}; version {__version__}, physics {physics_digest()})"
-    write_output(folder / PAGE, page(made_by, results, settings).encode(), force=True)
+    made_by = (
+        f"`{command_line(settings, items)}` on {today} ({machine}; version {__version__}, physics {physics_digest()})"
+    )
+    write_output(folder / RESULTS_FILE, page(made_by, results, settings).encode(), force=True)
     return results
 
 
-def command(settings: Settings, items: Sequence[Item]) -> str:
+def command_line(settings: ReproductionSettings, items: Sequence[Item]) -> str:
     names = [item.name for item in items] if len(items) < len(ITEMS) else []
-    fewer = ["--episodes", str(settings.episodes)] if settings.episodes < PAPER_EPISODES else []
-    given = ",".join(f"{name.lower()}={spec}" for name, spec in settings.policies.items())
-    policies = ["--policies", given] if settings.policies != Settings(settings.folder).policies else []
-    return shlex.join(["ethbrake", "reproduce", *names, "--full" if settings.full else "--quick", *fewer, *policies])
+    limit = ["--episodes", str(settings.episodes)] if settings.episodes < PAPER_EPISODES else []
+    policy_list = ",".join(f"{name.lower()}={spec}" for name, spec in settings.policies.items())
+    policies = (
+        ["--policies", policy_list] if settings.policies != ReproductionSettings(settings.folder).policies else []
+    )
+    return shlex.join(["ethbrake", "reproduce", *names, "--full" if settings.full else "--quick", *limit, *policies])
 
 
-def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[Drawn] = ()) -> None:
+def write_item(place: Path, sheets: Sequence[Sheet], figures: Sequence[DrawnFigure] = ()) -> None:
     if figures or sheets:
         place.mkdir(parents=True, exist_ok=True)
-    for drawn in figures:
+    for picture in figures:
         for ending in (".svg", ".pdf"):
-            write_picture(place / f"{drawn.stem}{ending}", drawn.figure, force=True)
+            write_picture(place / f"{picture.stem}{ending}", picture.figure, force=True)
     for sheet in sheets:
         stem = re.sub(r"[^a-z0-9]+", "-", sheet.title.lower()).strip("-") or "claims"
         write_output(place / f"{stem}.csv", sheet.csv().encode(), force=True)
         write_output(place / f"{stem}.tex", f"{latex(sheet)}\n".encode(), force=True)
 
 
-def plain(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
+def plain_results(results: Mapping[Item, Made]) -> list[dict[str, Any]]:
     return [
         {
             "name": item.name,
             "labels": list(item.labels),
             "title": item.title,
-            "claims": [each._asdict() for each in made.claims],
-            "tables": {sheet.title: sheet.json() for sheet in made.sheets},
-            "notes": list(made.notes),
+            "claims": [claim._asdict() for claim in result.claims],
+            "tables": {sheet.title: sheet.json() for sheet in result.sheets},
+            "notes": list(result.notes),
             "version": __version__,
             "physics_digest": physics_digest(),
         }
-        for item, made in results.items()
+        for item, result in results.items()
     ]
 
 
 def overview(results: Mapping[Item, Made]) -> Sheet:
-    return claims_sheet([claim for made in results.values() for claim in made.claims])
+    return claims_sheet([claim for result in results.values() for claim in result.claims])
 
 
-def page(made_by: str, results: Mapping[Item, Made], settings: Settings) -> str:
+def page(made_by: str, results: Mapping[Item, Made], settings: ReproductionSettings) -> str:
     lead = f"Numbers, statements and figures of {PAPER}, and ours. Made by {made_by}."
-    parts = ["# The paper, reproduced", lead, LEAD, *([] if settings.full else [QUICK]), markdown(overview(results))]
-    for item, made in results.items():
+    parts = [
+        "# The paper, reproduced",
+        lead,
+        LEAD,
+        *([] if settings.full else [QUICK_NOTE]),
+        markdown(overview(results)),
+    ]
+    for item, result in results.items():
         labels = f" In the paper's source: {', '.join(f'`{label}`' for label in item.labels)}." if item.labels else ""
-        parts += [f"## {item.title}", f"{item.what}{labels} Command: `ethbrake reproduce {item.name}`.", *made.notes]
-        parts += [f"![{each.title}. {each.text}]({item.name}/{each.stem}.svg)" for each in made.figures]
-        for sheet in made.sheets:
+        parts += [f"## {item.title}", f"{item.what}{labels} Command: `ethbrake reproduce {item.name}`.", *result.notes]
+        parts += [f"![{picture.title}. {picture.text}]({item.name}/{picture.stem}.svg)" for picture in result.figures]
+        for sheet in result.sheets:
             parts += [f"### {sheet.title}", markdown(sheet), *filter(None, [sheet.note])]
     return "\n\n".join(parts).replace("H*", r"H\*") + "\n"

@@ -16,9 +16,9 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import SHORT_NAMES
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.report.figures import curves_figure, over_seeds
+from ethbrake_marl.extensions.report.figures import curves_figure, mean_over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
-from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
 from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.files.sheet import Column, Sheet
@@ -28,7 +28,7 @@ RANDOM, HIGH, LOW, STOPPED = "random", "high", "low", "stopped"
 STATUS = "run.json"  # of a run
 
 
-class Plan(NamedTuple):
+class TrainingPlan(NamedTuple):
     scenario: str
     recipe: str
     seeds: int
@@ -37,19 +37,21 @@ class Plan(NamedTuple):
     mapped: bool = True  # in the paper's map
 
 
-def _process(scenario: str, seeds: int) -> tuple[Plan, ...]:
-    return Plan(scenario, "ppo-paper", seeds, 210.0), Plan(scenario, "sac-paper", seeds, 240.0)
+def _process(scenario: str, seeds: int) -> tuple[TrainingPlan, ...]:
+    return TrainingPlan(scenario, "ppo-paper", seeds, 210.0), TrainingPlan(scenario, "sac-paper", seeds, 240.0)
 
 
-GROUPS = {
-    STOPPED: (Plan("paper-random", "ppo", 1, 6.0, 100_000, mapped=False),),  # a fifteenth of the recipe's decisions
+TRAINING_GROUPS = {
+    STOPPED: (
+        TrainingPlan("paper-random", "ppo", 1, 6.0, 100_000, mapped=False),
+    ),  # a fifteenth of the recipe's decisions
     RANDOM: _process("paper-random", 5),
     HIGH: _process("paper-delay-high", 3),
     LOW: _process("paper-delay-low", 3),
 }
 
 
-def runs_of(folder: Path, group: str, plan: Plan) -> list[Path]:
+def runs_of(folder: Path, group: str, plan: TrainingPlan) -> list[Path]:
     return [folder / "trainings" / group / f"{plan.recipe}-seed{seed}" for seed in range(plan.seeds)]
 
 
@@ -58,34 +60,34 @@ def is_finished(run: Path) -> bool:
     return status.is_file() and read_object(status).get("status") == "finished"
 
 
-def trained(folder: Path, group: str) -> dict[str, list[Path]]:
+def finished_runs(folder: Path, group: str) -> dict[str, list[Path]]:
     """Finished trainings of a group of trainings (such as ``RANDOM``): recipe -> folder for each seed.
 
     Recipes with an unfinished training are left out.
     """
-    every = {plan.recipe: runs_of(folder, group, plan) for plan in GROUPS[group]}
-    return {recipe: runs for recipe, runs in every.items() if all(map(is_finished, runs))}
+    runs_of_recipe = {plan.recipe: runs_of(folder, group, plan) for plan in TRAINING_GROUPS[group]}
+    return {recipe: runs for recipe, runs in runs_of_recipe.items() if all(map(is_finished, runs))}
 
 
 def seconds_left(folder: Path, groups: Iterable[str]) -> float:
-    plans = [(group, plan) for group in groups for plan in GROUPS[group]]
+    plans = [(group, plan) for group in groups for plan in TRAINING_GROUPS[group]]
     return sum(plan.seconds for group, plan in plans for run in runs_of(folder, group, plan) if not is_finished(run))
 
 
-def train(settings: Settings, groups: Iterable[str]) -> bool:
+def train_groups(settings: ReproductionSettings, groups: Iterable[str]) -> bool:
     """Start, or continue, the unfinished trainings of some groups. Return False if Ctrl-C stopped one.
 
     Raises ``MissingExtra`` without torch, and the errors of ``eb.train`` and ``eb.resume``.
     """
     for group in groups:
-        for plan in GROUPS[group]:
+        for plan in TRAINING_GROUPS[group]:
             for seed, run in enumerate(runs_of(settings.folder, group, plan)):
                 if not (is_finished(run) or _train(plan, run, seed, settings)):
                     return False
     return True
 
 
-def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
+def _train(plan: TrainingPlan, run: Path, seed: int, settings: ReproductionSettings) -> bool:
     import ethbrake_marl as eb
 
     if (run / STATUS).is_file():
@@ -101,16 +103,16 @@ def _train(plan: Plan, run: Path, seed: int, settings: Settings) -> bool:
 
 def unconverged(folder: Path) -> str:
     """Agent name of the policy that the paper calls "obtained from training before convergence occurred"."""
-    ((run,),) = trained(folder, STOPPED).values()
+    ((run,),) = finished_runs(folder, STOPPED).values()
     return f"policy@{run / 'policy-last'}"
 
 
-def process(settings: Settings, group: str = RANDOM) -> dict[str, list[str]]:
+def process(settings: ReproductionSettings, group: str = RANDOM) -> dict[str, list[str]]:
     """Policies trained as in the paper, of one ``group`` of trainings: name -> one agent name per seed.
 
     Empty without ``settings.full``.
     """
-    runs = trained(settings.folder, group) if settings.full else {}
+    runs = finished_runs(settings.folder, group) if settings.full else {}
     return {
         name: [f"policy@{run / 'policy'}" for run in runs[recipe]] for recipe, name in NAMES.items() if recipe in runs
     }
@@ -120,20 +122,22 @@ NAMES = {"ppo-paper": "PPO", "sac-paper": "SAC"}
 RETURN, HARM = "rollout/ep_rew_mean", "eval/first_impact_harm"  # columns of progress.csv
 ALIKE, RISEN = 0.1, 0.9  # parts of the rise of a return: what counts as nearly identical, and as converged
 
-Values = Sequence[Mapping[float, float]]  # for each seed: progress (%) -> value; all seeds have the same progress
+LearningCurves = Sequence[
+    Mapping[float, float]
+]  # for each seed: progress (%) -> value; all seeds have the same progress
 
 
 class Course(NamedTuple):
     """Learning curves of one recipe at one delay, for each seed, over the progress of the training (%)."""
 
-    returns: Values  # mean return of training episodes
-    harm: Values  # first-impact harm on the fixed list (m2/s2)
+    returns: LearningCurves  # mean return of training episodes
+    harm: LearningCurves  # first-impact harm on the fixed list (m2/s2)
     decisions: float = 100.0  # at the end
 
     @property
     def values(self) -> Floats:
         """Returns of the training episodes, [seeds, k], at k values of the progress."""
-        return np.array([[*each.values()] for each in self.returns])
+        return np.array([[*curve.values()] for curve in self.returns])
 
     @property
     def late(self) -> Floats:
@@ -176,37 +180,47 @@ def column(run: Path, name: str) -> dict[float, float]:
 def course_of(runs: Sequence[Path]) -> Course:
     returns, harm = ([column(run, name) for run in runs] for name in (RETURN, HARM))
     last = max(harm[0])
-    returns, harm = ([{100.0 * k / last: x for k, x in each.items()} for each in every] for every in (returns, harm))
+    returns, harm = (
+        [{100.0 * k / last: x for k, x in curve.items()} for curve in curves] for curves in (returns, harm)
+    )
     return Course(returns, harm, last)
 
 
-def courses_of(settings: Settings, delay: str) -> dict[str, Course]:
+def courses_of(settings: ReproductionSettings, delay: str) -> dict[str, Course]:
     return {
         NAMES[recipe]: course_of(runs)
-        for recipe, runs in (trained(settings.folder, delay) if settings.full else {}).items()
+        for recipe, runs in (finished_runs(settings.folder, delay) if settings.full else {}).items()
     }
 
 
-def reproduce_curves(delay: str, settings: Settings) -> Made:
-    courses = {each: courses_of(settings, each) for each in (HIGH, LOW)}
-    if not all(name in courses[each] for each in courses for name in NAMES.values()):
+def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
+    courses = {level: courses_of(settings, level) for level in (HIGH, LOW)}
+    if not all(name in courses[level] for level in courses for name in NAMES.values()):
         why = "needs trainings at both delays; --full does them"
         return Made([Claim(FIGURE[delay], what, "", "", "not run", why) for what in STATEMENTS[delay]])
-    own = courses[delay]
+    delay_courses = courses[delay]
     title = f"Learning curves at {delay} delay, the paper's process"
     text = f"{title}: return and harm against progress, mean over seeds; bands: one standard deviation."
     panels = {
-        "Mean return of training episodes": {name: over_seeds(each.returns) for name, each in own.items()},
-        f"{TITLES['first']}, fixed list": {name: over_seeds(each.harm) for name, each in own.items()},
+        "Mean return of training episodes": {
+            name: mean_over_seeds(course.returns) for name, course in delay_courses.items()
+        },
+        f"{TITLES['first']}, fixed list": {
+            name: mean_over_seeds(course.harm) for name, course in delay_courses.items()
+        },
     }
-    figure = Drawn(f"learning-{delay}", title, text, curves_figure(panels, "Training progress (%)", text))
+    figure = DrawnFigure(f"learning-{delay}", title, text, curves_figure(panels, "Training progress (%)", text))
     rows = [
-        (name, len(each.harm), *(mean(np.array([each.harm[k][100.0] for k in range(len(each.harm))])), mean(each.last)))
-        for name, each in own.items()
+        (
+            name,
+            len(course.harm),
+            *(mean(np.array([course.harm[k][100.0] for k in range(len(course.harm))])), mean(course.last)),
+        )
+        for name, course in delay_courses.items()
     ]
     note = "Harm: first-impact, m²/s², 1,000 worlds of seed 1007. Return: of the last tenth. t intervals over seeds."
     sheet = Sheet(title, ("Algorithm", Column("Seeds"), Column("Last policy, harm"), Column("Last return")), rows, note)
-    return Made(judged(delay, courses), [sheet], [figure])
+    return Made(judge_courses(delay, courses), [sheet], [figure])
 
 
 FIGURE = {HIGH: "Fig. 2", LOW: "Fig. 3"}
@@ -224,14 +238,14 @@ STATEMENTS = {
 }
 
 
-def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Claim]:
+def judge_courses(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Claim]:
     high, low = courses[HIGH], courses[LOW]
     if delay == HIGH:
-        apart = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
+        last_difference = np.abs(high["PPO"].last - high["SAC"].last) - ALIKE * high["PPO"].rise
         unrest = {name: course.unrest - ALIKE * course.rise for name, course in high.items()}
         parts = [
-            [Less(f"{name}: deviation minus a tenth of the rise", mean(each)) for name, each in unrest.items()],
-            [Less("difference minus a tenth of PPO's rise", mean(apart))],
+            [Less(f"{name}: deviation minus a tenth of the rise", mean(excess)) for name, excess in unrest.items()],
+            [Less("difference minus a tenth of PPO's rise", mean(last_difference))],
         ]
     else:
         parts = [
@@ -240,17 +254,17 @@ def judged(delay: str, courses: Mapping[str, Mapping[str, Course]]) -> list[Clai
             [Less.of_lists("PPO minus SAC, deviation in the last quarter", low["PPO"].unrest, low["SAC"].unrest)],
             [Less.of_lists(name, high[name].spread, low[name].spread) for name in high],
         ]
-    claims = [judge(FIGURE[delay], text, each) for text, each in zip(STATEMENTS[delay], parts, strict=True)]
-    return claims if delay == HIGH else [claims[0], faster(low, claims[1]), *claims[2:]]
+    claims = [judge(FIGURE[delay], text, part) for text, part in zip(STATEMENTS[delay], parts, strict=True)]
+    return claims if delay == HIGH else [claims[0], convergence_claim(low, claims[1]), *claims[2:]]
 
 
-def faster(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
+def convergence_claim(courses: Mapping[str, Course], by_decisions: Claim) -> Claim:
     """Claim that SAC converges faster, as undecided.
 
     The paper's axis is the progress of trainings of unknown length. ``courses``: name -> learning curves.
     ``by_decisions``: the claim, judged by the number of decisions.
     """
     ends = {name: (course.converged.mean(), course.decisions) for name, course in courses.items()}
-    text = ", ".join(f"{name} after {at:,.0f} of {whole:,.0f} decisions" for name, (at, whole) in ends.items())
+    text = ", ".join(f"{name} after {at:,.0f} of {total:,.0f} decisions" for name, (at, total) in ends.items())
     why = f"in decisions or in % of the training? The lengths are ours: {text} is at nine tenths of its rise"
     return by_decisions._replace(ours=f"by decisions it {by_decisions.ours}", outcome="undecided", why=why)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from matplotlib.figure import Figure
 
-from ethbrake_marl.extensions.reproduction.random_test import SHIPPED
+from ethbrake_marl.extensions.reproduction.random_test import SHIPPED_SPECS
 from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Sheet
 from ethbrake_marl.progress import OnProgress
@@ -20,21 +20,21 @@ POLICIES = "PPO and SAC are the shipped policies, trained on paper-random at 0.5
 
 
 @dataclass(frozen=True)
-class Settings:
+class ReproductionSettings:
     folder: Path  # of all results, and of the trainings
     full: bool = False  # train by the paper's own process
     episodes: int = PAPER_EPISODES  # largest number of worlds of an item
     tell: OnProgress = lambda progress: None
-    policies: Mapping[str, str] = field(default_factory=lambda: SHIPPED)  # name -> spec
+    policies: Mapping[str, str] = field(default_factory=lambda: SHIPPED_SPECS)  # name -> spec
 
     @property
     def who_drives(self) -> str:
-        if self.policies == SHIPPED:
+        if self.policies == SHIPPED_SPECS:
             return POLICIES
         return f"{', '.join(f'{name} is {spec}' for name, spec in self.policies.items())}."
 
 
-class Drawn(NamedTuple):
+class DrawnFigure(NamedTuple):
     stem: str  # of the files' names
     title: str
     text: str  # description
@@ -44,7 +44,7 @@ class Drawn(NamedTuple):
 class Made(NamedTuple):
     claims: Sequence[Claim] = ()  # of the paper
     sheets: Sequence[Sheet] = ()  # tables
-    figures: Sequence[Drawn] = ()
+    figures: Sequence[DrawnFigure] = ()
     notes: Sequence[str] = ()  # what was run
 
 
@@ -53,6 +53,6 @@ class Item(NamedTuple):
     labels: tuple[str, ...]  # in the paper's source
     title: str
     what: str
-    make: Callable[[Settings], Made]
+    make: Callable[[ReproductionSettings], Made]
     most_s: float  # processor time with as many worlds as in the paper, without trainings
     trained: tuple[str, ...] = ()  # groups of trainings; without ``full``, only what takes seconds is trained

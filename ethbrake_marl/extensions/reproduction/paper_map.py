@@ -105,7 +105,7 @@ def sample(state: State, step_s: float) -> State:
     return state._replace(line=line, clock=clock)
 
 
-def collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
+def paper_collision(params: RewardParams, before: State, step: Step, after: State) -> Floats:
     """The paper's r_collision: minus ``k_energy w^2`` of every pair that overlaps at the sample, [n].
 
     w is the closing speed before the impacts of the sample, the state ``before``; ``step`` and ``after`` are unused. A
@@ -134,7 +134,7 @@ class PaperMap:
             what = f"the term {counted[0]}" if counted else "harm_count honest"
             raise InvalidInput(f"scenario {game.name!r}: {what} needs exact impacts, and physics: paper-map has none")
         terms = tuple(
-            (name, weight, partial(collision, game.rewarding.params) if name == "collision" else function)
+            (name, weight, partial(paper_collision, game.rewarding.params) if name == "collision" else function)
             for name, weight, function in game.rewarding.terms
         )
         return game.rewarding._replace(terms=terms)

@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ethbrake_marl.agents.drive import drive
-from ethbrake_marl.agents.pairwise import CANDIDATES, TIE, Choice, find_candidates, pairwise, predicted_harm
+from ethbrake_marl.agents.pairwise import (
+    CLOSED_FORM_CANDIDATES,
+    RELATIVE_TIE,
+    ConstantDeceleration,
+    find_candidates,
+    harm_of_deceleration,
+    pairwise,
+)
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import ENDED, State
 from ethbrake_marl.errors import Unfamiliar
@@ -27,58 +34,66 @@ from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.scenario import Scenario
 
 VEHICLE_2 = 2  # body
-NON_E, E_V2X_BM, HYBRID_SAC, HYBRID_PPO = ROWS = "Non-E", "E-V2X-BM", "Hybrid SAC", "Hybrid PPO"  # of the paper
-SHIPPED: Mapping[str, str] = MappingProxyType({"PPO": "ppo", "SAC": "sac"})  # specs of the policies
+NON_E, E_V2X_BM, HYBRID_SAC, HYBRID_PPO = PAPER_ROWS = "Non-E", "E-V2X-BM", "Hybrid SAC", "Hybrid PPO"  # of the paper
+SHIPPED_SPECS: Mapping[str, str] = MappingProxyType({"PPO": "ppo", "SAC": "sac"})  # specs of the policies
 
-WORLDS = ("base", "acts_s", "rear_s", "step_s", "restitution", "others", "seed")  # fields that change worlds, physics
+WORLD_FIELDS = (
+    "base",
+    "acts_s",
+    "rear_s",
+    "step_s",
+    "restitution",
+    "others",
+    "seed",
+)  # fields that change worlds, physics
 PLANS = ("base", "acts_s", "rear_s", "others", "seed", "plans_as_stated", "star")  # that change what E-V2X-BM plans
 
 SHORT_STEP_S = 0.02  # between decisions, where what follows an impact begins at the next decision
 
-Table = Mapping[str, tuple[Estimate, Estimate]]  # row -> collision rate, and mean harm (m2/s2)
+RandomTable = Mapping[str, tuple[Estimate, Estimate]]  # row -> collision rate, and mean harm (m2/s2)
 
 
-Outcome = Mapping[str, NDArray[Any]]  # collided [n]; first, total: harm [n] m2/s2
+RandomOutcome = Mapping[str, NDArray[Any]]  # collided [n]; first, total: harm [n] m2/s2
 
 
-def outcome_of(last: State) -> Outcome:
+def outcome_of(last: State) -> RandomOutcome:
     return {"collided": last.collided, "first": last.harm("first"), "total": last.harm("total")}
 
 
-def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED) -> Table:
+def table_of(reading: Reading, episodes: int, policies: Mapping[str, str] = SHIPPED_SPECS) -> RandomTable:
     """Table of the paper's random test, with 95 % intervals, under a reading of its text.
 
     ``policies``: agent names of ``SAC`` and ``PPO``. Raises ``InvalidInput`` for the coupled H* in the paper's map.
     """
     specs = "", "", policies["SAC"], policies["PPO"]
-    outcomes = {row: reported(row, reading, episodes, spec) for row, spec in zip(ROWS, specs, strict=True)}
+    outcomes = {row: report_outcome(row, reading, episodes, spec) for row, spec in zip(PAPER_ROWS, specs, strict=True)}
     return {row: (rate(collided), mean(harm)) for row, (collided, harm) in outcomes.items()}
 
 
-def reported(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
+def report_outcome(row: str, reading: Reading, episodes: int, spec: str = "") -> tuple[Bools, Floats]:
     """Collisions and harm (m2/s2) of each world, [n] each, as a reading of the paper reports them.
 
     ``row``: strategy (a row of the table). ``spec``: agent name of the policy in a hybrid.
     """
-    worlds, counted = reading.only(*WORLDS), reading.counted
+    worlds, counted = reading.only(*WORLD_FIELDS), reading.counted
     if row == NON_E:
         braking = brake(worlds, None, reading.after_impact, episodes)
         return braking["collided"], braking[counted]
     plans = reading.only(*PLANS)
     baseline, bound = brake(worlds, plans, "brakes on", episodes), plan(plans, episodes).harm
     if row == E_V2X_BM:
-        return choose(reading.baseline, baseline["collided"], baseline[counted], bound)
+        return reported_values(reading.baseline, baseline["collided"], baseline[counted], bound)
     policy = drive_all(worlds, spec, "first", episodes)
     if reading.hybrid == "policy alone":
         return policy["collided"], policy[counted]
     if reading.hybrid == "realised, by the coupled H*":
         baseline = drive_all(worlds, "e_v2x_bm", counted, episodes)
         bound = baseline[counted]
-    both = algorithm_1(policy, baseline, bound, counted)
-    return choose(reading.hybrid, both["collided"], both[counted], np.minimum(policy[counted], bound))
+    hybrid = algorithm_1(policy, baseline, bound, counted)
+    return reported_values(reading.hybrid, hybrid["collided"], hybrid[counted], np.minimum(policy[counted], bound))
 
 
-def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str = "first") -> Outcome:
+def algorithm_1(policy: RandomOutcome, baseline: RandomOutcome, bound: Floats, counted: str = "first") -> RandomOutcome:
     """Outcome of the policy where its harm is at most ``bound`` (H*, [n] m2/s2), else that of E-V2X-BM.
 
     ``baseline``: outcome of E-V2X-BM. ``counted``: ``first`` or ``total``, the harm that is compared.
@@ -87,7 +102,7 @@ def algorithm_1(policy: Outcome, baseline: Outcome, bound: Floats, counted: str 
     return {key: np.where(follows, policy[key], baseline[key]) for key in policy}
 
 
-def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
+def reported_values(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tuple[Bools, Floats]:
     """Collisions and harm, [n] each: as they happened, or as they were predicted at the alert.
 
     ``numbers`` says which: ``realised``, ``predicted``, or ``predicted harm, realised collisions``.
@@ -98,13 +113,13 @@ def choose(numbers: str, collided: Bools, harm: Floats, predicted: Floats) -> tu
 
 
 @lru_cache(16)  # a table needs the worlds of one reading, and those for which E-V2X-BM plans
-def opened(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
+def open_reading(worlds: Reading, episodes: int) -> tuple[Scenario, Game, State]:
     scenario, game = open_game(worlds.scenario(worlds.base))
     return scenario, game, scenario.sample(episodes, worlds.seed)
 
 
 @cache
-def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> Outcome:
+def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: int) -> RandomOutcome:
     """Simulate full braking of all vehicles or, with ``plans``, Vehicle 2 with the deceleration of E-V2X-BM.
 
     ``worlds`` and ``plans`` are readings: of the simulated worlds, and of those for which E-V2X-BM plans. After an
@@ -112,7 +127,7 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
     """
     if after_impact != "brakes on" and worlds.step_s is None:
         worlds = worlds._replace(others=(*worlds.others, ("time_step_s", SHORT_STEP_S)))
-    _, game, alert = opened(worlds, episodes)
+    _, game, alert = open_reading(worlds, episodes)
     car = alert.car.copy()
     if plans is not None:
         car[:, BRAKING, VEHICLE_2] = plan(plans, episodes).deceleration_mps2
@@ -129,35 +144,35 @@ def brake(worlds: Reading, plans: Reading | None, after_impact: str, episodes: i
 
 
 @cache
-def plan(plans: Reading, episodes: int) -> Choice:
+def plan(plans: Reading, episodes: int) -> ConstantDeceleration:
     """Deceleration that E-V2X-BM chooses under the reading ``plans``, [n], and the harm that it predicts.
 
     It uses the paper's closed form, without restitution and time steps. If several decelerations do the same least
     harm, the reading says which is taken: the smallest, middle or largest.
     """
     latencies = () if plans.plans_as_stated else ("acts_s", "rear_s")
-    _, _, alert = opened(plans.only("base", "others", "seed", *latencies), episodes)
+    _, _, alert = open_reading(plans.only("base", "others", "seed", *latencies), episodes)
     chosen = pairwise(alert, VEHICLE_2)
     if plans.star == "middle":
         return chosen
-    at, ends = np.empty(CANDIDATES), np.empty((episodes, 2))
+    at, ends = np.empty(CLOSED_FORM_CANDIDATES), np.empty((episodes, 2))
     for k, (line, car) in enumerate(zip(alert.line, alert.car.copy(), strict=True)):
         world = line, car[BRAKING], car[LATENCY], VEHICLE_2
         find_candidates(*world, at)  # type: ignore[no-untyped-call]
         possible = at[(at >= 0.0) & (at <= car[BRAKING, VEHICLE_2])]
-        harm = np.array([predicted_harm(*world, a) for a in possible])  # type: ignore[no-untyped-call]
-        tied = possible[harm <= harm.min() + TIE * (1.0 + harm.min())]
+        harm = np.array([harm_of_deceleration(*world, a) for a in possible])  # type: ignore[no-untyped-call]
+        tied = possible[harm <= harm.min() + RELATIVE_TIE * (1.0 + harm.min())]
         ends[k] = tied.min(), tied.max()
     return chosen._replace(deceleration_mps2=ends[:, ("low end", "high end").index(plans.star)])
 
 
 @cache
-def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> Outcome:
+def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> RandomOutcome:
     """Simulate the agent ``spec`` as Vehicle 2 under the reading ``worlds``; return the outcome.
 
     ``counted``: harm that the agent minimises. There is no warning if it is a policy trained for other worlds.
     """
-    scenario, game, alert = opened(worlds, episodes)
+    scenario, game, alert = open_reading(worlds, episodes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Unfamiliar)
         return outcome_of(drive(game, alert, teams_of({spec: spec}, scenario, harm_count=counted)[spec]))

@@ -10,9 +10,9 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 RANDOM = "paper-random"
 
-Reported = Literal["realised", "predicted", "predicted harm, realised collisions"]
+ReportedHarm = Literal["realised", "predicted", "predicted harm, realised collisions"]
 
-WORDS = {  # field of a reading -> its default in words, and another value
+FIELD_TEXTS = {  # field of a reading -> its default in words, and another value
     "base": ("the random test", "{}"),
     "acts_s": ("Vehicle 2 acts at its latency", "Vehicle 2 acts at {} s"),
     "rear_s": ("Vehicle 3 brakes at its latency", "Vehicle 3 brakes at {} s"),
@@ -29,11 +29,11 @@ WORDS = {  # field of a reading -> its default in words, and another value
 }
 
 
-def say(field: str, value: Any) -> str:
-    default, other = WORDS[field]
+def field_text(field: str, value: Any) -> str:
+    default, template = FIELD_TEXTS[field]
     if value == Reading._field_defaults[field]:
         return default
-    return other.format(", ".join(f"{key} = {each}" for key, each in value) if field == "others" else value)
+    return template.format(", ".join(f"{key} = {setting}" for key, setting in value) if field == "others" else value)
 
 
 class Reading(NamedTuple):
@@ -50,14 +50,14 @@ class Reading(NamedTuple):
     after_impact: Literal["brakes on", "coasts", "ends"] = "brakes on"  # what a vehicle of Non-E, or its episode does
     plans_as_stated: bool = False  # E-V2X-BM plans for the latencies of the scenario, whichever are driven
     star: Literal["low end", "middle", "high end"] = "middle"  # of the decelerations that do equally little harm
-    baseline: Reported = "realised"  # what is reported of E-V2X-BM: what happens, or what it predicts
+    baseline: ReportedHarm = "realised"  # what is reported of E-V2X-BM: what happens, or what it predicts
     # what is reported of Algorithm 1: with the pairwise H* what happens, or what it predicts, min(H_RL, H*)
-    hybrid: Reported | Literal["realised, by the coupled H*", "policy alone"] = "realised"
+    hybrid: ReportedHarm | Literal["realised, by the coupled H*", "policy alone"] = "realised"
 
     @property
     def name(self) -> str:
         changed = (field for field, value in self._asdict().items() if value != self._field_defaults[field])
-        return "; ".join(say(field, getattr(self, field)) for field in changed) or "as stated"
+        return "; ".join(field_text(field, getattr(self, field)) for field in changed) or "as stated"
 
     def only(self, *fields: str) -> Reading:
         """Copy with only these fields; all others have their default values."""

@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.extensions.report.paper_rows import RANDOM_TEST
-from ethbrake_marl.extensions.reproduction.made import Made, Settings
-from ethbrake_marl.extensions.reproduction.random_test import ROWS, Table, table_of
+from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.random_test import PAPER_ROWS, RandomTable, table_of
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
 from ethbrake_marl.extensions.reproduction.verdicts import PERCENT
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.progress import Progress
 
-WORLDS = 2_000
+REGISTER_WORLDS = 2_000
 PRINTED = np.array([(row.collision_rate, row.average_harm) for row in RANDOM_TEST])  # [4, 2]
 
 
@@ -30,7 +30,7 @@ class Gap(NamedTuple):
     otherwise: str = ""  # why there are none
 
 
-def each(field: str, *values: Any) -> tuple[Reading, ...]:
+def vary(field: str, *values: Any) -> tuple[Reading, ...]:
     return tuple(STATED._replace(**{field: value}) for value in values)
 
 
@@ -43,24 +43,24 @@ EARLY_DRIVEN = STATED._replace(acts_s=0.2, plans_as_stated=True, baseline="predi
 GAPS = (
     Gap("impacts at samples or exact, time step Δt", "dynamics2: at samples; a sampling period, no number",
         "at their exact time; a decision every 0.1 s",
-        (*each("step_s", 0.1, 0.2, 0.25, 0.5), *key("time_step_s", 0.05, 0.2))),
-    Gap("when Vehicle 2 may act", "text to Fig:Harm-ivds: τ2 = 0.5 s", "0.5 s", each("acts_s", 0.3, 0.2)),
+        (*vary("step_s", 0.1, 0.2, 0.25, 0.5), *key("time_step_s", 0.05, 0.2))),
+    Gap("when Vehicle 2 may act", "text to Fig:Harm-ivds: τ2 = 0.5 s", "0.5 s", vary("acts_s", 0.3, 0.2)),
     Gap("what the latency of Vehicle 3 is counted from", "eq:olle2: from t = 0", "from t = 0; 1.3 s: from τ2",
-        each("rear_s", 0.95, 1.3)),
+        vary("rear_s", 0.95, 1.3)),
     Gap("restitution e", "eq:12: e in [0, 1], typically at most 0.3; not said for its tests", "0.1",
-        each("restitution", 0.0, 0.2, 0.3, 0.5)),
+        vary("restitution", 0.0, 0.2, 0.3, 0.5)),
     Gap("which impacts count", "sec:result: each pairwise collision once; eq:Jharmn: at every sample",
-        "each pair's first impact", each("counted", "total")),
+        "each pair's first impact", vary("counted", "total")),
     Gap("the non-ethical vehicles after an impact", "text to Fig:Harm-ivds: brake until standstill or collision",
-        "brake until they stand", each("after_impact", "coasts", "ends")),
+        "brake until they stand", vary("after_impact", "coasts", "ends")),
     Gap("for which latencies E-V2X-BM plans", "sec:result: those of the test", "those that are driven",
         (EARLY_DRIVEN, EARLY_DRIVEN._replace(star="low end"), EARLY_DRIVEN._replace(star="high end"))),
     Gap("which a*", "Eq:BaselineHarm: any of an interval, if H* = 0", "the middle",
         otherwise="no effect, unless other latencies are driven than planned for: see above"),
     Gap("what is reported of E-V2X-BM", "Eq:BaselineHarm: the expected harm", "realised; both are shown",
-        each("baseline", "predicted")),
+        vary("baseline", "predicted")),
     Gap("H* inside the hybrid, and what is reported", "alg:hybrid: H* of Eq:BaselineHarm, expects min(H_RL, H*)",
-        "the pairwise H*, realised", each("hybrid", "predicted", "realised, by the coupled H*", "policy alone")),
+        "the pairwise H*, realised", vary("hybrid", "predicted", "realised, by the coupled H*", "policy alone")),
     Gap("may Vehicle 2 drive", "text to Fig:Harm-ivds: yes, a_u,2 = 7 m/s²; E-V2X-BM only brakes", "yes",
         key("driving_capacity_mps2", (6.0, 0.0, 6.0))),
     Gap("what Vehicle 1 brakes for", "sec:problem: an unforeseen obstacle, not modelled", "nothing ahead",
@@ -69,7 +69,7 @@ GAPS = (
         key("speeds_mps", (20.0, 18.0, 20.0))),
     Gap("horizon N", "Jfunc: N steps, no number", "8 s", otherwise="no effect on any number, from 5 to 16 s"),
     Gap("largest speed v_max", "eq:52: a limit, no number", "40 m/s", otherwise="no effect on any number, from 25 m/s"),
-    Gap("seed of the test", "text to Table:hybrid: a fixed random seed", "7", each("seed", 8, 9)),
+    Gap("seed of the test", "text to Table:hybrid: a fixed random seed", "7", vary("seed", 8, 9)),
     Gap("impacts before Vehicle 2 may act", "sec:system_model: assumed not to happen", "such worlds are drawn again",
         otherwise="no effect: no world of the random test has one"),
     Gap("weights of the reward", "w_h, w_p, w_j, R_safe, k_energy, k_d, d_safe, d_target: none stated",
@@ -91,9 +91,9 @@ COMBINED = Gap("several at once", "", "", (
 ))  # fmt: skip
 
 
-def numbers_of(table: Table) -> Floats:
+def rates_and_harms(table: RandomTable) -> Floats:
     """Collision rate and mean harm of the four rows, [4, 2]; the other printed numbers follow from them."""
-    return np.array([[each.value for each in row] for row in table.values()])
+    return np.array([[number.value for number in row] for row in table.values()])
 
 
 def distance(numbers: Floats, printed: Floats = PRINTED) -> float:
@@ -101,27 +101,27 @@ def distance(numbers: Floats, printed: Floats = PRINTED) -> float:
     return float(np.sqrt(np.square(numbers / printed - 1.0).mean()))
 
 
-def reproduce_gaps(settings: Settings) -> Made:
-    episodes = min(WORLDS, settings.episodes)
-    asked = [(DEFAULTS, STATED), *((gap, each) for gap in (*GAPS, COMBINED) for each in gap.alternatives)]
+def reproduce_gaps(settings: ReproductionSettings) -> Made:
+    episodes = min(REGISTER_WORLDS, settings.episodes)
+    cases = [(DEFAULTS, STATED), *((gap, reading) for gap in (*GAPS, COMBINED) for reading in gap.alternatives)]
     rows = []
-    for number, (gap, reading) in enumerate(asked):
-        settings.tell(Progress("open quantities", number, len(asked)))
+    for number, (gap, reading) in enumerate(cases):
+        settings.tell(Progress("open quantities", number, len(cases)))
         table = table_of(reading, episodes, settings.policies)
         rates, harms = zip(*table.values(), strict=True)
-        rows.append((gap.name, reading.name, distance(numbers_of(table)), *harms, *(rate.value for rate in rates)))
+        rows.append((gap.name, reading.name, distance(rates_and_harms(table)), *harms, *(rate.value for rate in rates)))
     register = [
-        (gap.name, gap.paper, gap.ours, "; ".join(each.name for each in gap.alternatives) or gap.otherwise)
+        (gap.name, gap.paper, gap.ours, "; ".join(reading.name for reading in gap.alternatives) or gap.otherwise)
         for gap in GAPS
     ]
-    collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in ROWS]
+    collisions = [replace(PERCENT, heading=f"Collisions, {row}") for row in PAPER_ROWS]
     note = (
         f"{episodes:,} worlds. Distance: root mean square of ours / printed - 1 over the eight numbers. Then mean harm"
         f" (m²/s²) with its 95 % interval, and the collision rate. {settings.who_drives} They are not trained anew for"
         " an alternative."
     )
     far = replace(PERCENT, heading="Distance")
-    columns: list[Column | str] = ["Quantity", "Value", far, *map(Column, ROWS), *collisions]
+    columns: list[Column | str] = ["Quantity", "Value", far, *map(Column, PAPER_ROWS), *collisions]
     sheets = [
         Sheet(
             "Register of what the paper leaves open",

@@ -8,17 +8,17 @@ import numpy as np
 
 from ethbrake_marl.extensions.proofs.lower_bound import lower_bound
 from ethbrake_marl.extensions.reproduction.learning import process
-from ethbrake_marl.extensions.reproduction.made import Settings
+from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
     NON_E,
     PLANS,
-    WORLDS,
-    Outcome,
+    WORLD_FIELDS,
+    RandomOutcome,
     algorithm_1,
     brake,
     drive_all,
-    opened,
+    open_reading,
     plan,
 )
 from ethbrake_marl.extensions.reproduction.readings import Reading
@@ -30,29 +30,31 @@ PREDICTED = "predicted"  # key of an outcome: harm that is expected at the alert
 MAP_STEP_S = 0.1
 
 
-def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, Outcome]:
+def strategies(reading: Reading, episodes: int, policies: Mapping[str, str]) -> dict[str, RandomOutcome]:
     """Outcome of each strategy under a reading of the paper: name -> outcome.
 
     If impacts are exact, E-V2X-BM (coupled) and its hybrids are included. ``policies``: name -> agent name. Hybrids
     decide by first-impact harm.
     """
-    worlds, plans = reading.only(*WORLDS), reading.only(*PLANS)
+    worlds, plans = reading.only(*WORLD_FIELDS), reading.only(*PLANS)
     baseline = {**brake(worlds, plans, "brakes on", episodes), PREDICTED: plan(plans, episodes).harm}
-    found: dict[str, Outcome] = {NON_E: brake(worlds, None, "brakes on", episodes), E_V2X_BM: baseline}
-    hybrids: dict[str, Outcome] = {"": baseline}
+    outcomes: dict[str, RandomOutcome] = {NON_E: brake(worlds, None, "brakes on", episodes), E_V2X_BM: baseline}
+    hybrids: dict[str, RandomOutcome] = {"": baseline}
     if reading.step_s is None:
         coupled = drive_all(worlds, "e_v2x_bm", "first", episodes)
-        found[COUPLED] = {**coupled, PREDICTED: coupled["first"]}
-        hybrids[f", {SIMULATED}"] = found[COUPLED]
-    found |= {name: drive_all(worlds, spec, "first", episodes) for name, spec in policies.items()}
+        outcomes[COUPLED] = {**coupled, PREDICTED: coupled["first"]}
+        hybrids[f", {SIMULATED}"] = outcomes[COUPLED]
+    outcomes |= {name: drive_all(worlds, spec, "first", episodes) for name, spec in policies.items()}
     for name in policies:
         for ending, bound in hybrids.items():
-            least = {PREDICTED: np.minimum(found[name]["first"], bound[PREDICTED])}
-            found[f"Hybrid {name}{ending}"] = {**algorithm_1(found[name], bound, bound[PREDICTED]), **least}
-    return found
+            least = {PREDICTED: np.minimum(outcomes[name]["first"], bound[PREDICTED])}
+            outcomes[f"Hybrid {name}{ending}"] = {**algorithm_1(outcomes[name], bound, bound[PREDICTED]), **least}
+    return outcomes
 
 
-def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[str, list[dict[str, Outcome]]]:
+def of_the_process(
+    reading: Reading, episodes: int, settings: ReproductionSettings
+) -> dict[str, list[dict[str, RandomOutcome]]]:
     """Outcomes of policies trained as in the paper, alone and in the hybrid, in the paper's fixed-step map.
 
     Policy -> for each seed, strategy -> outcome. Empty without such trainings.
@@ -64,7 +66,7 @@ def of_the_process(reading: Reading, episodes: int, settings: Settings) -> dict[
     }
 
 
-def least_harm(reading: Reading, episodes: int) -> Floats:
+def proven_least_harm(reading: Reading, episodes: int) -> Floats:
     """Proven lower bound on the harm of every strategy under exact impacts, [n] m2/s2."""
-    scenario, _, alert = opened(reading.only(*WORLDS), episodes)
+    scenario, _, alert = open_reading(reading.only(*WORLD_FIELDS), episodes)
     return lower_bound(alert, horizon_s=scenario.horizon_s, time_step_s=scenario.time_step_s).harm

@@ -12,16 +12,16 @@ from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.extensions.report.style import GREY, finish, in_our_style, new_panels, series_style
 from ethbrake_marl.extensions.reproduction.learning import process
-from ethbrake_marl.extensions.reproduction.made import Drawn, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED, Reading
-from ethbrake_marl.extensions.reproduction.verdicts import Claim, Outcome
+from ethbrake_marl.extensions.reproduction.verdicts import Claim, Verdict
 from ethbrake_marl.files.sheet import Column, Sheet
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game, teams_of
 
-SCENARIOS = (1, 2)
+PAPER_SCENARIOS = (1, 2)
 ARROW_S = 1.0  # between arrows: ten steps, as in the paper
-VEHICLE_2 = 1  # column of arrays
+VEHICLE_2_COLUMN = 1  # column of arrays
 
 Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the scenario) -> episode
 
@@ -29,7 +29,7 @@ Records = Mapping[tuple[str, int], EpisodeRecord]  # (PPO or SAC, number of the 
 @cache
 def record_all(reading: Reading, policies: tuple[tuple[str, str], ...]) -> Records:
     records = {}
-    for number in SCENARIOS:
+    for number in PAPER_SCENARIOS:
         scenario, game = open_game(reading.only("acts_s", "rear_s").scenario(f"paper-scenario-{number}"))
         world = scenario.sample(1, SEED)
         for name, team in teams_of(dict(policies), scenario).items():
@@ -59,46 +59,46 @@ def road_figure(records: Records, caption: str) -> Figure:
 
 @in_our_style
 def profiles_figure(curves: Mapping[str, Records], caption: str) -> Figure:
-    figure, every = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
-    for axes, key in zip(every, next(iter(curves.values())), strict=True):
+    figure, all_axes = new_panels((10.0, 5.6), 2, 2, sharex=True, sharey=True)
+    for axes, key in zip(all_axes, next(iter(curves.values())), strict=True):
         axes.axhline(0.0, color=GREY, linewidth=0.8)
         for number, (label, records) in enumerate(curves.items()):
             style, record = {**series_style(number), "marker": ""}, records[key]
-            command = record.command_mps2[:, VEHICLE_2]
+            command = record.command_mps2[:, VEHICLE_2_COLUMN]
             axes.plot(record.time_s, command, drawstyle="steps-post", label=label, **style)
         axes.set(title=f"{key[0]}, Scenario {key[1]}", ylabel="Command (m/s²)")
         axes.set(xlabel="Time since Vehicle 1 began to brake (s)")
         axes.label_outer()
-    return finish(figure, caption, every[0], columns=4)
+    return finish(figure, caption, all_axes[0], columns=4)
 
 
-def all_records(settings: Settings) -> dict[str, Records]:
+def all_records(settings: ReproductionSettings) -> dict[str, Records]:
     """Recorded episodes under the paper's parameters as stated, and in the reading nearest to its results.
 
     Reading -> (policy, scenario number) -> episode. After trainings by the paper's own recipes, also the episodes of
     their first seed.
     """
     policies = tuple(settings.policies.items())
-    found = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
+    records = {"as stated": record_all(STATED, policies), "nearest reading": record_all(NEAREST, policies)}
     trained = tuple((name, specs[0]) for name, specs in process(settings).items())
-    return found | ({"paper's process": record_all(STATED, trained)} if trained else {})
+    return records | ({"paper's process": record_all(STATED, trained)} if trained else {})
 
 
-def reproduce_trajectories(settings: Settings) -> Made:
-    every, parts = all_records(settings), []
+def reproduce_trajectories(settings: ReproductionSettings) -> Made:
+    readings, parts = all_records(settings), []
     figures = []
-    for number, (name, records) in enumerate(every.items(), 1):
+    for number, (name, records) in enumerate(readings.items(), 1):
         text = f"Positions of the vehicles, {name}; an arrow every second, dashed lines join equal times."
-        figures.append(Drawn(f"trajectories-{number}", f"Trajectories, {name}", text, road_figure(records, text)))
-    for records in (every["as stated"], every["nearest reading"]):
-        one, two = (apart(records, k, "positions_m") for k in SCENARIOS)
+        figures.append(DrawnFigure(f"trajectories-{number}", f"Trajectories, {name}", text, road_figure(records, text)))
+    for records in (readings["as stated"], readings["nearest reading"]):
+        smaller, larger = (policy_difference(records, k, "positions_m") for k in PAPER_SCENARIOS)
         (ppo_1, sac_1), (ppo_2, sac_2) = (
-            [float(gap.mean()) for gap in both(records, 2, "gaps_m", pair)] for pair in (0, 1)
+            [float(gap.mean()) for gap in resample_pair(records, 2, "gaps_m", pair)] for pair in (0, 1)
         )
         parts.append(
             {
                 "positions under PPO and SAC are more alike in Scenario 1 than in 2": (
-                    f"root mean square {one:.2f} m against {two:.2f} m", one - two,
+                    f"root mean square {smaller:.2f} m against {larger:.2f} m", smaller - larger,
                 ),
                 "Scenario 2: PPO keeps the larger distance to Vehicle 3": (
                     f"mean gap {sac_2:.2f} m under SAC, {ppo_2:.2f} m under PPO", sac_2 - ppo_2,
@@ -116,7 +116,7 @@ def reproduce_trajectories(settings: Settings) -> Made:
                 *map(float, record.gaps_m[-1]),
             ),
         )
-        for name, records in every.items()
+        for name, records in readings.items()
         for (policy, number), record in records.items()
     ]
     numbers = ("Impacts", "First-impact harm", "Total harm", "Last gap 1 (m)", "Last gap 2 (m)")
@@ -125,17 +125,17 @@ def reproduce_trajectories(settings: Settings) -> Made:
     return Made(claims_of("Fig. 6", parts), [sheet], figures)
 
 
-def reproduce_accelerations(settings: Settings) -> Made:
-    every, parts = all_records(settings), []
+def reproduce_accelerations(settings: ReproductionSettings) -> Made:
+    readings, parts = all_records(settings), []
     text = "Command of Vehicle 2 over time, as the paper states the latencies and under other readings."
-    figure = Drawn("accelerations", "Acceleration profiles", text, profiles_figure(every, text))
-    for records in (every["as stated"], every["nearest reading"]):
-        one, two = (apart(records, k, "command_mps2") for k in SCENARIOS)
+    figure = DrawnFigure("accelerations", "Acceleration profiles", text, profiles_figure(readings, text))
+    for records in (readings["as stated"], readings["nearest reading"]):
+        smaller, larger = (policy_difference(records, k, "command_mps2") for k in PAPER_SCENARIOS)
         (first, ppo_changes, _), (_, sac_changes, braking) = (profile_of(records[name, 2]) for name in ("PPO", "SAC"))
         parts.append(
             {
                 "profiles of PPO and SAC are more alike in Scenario 1 than in 2": (
-                    f"root mean square difference {one:.2f} m/s² against {two:.2f} m/s²", one - two,
+                    f"root mean square difference {smaller:.2f} m/s² against {larger:.2f} m/s²", smaller - larger,
                 ),
                 "Scenario 2: PPO accelerates before it brakes": (f"first command {first:+.2f} m/s²", -first),
                 "Scenario 2: SAC decelerates throughout most of it": (
@@ -148,8 +148,11 @@ def reproduce_accelerations(settings: Settings) -> Made:
             }
         )  # fmt: skip
     rows = [
-        (*(name, str(number), policy, first), *(float(record.command_mps2[:, VEHICLE_2].min()), braking, changes))
-        for name, records in every.items()
+        (
+            *(name, str(number), policy, first),
+            *(float(record.command_mps2[:, VEHICLE_2_COLUMN].min()), braking, changes),
+        )
+        for name, records in readings.items()
         for (policy, number), record in records.items()
         for first, changes, braking in (profile_of(record),)
     ]
@@ -164,7 +167,7 @@ def reproduce_accelerations(settings: Settings) -> Made:
     return Made(claims_of("Fig. 7", parts), [sheet], [figure])
 
 
-def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
+def resample_pair(records: Records, number: int, what: str, column: int) -> list[Floats]:
     """Recorded quantity under PPO, and under SAC at the same times; a finished episode keeps its last value.
 
     ``number``: the paper's Scenario 1 or 2. ``what``: attribute of ``EpisodeRecord``. ``column``: vehicle or pair, from
@@ -172,16 +175,16 @@ def both(records: Records, number: int, what: str, column: int) -> list[Floats]:
     """
     pair = [records[name, number] for name in ("PPO", "SAC")]
     times = np.arange(0.0, float(max(record.time_s[-1] for record in pair)), 0.02)
-    return [np.interp(times, each.time_s, getattr(each, what)[:, column]) for each in pair]
+    return [np.interp(times, record.time_s, getattr(record, what)[:, column]) for record in pair]
 
 
-def apart(records: Records, number: int, what: str) -> float:
+def policy_difference(records: Records, number: int, what: str) -> float:
     """Root mean square over time of the difference between PPO and SAC, for Vehicle 2.
 
     ``number``: the paper's Scenario 1 or 2. ``what``: attribute of ``EpisodeRecord``.
     """
-    one, other = both(records, number, what, VEHICLE_2)
-    return float(np.sqrt(np.mean((one - other) * (one - other))))
+    ppo, sac = resample_pair(records, number, what, VEHICLE_2_COLUMN)
+    return float(np.sqrt(np.mean((ppo - sac) * (ppo - sac))))
 
 
 def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[Claim]:
@@ -191,9 +194,9 @@ def claims_of(where: str, readings: list[dict[str, tuple[str, float]]]) -> list[
     """
     claims = []
     for text in readings[0]:
-        (words, stated), (_, nearest) = (each[text] for each in readings)
+        (words, stated), (_, nearest) = (reading[text] for reading in readings)
         ours, near = ("holds" if value < 0.0 else "does not hold" for value in (stated, nearest))
-        outcome: Outcome = "agrees" if stated < 0.0 else "undecided"
+        outcome: Verdict = "agrees" if stated < 0.0 else "undecided"
         why = (
             f"with our policies, {words}" if stated < 0.0 else f"our policies do not show it, the paper's may ({words})"
         )
@@ -206,6 +209,6 @@ def profile_of(record: EpisodeRecord) -> tuple[float, float, float]:
 
     The share is of the time in which it moves after its latency.
     """
-    acting = record.time_s >= float(record.initial.latency_s[0, VEHICLE_2])
-    command, moving = record.command_mps2[acting, VEHICLE_2], record.speeds_mps[acting, VEHICLE_2] > 0.0
+    acting = record.time_s >= float(record.initial.latency_s[0, VEHICLE_2_COLUMN])
+    command, moving = record.command_mps2[acting, VEHICLE_2_COLUMN], record.speeds_mps[acting, VEHICLE_2_COLUMN] > 0.0
     return float(command[0]), float(np.abs(np.diff(command)).sum()), float((command[moving] < 0.0).mean())

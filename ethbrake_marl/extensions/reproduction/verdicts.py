@@ -21,12 +21,12 @@ from ethbrake_marl.evaluation.statistics import difference, mean, unpaired
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from ethbrake_marl.motion.layout import Floats
 
-Outcome = Literal["agrees", "differs", "cannot be", "undecided", "not run"]
+Verdict = Literal["agrees", "differs", "cannot be", "undecided", "not run"]
 
-TOLERANCE = 0.02
+VERDICT_TOLERANCE = 0.02
 
 HARM, PERCENT = Column("Harm"), Column("Collision rate", digits=1, scale=100.0, unit=" %")
-APART = Column("Difference", sign="+")
+DIFFERENCE = Column("Difference", sign="+")
 
 
 class Claim(NamedTuple):
@@ -34,7 +34,7 @@ class Claim(NamedTuple):
     paper: str  # what it says
     ours: str  # as the paper states its parameters
     nearest: str  # in the nearest reading
-    outcome: Outcome  # as stated
+    outcome: Verdict  # as stated
     why: str
 
     @property
@@ -44,26 +44,26 @@ class Claim(NamedTuple):
 
 
 def claims_sheet(claims: Sequence[Claim]) -> Sheet:
-    rows = [(each.where, each.paper, each.ours, each.nearest, each.verdict) for each in claims]
+    rows = [(claim.where, claim.paper, claim.ours, claim.nearest, claim.verdict) for claim in claims]
     headings = "Where", "The paper", "Ours, as stated", "Ours, nearest reading", "Why"
     return Sheet("", [Column(heading, text=True) for heading in headings], rows)
 
 
-def chance(ours: Estimate) -> float:
+def chance_difference(ours: Estimate) -> float:
     low, high = ours.ends
     return math.sqrt(2.0) * 0.5 * (high - low)
 
 
-def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) -> Outcome:
+def judge_number(printed: float, ours: Estimate, least: Estimate | None = None) -> Verdict:
     """Compare a printed number (not 0) with ours; the outcomes are explained in the module.
 
     ``least``: proven lower bound for all strategies.
     """
-    if least is not None and least.value - printed > chance(least):
+    if least is not None and least.value - printed > chance_difference(least):
         return "cannot be"
-    if abs(ours.value - printed) <= TOLERANCE * abs(printed):
+    if abs(ours.value - printed) <= VERDICT_TOLERANCE * abs(printed):
         return "agrees"
-    return "undecided" if abs(ours.value - printed) <= chance(ours) else "differs"
+    return "undecided" if abs(ours.value - printed) <= chance_difference(ours) else "differs"
 
 
 class Less(NamedTuple):
@@ -84,7 +84,7 @@ class Less(NamedTuple):
         return self.difference.ends[1] < 0.0
 
 
-def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, Outcome, str]:
+def judge_statement(parts: Sequence[Less], show: Column = DIFFERENCE) -> tuple[str, Verdict, str]:
     """Judge a statement of the paper, that some quantities are smaller than others.
 
     Return in how many comparisons (``parts``) it holds, the outcome, and the comparisons that fail or, if none does,
@@ -105,13 +105,19 @@ def judge_statement(parts: Sequence[Less], show: Column = APART) -> tuple[str, O
 
 
 def judge(
-    where: str, paper: str, stated: Sequence[Less], nearest: Sequence[Less] = (), *, why: str = "", show: Column = APART
+    where: str,
+    paper: str,
+    stated: Sequence[Less],
+    nearest: Sequence[Less] = (),
+    *,
+    why: str = "",
+    show: Column = DIFFERENCE,
 ) -> Claim:
     """Compare a statement of the paper with our results as stated and in the nearest reading.
 
     ``where`` and ``paper``: place and words of the statement. ``why``: the reason to show if they differ.
     """
     ours, outcome, numbers = judge_statement(stated, show)
-    other = judge_statement(nearest, show)[0] if nearest else ""
+    nearest_result = judge_statement(nearest, show)[0] if nearest else ""
     text = f"{why} ({numbers})" if why and outcome == "differs" else numbers
-    return Claim(where, paper, ours, other, outcome, text)
+    return Claim(where, paper, ours, nearest_result, outcome, text)

@@ -12,10 +12,10 @@ from ethbrake_marl.agents.drive import MODEL, Agent, Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
-from ethbrake_marl.extensions.search.best_harm import BUDGET, commands_of, e_v2x_bm_profiles
+from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, commands_of, e_v2x_bm_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of, with_braking
 from ethbrake_marl.extensions.search.search import refine, search_profiles
-from ethbrake_marl.extensions.search.tables import best_known, outdated_tables
+from ethbrake_marl.extensions.search.tables import best_stored, outdated_tables
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import AgentSettings, make_agent
 from ethbrake_marl.registry import Part
@@ -23,14 +23,14 @@ from ethbrake_marl.worlds.game import game_of
 from ethbrake_marl.worlds.roles import HELD, LEARNER
 from ethbrake_marl.worlds.scenario import Scenario
 
-CANDIDATES = 500  # plans that +search simulates
+SEARCH_CANDIDATES = 500  # plans that +search simulates
 MOST_CANDIDATES = 1_000_000
 START = {"honest": "universal"}  # count -> policy whose episode a search also starts from,
 OTHER_START = "ppo"  # and that of every other count
-ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
+DECISION_ROUNDING = 1e-6  # part of a step: a time this close before a decision counts as the decision
 
 
-class Memory(NamedTuple):
+class SearchMemory(NamedTuple):
     commands_mps2: Floats  # [n, T] at every decision
     start_s: Floats  # [n] time of the first decision
     predicted_harm: Floats  # [n] m2/s2
@@ -47,19 +47,21 @@ class Planner:
     def __init__(self, name: str, scenario: Scenario, count: str) -> None:
         self.name, self.scenario, self.count = name, scenario, count
 
-    def begin(self, alert: State, body: int) -> Memory:
+    def begin(self, alert: State, body: int) -> SearchMemory:
         """Choose the commands. Raises ``InvalidInput`` if another vehicle's commands are not known at the alert."""
-        game, alert = alone(self.scenario, alert, body)
+        game, alert = single_learner_game(self.scenario, alert, body)
         problem = problem_of(game, alert, count=self.count, objective=self.scenario.objective)
         commands, harm = self.choose(game, alert, problem, body)
-        return Memory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
+        return SearchMemory(commands, problem.state.clock[:, FIRST_DECISION].copy(), harm)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
         """Vehicle ``body``'s commands at every decision, [n, T] m/s2, and what they cost, [n] m2/s2."""
         raise NotImplementedError
 
-    def act(self, state: State, memory: Memory, body: int) -> tuple[Floats, Memory]:
-        step = np.floor((state.time_s - memory.start_s) / self.scenario.time_step_s + ROUNDING).astype(np.int64)
+    def act(self, state: State, memory: SearchMemory, body: int) -> tuple[Floats, SearchMemory]:
+        step = np.floor((state.time_s - memory.start_s) / self.scenario.time_step_s + DECISION_ROUNDING).astype(
+            np.int64
+        )
         at = np.clip(step, 0, memory.commands_mps2.shape[1] - 1)
         return memory.commands_mps2[np.arange(state.n), at], memory
 
@@ -71,7 +73,9 @@ class BestHarm(Planner):
     policy's episode is improved once more, so the agent never does more harm than either.
     """
 
-    def __init__(self, scenario: Scenario, count: str = "first", budget: int = BUDGET, name: str = "best_harm") -> None:
+    def __init__(
+        self, scenario: Scenario, count: str = "first", budget: int = SEARCH_BUDGET, name: str = "best_harm"
+    ) -> None:
         super().__init__(name, scenario, count)
         self.budget = budget
 
@@ -82,10 +86,10 @@ class BestHarm(Planner):
             warnings.warn(f"{self.name}: searches every world: {outdated[game.name]}", Unfamiliar, stacklevel=2)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        known, profiles = best_known(problem, self.count)
+        known_harm, profiles = best_stored(problem, self.count)
         commands = profiles.stepwise(int(problem.last_step.max()))[:, :, 0]
         harm = problem.value(problem.follow(profiles))
-        some = (np.isinf(known) | (self.scenario.objective != "total")).nonzero()[0]
+        some = (np.isinf(known_harm) | (self.scenario.objective != "total")).nonzero()[0]
         if len(some):
             commands[some], harm[some] = self.search(
                 game, alert.take(some), problem.take(some), body, commands.shape[1]
@@ -100,10 +104,10 @@ class BestHarm(Planner):
         start = START.get(self.count, OTHER_START)
         policy = make_agent(start, scenario=self.scenario)
         assert not isinstance(policy, Team)
-        theirs = commands_of(problem, game, alert, Team(start, {body: policy}))[:, :, 0]
-        better = refine(problem, theirs, budget=1)[1] < values[self.count]
-        first = np.where(better[:, np.newaxis], theirs, best[:, : theirs.shape[1]])
-        best[:, : theirs.shape[1]], harm = refine(problem, first, budget=self.budget)
+        policy_commands = commands_of(problem, game, alert, Team(start, {body: policy}))[:, :, 0]
+        better = refine(problem, policy_commands, budget=1)[1] < values[self.count]
+        first = np.where(better[:, np.newaxis], policy_commands, best[:, : policy_commands.shape[1]])
+        best[:, : policy_commands.shape[1]], harm = refine(problem, first, budget=self.budget)
         return best, harm
 
 
@@ -113,7 +117,9 @@ class Searched(Planner):
     It never does more harm than that agent, if the other vehicles keep their commands.
     """
 
-    def __init__(self, inner: Agent, scenario: Scenario, count: str = "first", candidates: int = CANDIDATES) -> None:
+    def __init__(
+        self, inner: Agent, scenario: Scenario, count: str = "first", candidates: int = SEARCH_CANDIDATES
+    ) -> None:
         check_whole_number("search: candidates", candidates, 1, MOST_CANDIDATES)
         super().__init__(f"{inner.name}+search", scenario, count)
         self.inner, self.candidates = inner, candidates
@@ -127,27 +133,28 @@ class Searched(Planner):
         return refine(problem, start, budget=self.candidates)
 
 
-def alone(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
+def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Game, State]:
     """Game with ``body`` as its only learner, while other learners brake fully, and its worlds at the alert.
 
     Raises ``InvalidInput`` if an agent drives another vehicle, because its commands are not known at the alert.
     """
-    for other, role in enumerate(scenario.roles.values(), 1):
-        if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
+    for vehicle, role in enumerate(scenario.roles.values(), 1):
+        if vehicle != body and role.partition(":")[0] not in (LEARNER, *HELD):
             raise InvalidInput(
-                f"scenario {scenario.name!r}: vehicle_{other} is driven by {role!r}, whose commands are not known at"
+                f"scenario {scenario.name!r}: vehicle_{vehicle} is driven by {role!r}, whose commands are not known at"
                 " the alert; a search needs scripts that hold one command"
             )
-    others = [each for each in scenario.learners if each != body]
-    return game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {})[1], with_braking(alert, others)
+    braking_learners = [learner for learner in scenario.learners if learner != body]
+    _, game = game_of(scenario.with_learners([scenario.vehicle_names[body - 1]]), {})
+    return game, with_braking(alert, braking_learners)
 
 
 def make_best_harm(argument: str | None, settings: AgentSettings) -> BestHarm:
-    budget = BUDGET if argument is None else int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
+    budget = SEARCH_BUDGET if argument is None else int(argument) if re.fullmatch("[0-9]{1,7}", argument) else 0
     if not 1 <= budget <= MOST_CANDIDATES:
         raise InvalidInput(
             f"agent {settings.spec!r}: after the colon, give the number of profiles to try in each world, from 1 to"
-            f" {MOST_CANDIDATES:,}, for instance best_harm:{BUDGET}"
+            f" {MOST_CANDIDATES:,}, for instance best_harm:{SEARCH_BUDGET}"
         )
     return BestHarm(settings.needed_scenario(), settings.harm_count, budget, settings.spec)
 
@@ -174,4 +181,4 @@ SEARCH = Part(
     about="drives the best commands that a search around the agent's own commands finds at the alert",
     knows=MODEL,
 )
-LADDER = ("best_harm",)  # what `--agents ladder` adds to the core's
+SEARCH_LADDER = ("best_harm",)  # what `--agents ladder` adds to the core's

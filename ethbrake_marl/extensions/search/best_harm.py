@@ -24,9 +24,9 @@ from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
 
-BUDGET = 20_000  # profiles that are simulated in each world, in each count
-CHUNK = 200  # worlds that are searched together
-CONSTANTS = 29  # constant commands with which every search begins
+SEARCH_BUDGET = 20_000  # profiles that are simulated in each world, in each count
+SEARCH_CHUNK = 200  # worlds that are searched together
+SEARCH_CONSTANTS = 29  # constant commands with which every search begins
 
 
 def best_harm(
@@ -35,16 +35,16 @@ def best_harm(
     *,
     counts: Sequence[str] = tuple(HARM),
     bodies: Sequence[int] | None = None,
-    budget: int = BUDGET,
+    budget: int = SEARCH_BUDGET,
     seed: int = 0,
     threads: int | None = None,
-    given: Sequence[Profiles] = (),
+    first_profiles: Sequence[Profiles] = (),
     objective: Declared = "total",
 ) -> BestHarmTable:
     """Search worlds at the alert for the profile (commands over time) of least harm; return a table.
 
-    The harm is at most that of every profile in ``given``, and of one vehicle's best constant deceleration. With
-    several vehicles it is at most what the same search reaches with one of them, while the others brake fully. A
+    The harm is at most that of every profile in ``first_profiles``, and of one vehicle's best constant deceleration.
+    With several vehicles it is at most what the same search reaches with one of them, while the others brake fully. A
     world's result depends on no other world.
 
     Args:
@@ -56,7 +56,7 @@ def best_harm(
         budget: number of profiles that are simulated in each world, for each count.
         seed: seed of the random search.
         threads: number of threads; None: one for each core.
-        given: profiles that are tried first, [n] each, with any number of phases.
+        first_profiles: profiles that are tried first, [n] each, with any number of phases.
         objective: whose harm is minimised, in each count, as under a scenario's key ``objective``; ``total``: the sum
             over the line. The table holds its values.
 
@@ -68,35 +68,45 @@ def best_harm(
         raise InvalidInput(f"counts = {tuple(counts)}: must be some of {', '.join(COUNTS)}, each once")
     effort = {"budget": budget, "seed": seed, "threads": (os.cpu_count() or 1) if threads is None else threads}
     problem = problem_of(game, alert, bodies, objective=objective)
-    found = [(profiles, problem.values(profiles)) for profiles in given]
+    outcomes = [(profiles, problem.values(profiles)) for profiles in first_profiles]
     for count in counts:
-        starts = [profiles for profiles, _ in found]
-        found.append(_searched(game, alert, problem.counting(count), starts, objective, effort))
+        starts = [profiles for profiles, _ in outcomes]
+        outcomes.append(_search(game, alert, problem.counting(count), starts, objective, effort))
     names = [f"vehicle_{body}" for body in problem.bodies]
     header: dict[str, Any] = {"scenario": game.name, "vehicles": names, "budget": budget, "search_seed": seed}
     header["physics"] = physics_digest()
     header |= {} if objective == "total" else {"objective": objective}
-    best = {count: best_of([(values[count], profiles) for profiles, values in found]) for count in counts}
-    harms, kept = {count: harm for count, (harm, _) in best.items()}, {count: one for count, (_, one) in best.items()}
-    return BestHarmTable(problem.identity, harms, kept, header)
+    best = {count: best_of([(values[count], profiles) for profiles, values in outcomes]) for count in counts}
+    harms, best_profiles = (
+        {count: harm for count, (harm, _) in best.items()},
+        {count: winners for count, (_, winners) in best.items()},
+    )
+    return BestHarmTable(problem.identity, harms, best_profiles, header)
 
 
-def _searched(
-    game: Game, alert: State, problem: Problem, given: Sequence[Profiles], objective: Declared, effort: dict[str, int]
+def _search(
+    game: Game,
+    alert: State,
+    problem: Problem,
+    first_profiles: Sequence[Profiles],
+    objective: Declared,
+    effort: dict[str, int],
 ) -> tuple[Profiles, dict[str, Floats]]:
-    starts, bodies = starting_profiles(problem, alert, given), problem.bodies.tolist()
+    starts, bodies = starting_profiles(problem, alert, first_profiles), problem.bodies.tolist()
     for body in bodies if len(bodies) > 1 else ():
-        alone = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)
-        starts.append(beside_braking(problem, alone, _searched(game, alert, alone, (), objective, effort)[0]))
+        single_problem = problem_of(game, alert, [body], count=problem.harm_count, objective=objective, deciders=bodies)
+        starts.append(
+            beside_braking(problem, single_problem, _search(game, alert, single_problem, (), objective, effort)[0])
+        )
     return search_profiles(problem, starts, **effort)
 
 
-def starting_profiles(problem: Problem, alert: State, given: Sequence[Profiles] = ()) -> list[Profiles]:
-    """Profiles with which a search begins: constant commands, ``given``, and for a single vehicle some more.
+def starting_profiles(problem: Problem, alert: State, first_profiles: Sequence[Profiles] = ()) -> list[Profiles]:
+    """Profiles with which a search begins: constant commands, ``first_profiles``, and for a single vehicle some more.
 
     These are E-V2X-BM's choice and profiles of full driving and full braking.
     """
-    starts = [problem.constant(problem.even_grid(CONSTANTS)), *given]
+    starts = [problem.constant(problem.even_grid(SEARCH_CONSTANTS)), *first_profiles]
     if len(problem.bodies) > 1:
         return starts
     return [e_v2x_bm_profiles(problem, alert), *starts, extreme_profiles(problem)]
@@ -114,7 +124,7 @@ def search_list(
     *,
     chunks: Path | None = None,
     on_progress: Callable[[int, int], None] | None = None,
-    known: BestHarmTable | None = None,
+    known_table: BestHarmTable | None = None,
     teams: Iterable[Team] = (),
     bodies: Sequence[int] | None = None,
     threads: int | None = None,
@@ -127,30 +137,32 @@ def search_list(
         alert: worlds at the alert.
         chunks: folder in which finished parts are stored, and read if they are of the same search. None: no files.
         on_progress: called with the number of finished worlds, and of all.
-        known: a table of the same vehicles, whose profiles are tried first.
+        known_table: a table of the same vehicles, whose profiles are tried first.
         teams: agents whose commands are tried first, too.
         bodies: as for ``best_harm``.
         threads: as for ``best_harm``.
         options: other arguments of ``best_harm``.
 
-    Raises ``InvalidInput`` if ``known`` contains none of the worlds, and the errors of ``best_harm``.
+    Raises ``InvalidInput`` if ``known_table`` contains none of the worlds, and the errors of ``best_harm``.
 
     """
     parts = []
-    if known is not None:
-        known.check_holds_any(problem_of(game, alert, bodies).identity)
-    for first in range(0, alert.n, CHUNK):
-        some = alert.take(slice(first, first + CHUNK))
+    if known_table is not None:
+        known_table.check_holds_any(problem_of(game, alert, bodies).identity)
+    for first in range(0, alert.n, SEARCH_CHUNK):
+        some = alert.take(slice(first, first + SEARCH_CHUNK))
         problem = problem_of(game, some, bodies)
-        given = [] if known is None else [known.stored(problem, count)[1] for count in known.harm]
-        given += [driven_profiles(problem, game, some, team) for team in teams]
-        asked = [repr(options).encode(), physics_digest().encode(), problem.identity.tobytes()]
-        asked += [array.tobytes() for each in given for array in each]
-        file = None if chunks is None else chunks / f"{hashlib.sha256(b''.join(asked)).hexdigest()[:16]}.npz"
+        first_profiles = (
+            [] if known_table is None else [known_table.stored(problem, count)[1] for count in known_table.harm]
+        )
+        first_profiles += [driven_profiles(problem, game, some, team) for team in teams]
+        request = [repr(options).encode(), physics_digest().encode(), problem.identity.tobytes()]
+        request += [array.tobytes() for part_profiles in first_profiles for array in part_profiles]
+        file = None if chunks is None else chunks / f"{hashlib.sha256(b''.join(request)).hexdigest()[:16]}.npz"
         if file is not None and file.exists():
             part = BestHarmTable.load(file)
         else:
-            part = best_harm(game, some, bodies=bodies, threads=threads, given=given, **options)
+            part = best_harm(game, some, bodies=bodies, threads=threads, first_profiles=first_profiles, **options)
             if file is not None:
                 file.parent.mkdir(parents=True, exist_ok=True)
                 part.save(file)
@@ -176,4 +188,4 @@ def commands_of(problem: Problem, game: Game, alert: State, team: Team) -> Float
 def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
     """Let a team drive; return its commands as profiles with one phase for each change of command."""
     steps = Profiles.of_steps(commands_of(problem, game, alert, team), problem.last_step)
-    return Profiles.join([compact(*one) for one in zip(*steps, strict=True)])
+    return Profiles.join([compact(*profile) for profile in zip(*steps, strict=True)])

@@ -11,49 +11,49 @@ import numpy as np
 
 from ethbrake_marl.extensions.proofs.line import rows_of
 from ethbrake_marl.extensions.proofs.meetings import meet_front, meet_rear
-from ethbrake_marl.extensions.search.kernels import allowed, try_all
+from ethbrake_marl.extensions.search.kernels import limit_command, try_all
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles
-from ethbrake_marl.extensions.search.search import prepared, seeded
+from ethbrake_marl.extensions.search.search import prepare_world, random_states
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import Floats
 
-KEPT = 12  # profiles of each world
+KEPT_PROFILES = 12  # profiles of each world
 LATEST_S = 2.0  # latest first change of command, in the first round
 TIMES = 24  # first changes that are tried in each round
-ROUNDS = 3  # each closer to the best time so far
+EXTREME_ROUNDS = 3  # each closer to the best time so far
 EXTREME_PHASES = 5
 WAYS = ((0, 0.0), (0, 0.5), (0, 1.0), (1, 0.5))  # steps by which the second change comes early, and the share in it
 
 
 def extreme_profiles(problem: Problem) -> Profiles:
-    """Best profiles of full driving and full braking for one controlled vehicle, [n * KEPT], world by world.
+    """Best profiles of full driving and full braking for one controlled vehicle, [n * KEPT_PROFILES], world by world.
 
     The meetings with its neighbours are computed as if these braked fully. In worlds without neighbours, or with a
     vehicle that moves backward, the profiles coast.
     """
     (body,), n, last = problem.bodies.tolist(), problem.n, problem.last_step
-    at, random = rows_of(problem.state, body), seeded(problem.identity, 0)
+    at, random = rows_of(problem.state, body), random_states(problem.identity, 0)
     kinds = [kind for kind, there in ((0, body > 1), (1, body < problem.state.vehicles)) if there]
-    ends = np.repeat(last, KEPT * MOST_PHASES).reshape(n, KEPT, MOST_PHASES)
-    commands = np.zeros((n, KEPT, MOST_PHASES, 1))
+    ends = np.repeat(last, KEPT_PROFILES * MOST_PHASES).reshape(n, KEPT_PROFILES, MOST_PHASES)
+    commands = np.zeros((n, KEPT_PROFILES, MOST_PHASES, 1))
     for k in np.flatnonzero((problem.state.speeds_mps >= 0.0).all(axis=1)):
-        world, room = prepared(problem, int(k), random, MOST_PHASES, False)
-        tried, values = [], []
+        world, room = prepare_world(problem, int(k), random, MOST_PHASES, False)
+        candidates, values = [], []
         for kind in kinds:
             low, high = 0.0, LATEST_S
-            for _ in range(ROUNDS):
+            for _ in range(EXTREME_ROUNDS):
                 changes = low + (high - low) * np.arange(TIMES) / (TIMES - 1)
                 value = np.empty(TIMES * len(WAYS))
-                tried.append(extremes(problem, int(k), at[k], kind, changes))
-                try_all(world, room, *tried[-1], value)
+                candidates.append(extremes(problem, int(k), at[k], kind, changes))
+                try_all(world, room, *candidates[-1], value)
                 values.append(value)
                 best = changes[value.argmin() // len(WAYS)]
                 around = 1.5 * (high - low) / (TIMES - 1)
                 low, high = max(best - around, 0.0), best + around
-        if tried:
-            order = np.concatenate(values).argsort(kind="stable")[:KEPT]
-            kept = Profiles.padded([Profiles.join(tried).take(order)], MOST_PHASES)[0]
-            ends[k], commands[k] = kept
+        if candidates:
+            order = np.concatenate(values).argsort(kind="stable")[:KEPT_PROFILES]
+            best_profiles = Profiles.padded([Profiles.join(candidates).take(order)], MOST_PHASES)[0]
+            ends[k], commands[k] = best_profiles
     return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, 1))
 
 
@@ -72,10 +72,10 @@ def write_extreme(kind, change, meeting, early, share, step, last, low, high, en
     back = max(int(min(meeting / step, float(last))) - early, turn + 1)
     ends[0], ends[1], ends[2] = turn, min(turn + 1, last), min(back, last)
     ends[3], ends[4] = min(back + 1, last), last
-    commands[0, 0] = commands[4, 0] = allowed(first, low, high)
-    commands[1, 0] = allowed(second + (change / step - turn) * (first - second), low, high)
-    commands[2, 0] = allowed(second, low, high)
-    commands[3, 0] = allowed(second + share * (first - second), low, high)
+    commands[0, 0] = commands[4, 0] = limit_command(first, low, high)
+    commands[1, 0] = limit_command(second + (change / step - turn) * (first - second), low, high)
+    commands[2, 0] = limit_command(second, low, high)
+    commands[3, 0] = limit_command(second + share * (first - second), low, high)
 
 
 @large

@@ -70,7 +70,7 @@ class Field(NamedTuple):
 
 
 @kernel
-def value_of(world, line):
+def search_value(world, line):
     """What the search minimises (m2/s2), plus a little of the other count of harm, which decides ties.
 
     ``world``: a ``World``. ``line`` [LINE_ROWS, N + 1]: the present state of its bodies.
@@ -96,7 +96,7 @@ def follow(world, lines, ends, commands, phase, most):
     bits of the episode; phase by phase it is several times faster and rounds differently.
     """
     numbers, clock = world.numbers, world.clock
-    value = value_of(world, lines[phase])
+    value = search_value(world, lines[phase])
     for p in range(phase, ends.shape[0]):
         step, at_rest, line = ends[p - 1] if p > 0 else 0, False, lines[p + 1]
         copy_line(lines[p], line)
@@ -113,14 +113,14 @@ def follow(world, lines, ends, commands, phase, most):
                 at_rest = stands(line, world.wanted)
                 if step >= clock[LAST]:
                     note_motion(line)
-            value = value_of(world, line)
+            value = search_value(world, line)
         if value >= most or at_rest:
             return value, p + 1
     return value, ends.shape[0]
 
 
 @large
-def draw(random):
+def next_uniform(random):
     """Next random number in [0, 1) of a splitmix64 generator, whose state is ``random`` [1]."""
     random[0] += np.uint64(0x9E3779B97F4A7C15)
     z = random[0]
@@ -132,16 +132,16 @@ def draw(random):
 
 @large
 def draw_below(random, n):
-    return min(int(draw(random) * n), n - 1)
+    return min(int(next_uniform(random) * n), n - 1)
 
 
 @large
 def draw_sign(random):
-    return 1.0 if draw(random) < 0.5 else -1.0
+    return 1.0 if next_uniform(random) < 0.5 else -1.0
 
 
 @kernel
-def allowed(command, low, high):
+def limit_command(command, low, high):
     """Command limited to ``low`` ... ``high``, rounded toward 0 to a multiple of 1 / RESOLUTION (m/s2)."""
     return int(min(max(command, low), high) * RESOLUTION) / RESOLUTION
 
@@ -153,7 +153,7 @@ def draw_command(world, b):
     Likely are full braking, full driving, 0, and the command of the vehicle ahead.
     """
     random, body, low, high = world.random, world.bodies[b], world.bounds[b, 0], world.bounds[b, 1]
-    u = draw(random)
+    u = next_uniform(random)
     if u < 0.35:
         return low
     if u < 0.5:
@@ -161,8 +161,8 @@ def draw_command(world, b):
     if u < 0.6:
         return 0.0
     if u < 0.7:
-        return allowed(world.wanted[body - 1], low, high)
-    return allowed(low + (high - low) * draw(random), low, high)
+        return limit_command(world.wanted[body - 1], low, high)
+    return limit_command(low + (high - low) * next_uniform(random), low, high)
 
 
 @large
@@ -178,13 +178,13 @@ def draw_profile(world, drawing, ends, commands):
         first = draw_below(random, drawing[ATTENTION])
         ends[0], ends[1], ends[2] = first, first + 1 + draw_below(random, drawing[LONGEST_WHILE]), last
         commands[1, 0], commands[2, 0] = draw_command(world, 0), low
-        commands[0, 0] = low if draw(random) < 0.8 else draw_command(world, 0)
+        commands[0, 0] = low if next_uniform(random) < 0.8 else draw_command(world, 0)
         for p in range(3):
             ends[p] = min(ends[p], last)
         return 3
     step = 0
     for p in range(6):
-        u = draw(random)
+        u = next_uniform(random)
         step = min(step + 1 + int(u * u * 25.0), last)
         ends[p] = step
         for b in range(bounds.shape[0]):
@@ -202,19 +202,19 @@ def draw_change(world, active, drawing, change):
     random, bounds = world.random, world.bounds
     if drawing[KIND] == PLAN:
         low, high = bounds[0, 0], bounds[0, 1]
-        change[WHAT], change[VEHICLE] = ADD if draw(random) >= 0.1 else SET, 0
+        change[WHAT], change[VEHICLE] = ADD if next_uniform(random) >= 0.1 else SET, 0
         change[PHASE] = draw_below(random, min(active, drawing[ATTENTION]))
-        u = draw(random)
+        u = next_uniform(random)
         change[LENGTH] = 1 + int(u * u * drawing[LONGEST_CHANGE])
         if change[WHAT] == ADD:  # down to a thousandth of all commands
             sign = draw_sign(random)
-            change[AMOUNT] = sign * (high - low) * exp(-6.907755278982138 * draw(random))
+            change[AMOUNT] = sign * (high - low) * exp(-6.907755278982138 * next_uniform(random))
         else:
             change[AMOUNT] = draw_command(world, 0)
         return
-    u = draw(random)
+    u = next_uniform(random)
     change[PHASE], b, change[LENGTH] = draw_below(random, active), draw_below(random, bounds.shape[0]), 1
-    sign, size, low, high = draw_sign(random), draw(random), bounds[b, 0], bounds[b, 1]
+    sign, size, low, high = draw_sign(random), next_uniform(random), bounds[b, 0], bounds[b, 1]
     change[VEHICLE] = b
     if u < 0.70:  # down to a millionth of all commands
         change[WHAT] = ADD if u < 0.45 else TRADE
@@ -243,12 +243,12 @@ def apply_change(change, bounds, ends, commands):
         if here == 0 or there == 0:
             return False
         before = commands[p, b]
-        commands[p, b] = allowed(before + amount, low, high)
-        commands[p + 1, b] = allowed(commands[p + 1, b] - (commands[p, b] - before) * here / there, low, high)
+        commands[p, b] = limit_command(before + amount, low, high)
+        commands[p + 1, b] = limit_command(commands[p + 1, b] - (commands[p, b] - before) * here / there, low, high)
         return commands[p, b] != before
     for q in range(p, min(p + int(change[LENGTH]), phases)):
         before = commands[q, b]
-        commands[q, b] = amount if what == SET else allowed(before + amount, low, high)
+        commands[q, b] = amount if what == SET else limit_command(before + amount, low, high)
         changed = changed or commands[q, b] != before
     return changed
 
@@ -262,7 +262,7 @@ def copy_profile(ends, commands, to_ends, to_commands):
 
 
 @kernel
-def largest(values):
+def largest_place(values):
     place = 0
     for m in range(1, values.shape[0]):
         if values[m] > values[place]:
@@ -271,35 +271,35 @@ def largest(values):
 
 
 @large
-def gather(world, room, ends, commands, phases, drawn, drawing, same, field):
-    """Fill ``field`` with the best of the given profiles [Q, K] and of ``drawn`` random ones, in any order.
+def gather(world, room, ends, commands, phases, random_count, drawing, tolerance, field):
+    """Fill ``field`` with the best of the given profiles [Q, K] and of ``random_count`` random ones, in any order.
 
-    ``phases`` [Q]: their numbers of phases. Of profiles whose values differ by less than ``same`` (m2/s2), only the
-    first is kept. ``world``, ``room``, ``field``: a ``World``, ``Room``, ``Field``. ``drawing``: as for
+    ``phases`` [Q]: their numbers of phases. Of profiles whose values differ by less than ``tolerance`` (m2/s2), only
+    the first is kept. ``world``, ``room``, ``field``: a ``World``, ``Room``, ``Field``. ``drawing``: as for
     ``draw_profile``.
     """
     worst, number = 0, ends.shape[0]
     begin = min(worst, number)  # 0, but no literal: numba would compile the physics again for it
-    for s in range(number + drawn):
-        used = phases[s] if s < number else 0
+    for s in range(number + random_count):
+        phase_count = phases[s] if s < number else 0
         if s < number:
             copy_profile(ends[s], commands[s], room.ends, room.commands)
         else:
-            used = draw_profile(world, drawing, room.ends, room.commands)
-        if used == 0:
+            phase_count = draw_profile(world, drawing, room.ends, room.commands)
+        if phase_count == 0:
             continue
-        tried_ends, tried = room.ends[:used], room.commands[:used]
-        value, reached = follow(world, room.lines, tried_ends, tried, begin, field.values[worst])
-        taken = reached > 0 and value < field.values[worst]
+        trial_ends, trial_commands = room.ends[:phase_count], room.commands[:phase_count]
+        value, reached = follow(world, room.lines, trial_ends, trial_commands, begin, field.values[worst])
+        is_accepted = reached > 0 and value < field.values[worst]
         for m in range(field.values.shape[0]):
-            taken = taken and not abs(field.values[m] - value) < same
-        if not taken:
+            is_accepted = is_accepted and not abs(field.values[m] - value) < tolerance
+        if not is_accepted:
             continue
-        copy_profile(tried_ends, tried, field.ends[worst], field.commands[worst])
-        field.phases[worst], field.values[worst] = used, value
+        copy_profile(trial_ends, trial_commands, field.ends[worst], field.commands[worst])
+        field.phases[worst], field.values[worst] = phase_count, value
         if value <= 0.0:
             break
-        worst = largest(field.values)
+        worst = largest_place(field.values)
 
 
 @large
@@ -311,7 +311,7 @@ def improve(world, room, ends, commands, budget, drawing, least):
     episode ends. A change that helps is tried again with twice the amount. A change without effect costs no budget,
     except in plans.
     """
-    change, lines, tried = room.change, room.lines, room.tried
+    change, lines, trial_lines = room.change, room.lines, room.tried
     new_ends, new_commands = room.ends[: ends.shape[0]], room.commands[: ends.shape[0]]
     begin = min(0, ends.shape[0])  # no literal, as in `gather`
     value, active = follow(world, lines, ends, commands, begin, math.inf)
@@ -329,14 +329,14 @@ def improve(world, room, ends, commands, budget, drawing, least):
             spent += 1 if drawing[KIND] == PLAN else 0
             continue
         spent += 1
-        copy_line(lines[phase], tried[phase])
-        new, reached = follow(world, tried, new_ends, new_commands, phase, value)
+        copy_line(lines[phase], trial_lines[phase])
+        new, reached = follow(world, trial_lines, new_ends, new_commands, phase, value)
         if reached < 0 or not new < value:
             continue
         value, active = new, reached
         copy_profile(new_ends, new_commands, ends, commands)
         for p in range(phase + 1, reached + 1):
-            copy_line(tried[p], lines[p])
+            copy_line(trial_lines[p], lines[p])
         change[AMOUNT] *= 2.0
         again = change[WHAT] != SET
     return value, active

@@ -10,23 +10,25 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.measures import Given, Statistic
 from ethbrake_marl.extensions.search.pricing import problem_of
-from ethbrake_marl.extensions.search.tables import best_known as stored, outdated_tables, shipped_tables
+from ethbrake_marl.extensions.search.tables import best_stored as stored, outdated_tables, shipped_tables
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 
 
-def least(game: Game, alert: State) -> dict[str, Floats]:
+def least_known_values(game: Game, alert: State) -> dict[str, Floats]:
     """Least known value of each count, count -> [n] m2/s2.
 
     The honest cost is included only if it is known in all worlds. Raises ``InvalidInput`` if the least harm of a world
     is in no shipped table.
     """
     problem = problem_of(game, alert)
-    known = {count: stored(problem, count)[0] for count in COUNTS}
-    known = {count: each for count, each in known.items() if count in HARM or np.isfinite(each).all()}
-    if any(np.isinf(known[count]).any() for count in HARM):
+    least_values = {count: stored(problem, count)[0] for count in COUNTS}
+    least_values = {
+        count: values for count, values in least_values.items() if count in HARM or np.isfinite(values).all()
+    }
+    if any(np.isinf(least_values[count]).any() for count in HARM):
         raise InvalidInput(f"measures limits: {_why_unknown(game.name)}; evaluate the agent best_harm beside yours")
-    return known
+    return least_values
 
 
 def _why_unknown(scenario: str) -> str:
@@ -47,16 +49,16 @@ def best_known(game: Game, alert: State, last: State) -> Given:
 
     The result is the same for every agent.
     """
-    return least(game, alert)
+    return least_known_values(game, alert)
 
 
 def regret(game: Game, alert: State, last: State) -> Given:
     """Harm (or honest cost) minus the least known in the same world. Below 0: the agent did even less."""
-    return {count: last.harm(count) - harm for count, harm in least(game, alert).items()}
+    return {count: last.harm(count) - harm for count, harm in least_known_values(game, alert).items()}
 
 
 SHARE = "How much of what the best known braking saves the agent saves: 0 % for full braking, 100 % for the best known."
-NAMED = {"honest": "honest cost", "first": "first-impact", "total": "total"}  # in headings
+COUNT_HEADINGS = {"honest": "honest cost", "first": "first-impact", "total": "total"}  # in headings
 LIMITS = {
     "best_known": Part(
         best_known, unit="m2/s2",
@@ -65,9 +67,9 @@ LIMITS = {
     "regret": Part(
         regret, unit="m2/s2",
         shown=tuple(
-            each
-            for count, name in NAMED.items()
-            for each in (
+            statistic
+            for count, name in COUNT_HEADINGS.items()
+            for statistic in (
                 Statistic(f"regret_{count}", "mean", f"Regret, {name}", f"Regret\n{count}", count),
                 Statistic(
                     f"share_of_possible_reduction_{count}", "decrease", f"Share of possible, {name}",

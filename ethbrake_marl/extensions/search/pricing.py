@@ -48,7 +48,7 @@ MOST_PHASES = 12  # of a profile, before it is polished at every decision,
 FEW_ENDS = 1, 2, 3, 4, 6, 8, 11, 14, 18, 23, 30  # and where they end, up to the last, in one that is shortened
 
 # what a search minimises
-WHOLE = 0.0  # harm of the line
+WHOLE_LINE = 0.0  # harm of the line
 WEIGHTED = 1.0  # weighted sum of the vehicles' harm
 LARGEST = 2.0  # largest weighted harm of a vehicle
 
@@ -106,12 +106,12 @@ class Profiles(NamedTuple):
         return Profiles(*(np.concatenate(arrays) for arrays in zip(*Profiles.padded(parts), strict=True)))
 
 
-def best_of(found: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
-    """Least of several harms [n] in each world, and its profile. ``found``: pairs; ties: the first."""
-    harms = np.stack([harm for harm, _ in found])
+def best_of(results: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
+    """Least of several harms [n] in each world, and its profile. ``results``: pairs; ties: the first."""
+    harms = np.stack([harm for harm, _ in results])
     pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
-    every = Profiles.padded([profiles for _, profiles in found])
-    return harms[pick, rows], Profiles(*(np.stack(arrays)[pick, rows] for arrays in zip(*every, strict=True)))
+    padded_profiles = Profiles.padded([profiles for _, profiles in results])
+    return harms[pick, rows], Profiles(*(np.stack(arrays)[pick, rows] for arrays in zip(*padded_profiles, strict=True)))
 
 
 class Problem(NamedTuple):
@@ -129,7 +129,7 @@ class Problem(NamedTuple):
     state: State  # at the first decision; all other vehicles hold ``wanted``
     time_step_s: float
     harm_count: str  # what is minimised (`episode.counts`)
-    aim: float  # WHOLE, WEIGHTED or LARGEST
+    aim: float  # WHOLE_LINE, WEIGHTED or LARGEST
     shares: Floats  # [n, 3, N + 1] weights of what a pair's front and rear vehicle share, and of the rear's own amount
     identity: UInt64s  # [n] hash of everything that decides the harm of a profile (``identities``)
 
@@ -277,7 +277,7 @@ def problem_of(
     shares = np.zeros((alert.n, 3, wanted.shape[1]))
     times = [state.clock[:, [FIRST_DECISION]], np.full((alert.n, 1), dt), state.clock[:, [LAST, END]]]
     identity = identities(alert._replace(wanted=wanted), chosen, np.hstack(times))
-    return aimed(Problem(chosen, state, dt, count, WHOLE, shares, identity), objective)
+    return with_objective(Problem(chosen, state, dt, count, WHOLE_LINE, shares, identity), objective)
 
 
 def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
@@ -287,18 +287,18 @@ def with_braking(alert: State, bodies: Sequence[int] | Ints) -> State:
     return alert._replace(wanted=wanted)
 
 
-def beside_braking(problem: Problem, alone: Problem, profiles: Profiles) -> Profiles:
+def beside_braking(problem: Problem, single_problem: Problem, profiles: Profiles) -> Profiles:
     """Profiles of all controlled vehicles of a problem: one follows ``profiles``, the others brake fully.
 
-    ``alone``: the problem of this one vehicle, in the same worlds. Its first decision may be later, because its latency
-    is longer; if its decisions are not also decisions of ``problem``, they are rounded to the nearest ones.
+    ``single_problem``: the problem of this one vehicle, in the same worlds. Its first decision may be later, because
+    its latency is longer; if its decisions are not also decisions of ``problem``, they are rounded to the nearest ones.
     """
-    later = alone.state.clock[:, FIRST_DECISION] - problem.state.clock[:, FIRST_DECISION]
+    later = single_problem.state.clock[:, FIRST_DECISION] - problem.state.clock[:, FIRST_DECISION]
     last = problem.last_step[:, np.newaxis]
     ends = np.minimum(profiles.ends + np.rint(later / problem.time_step_s).astype(np.int64)[:, np.newaxis], last)
     ends[:, -1:] = last
     commands = np.repeat(problem.bounds[:, np.newaxis, :, 0], ends.shape[1], axis=1)
-    commands[:, :, problem.bodies == alone.bodies[0]] = profiles.commands_mps2
+    commands[:, :, problem.bodies == single_problem.bodies[0]] = profiles.commands_mps2
     return Profiles(ends, commands)
 
 
@@ -319,14 +319,16 @@ def identities(alert: State, bodies: Ints, times: Floats) -> UInt64s:
         parts += [alert.wanted[rows, ahead:], times[rows], controlled[rows, ahead:]]
         forces = [of_line[:, FORCE], of_car[:, BRAKE_RATE], of_car[:, RELEASE_RATE]]
         builds = np.isfinite(of_car[:, [BRAKE_RATE, RELEASE_RATE]]).sum(axis=(1, 2))
-        whole, more = (np.ascontiguousarray(np.hstack(each) + 0.0, "<f8") for each in (parts, forces))  # -0.0 is 0.0
+        motion_rows, force_rows = (
+            np.ascontiguousarray(np.hstack(arrays) + 0.0, "<f8") for arrays in (parts, forces)
+        )  # -0.0 is 0.0
         for k, row in enumerate(rows):
-            content = whole[k].tobytes() + (more[k].tobytes() if builds[k] else b"")
+            content = motion_rows[k].tobytes() + (force_rows[k].tobytes() if builds[k] else b"")
             digests[row] = int.from_bytes(hashlib.blake2b(content, digest_size=8).digest(), "little")
     return digests
 
 
-def aimed(problem: Problem, objective: Declared) -> Problem:
+def with_objective(problem: Problem, objective: Declared) -> Problem:
     """Problem with ``objective``, as under a scenario's key, as what its search minimises.
 
     Raises ``InvalidInput`` if the controlled vehicles' objective is neither a weighted sum of harm nor ``maximin``, or
@@ -340,7 +342,7 @@ def aimed(problem: Problem, objective: Declared) -> Problem:
     if set(forms) == {"maximin"}:
         return problem.minimising(np.ones(problem.state.vehicles), largest=True)
     weights = [] if "maximin" in forms else [objectives[i].weights(car, i) for i in chosen]
-    if not weights or any(not np.array_equal(weights[0], other) for other in weights[1:]):
+    if not weights or any(not np.array_equal(weights[0], vector) for vector in weights[1:]):
         raise InvalidInput(
             f"objective {objective!r}: the {len(chosen)} controlled vehicles have different objectives, but a search"
             " minimises one; give all of them the same, for instance weighted:1,4,1"
@@ -355,7 +357,7 @@ def worth(line, shares, weights, aim):
     ``line`` [LINE_ROWS, N + 1]: the present state. ``shares`` [3, N + 1], ``aim``: as in ``Problem``. ``weights`` [6]:
     of the count of harm.
     """
-    if aim == WHOLE:
+    if aim == WHOLE_LINE:
         return amount_so_far(line, weights)
     value, from_ahead = 0.0, 0.0
     for i in range(line.shape[1]):
@@ -388,5 +390,5 @@ def follow_worlds(line, car, clock, wanted, ends, commands, bodies, time_step_s,
                 phase += 1
             for b in range(len(bodies)):
                 wanted[k, bodies[b]] = commands[k, phase, b]
-            met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
-            failed[k] = met == FAILED
+            outcome, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
+            failed[k] = outcome == FAILED

@@ -20,12 +20,12 @@ STEPWISE_SHARE = 0.02  # for the last one, step by step, which takes several tim
 POLISHING_SHARE = 0.2  # and for changes at every decision; half as many more of several decisions at once follow
 PER_PROFILE = 400  # the first field has one profile for this part of the budget,
 SMALLEST_FIELD, LARGEST_FIELD = 4, 128  # but at least and at most so many
-SAME = 1e-6  # profiles whose values (m2/s2) are closer count as the same
+SAME_VALUE = 1e-6  # profiles whose values (m2/s2) are closer count as the same
 LONGEST_TOGETHER = 50  # decisions that polishing changes at once
 ATTENTION_STEPS = 30  # phases are halved within this number of steps from the first decision
 
 # of a search around commands
-TEMPLATE_SHARE, THEIR_SHARE = 0.3, 0.3  # parts of the budget for templates, and for improving the best of them
+TEMPLATE_SHARE, IMPROVEMENT_SHARE = 0.3, 0.3  # parts of the budget for templates, and for improving the best of them
 ATTENTION_S = 3.0  # changes and templates begin within this time from the first decision
 LONGEST_CHANGE_S = 0.6
 LONGEST_WHILE_S = 0.8  # of the second command of a template
@@ -36,11 +36,11 @@ PROFILES = np.zeros(DRAWING, np.int64)  # random profiles and changes are those 
 
 
 def search_profiles(
-    problem: Problem, given: Sequence[Profiles], *, budget: int, seed: int = 0, threads: int = 1
+    problem: Problem, starts: Sequence[Profiles], *, budget: int, seed: int = 0, threads: int = 1
 ) -> tuple[Profiles, dict[str, Floats]]:
     """Search each world for the best profile; return it, and what it costs, count -> [n] m2/s2.
 
-    It is at least as good as each of the profiles ``given``, [n * Q] each: first the Q profiles of world 0, and so on.
+    It is at least as good as each of the profiles ``starts``, [n * Q] each: first the Q profiles of world 0, and so on.
     ``budget`` is about the number of profiles that are simulated in each world. The result does not depend on the
     number of threads. At last the best is polished: its commands are changed at every decision, of one vehicle also at
     several decisions at once.
@@ -50,53 +50,58 @@ def search_profiles(
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
     n = problem.n
-    ends, commands = joined([part.shortened() for part in given], n)
-    whole = [part for part in given if part.ends.shape[1] > MOST_PHASES]  # in the search they are shortened
-    random, polishing = seeded(problem.identity, seed), int(POLISHING_SHARE * budget)
+    ends, commands = join_profiles([part.shortened() for part in starts], n)
+    long_starts = [part for part in starts if part.ends.shape[1] > MOST_PHASES]  # in the search they are shortened
+    random, polishing = random_states(problem.identity, seed), int(POLISHING_SHARE * budget)
 
     def work(k: int) -> Profiles | None:
-        world, room = prepared(problem, k, random, MOST_PHASES, False)
+        world, room = prepare_world(problem, k, random, MOST_PHASES, False)
         last = int(problem.last_step[k])
         return search_world(world, room, Profiles(ends[k], commands[k]), last, max(budget - polishing, 1))
 
-    def polished(k: int) -> Profiles:
+    def polish(k: int) -> Profiles:
         last = int(problem.last_step[k])
-        world, room = prepared(problem, k, random, last, True)
-        each, mine = np.arange(1, last + 1), np.ascontiguousarray(best.take([k]).stepwise(last)[0])
-        _, active = improve(world, room, each, mine, polishing, PROFILES, 0.0)
+        world, room = prepare_world(problem, k, random, last, True)
+        step_ends, step_commands = np.arange(1, last + 1), np.ascontiguousarray(best.take([k]).stepwise(last)[0])
+        _, active = improve(world, room, step_ends, step_commands, polishing, PROFILES, 0.0)
         if len(problem.bodies) == 1 and active > 0:
             together = np.array([PLAN, last, LONGEST_TOGETHER, 1])
-            _, active = improve(world, room, each, mine, polishing // 2, together, 0.0)
-        each[max(active - 1, 0) :] = last
-        return compact(each, mine)
+            _, active = improve(world, room, step_ends, step_commands, polishing // 2, together, 0.0)
+        step_ends[max(active - 1, 0) :] = last
+        return compact(step_ends, step_commands)
 
     with ThreadPoolExecutor(threads) as pool:
-        found = list(pool.map(work, range(n)))
-        failed = [k for k in range(n) if found[k] is None]
+        leading_profiles = list(pool.map(work, range(n)))
+        failed = [k for k in range(n) if leading_profiles[k] is None]
         if failed:
             raise PhysicsError(dict.fromkeys(failed, "no profile could be simulated"))
-        best = Profiles.join([profile for profile in found if profile is not None])
-        every = [
+        best = Profiles.join([profile for profile in leading_profiles if profile is not None])
+        candidates = [
             best,
-            *(part.take(slice(q, None, len(part.ends) // n)) for part in whole for q in range(len(part.ends) // n)),
+            *(
+                part.take(slice(q, None, len(part.ends) // n))
+                for part in long_starts
+                for q in range(len(part.ends) // n)
+            ),
         ]
-        best = best_of([(problem.value(problem.follow(one)), one) for one in every])[1]
-        better = Profiles.join(list(pool.map(polished, range(n))))
-    best = best_of([(problem.value(problem.follow(one)), one) for one in (best, better)])[1]
+        best = best_of([(problem.value(problem.follow(candidate)), candidate) for candidate in candidates])[1]
+        better = Profiles.join(list(pool.map(polish, range(n))))
+    best = best_of([(problem.value(problem.follow(candidate)), candidate) for candidate in (best, better)])[1]
     return best, problem.values(best)
 
 
-def joined(parts: Sequence[Profiles], n: int) -> Profiles:
+def join_profiles(parts: Sequence[Profiles], n: int) -> Profiles:
     """Join lists of profiles of as many phases, each [n * q] (q may differ), into one list for each world, [n, Q]."""
     K, B = parts[0].commands_mps2.shape[1:]
     ends = np.concatenate([part.ends.reshape(n, -1, K) for part in parts], axis=1)
     return Profiles(ends, np.concatenate([part.commands_mps2.reshape(n, -1, K, B) for part in parts], axis=1))
 
 
-def search_world(world: World, room: Room, given: Profiles, last: int, budget: int) -> Profiles | None:
+def search_world(world: World, room: Room, starts: Profiles, last: int, budget: int) -> Profiles | None:
     """Best profile of one world, [1]; None if no profile can be simulated.
 
-    ``given``: profiles that are tried first. ``last``: number of decisions. ``budget``: number of profiles to simulate.
+    ``starts``: profiles that are tried first. ``last``: number of decisions. ``budget``: number of profiles to
+    simulate.
 
     First many profiles are improved in rounds, each of which keeps the better half. Then the phases of the best are
     divided and it is improved again; at last with a step-by-step simulation: where harm jumps, rounding decides how
@@ -107,34 +112,34 @@ def search_world(world: World, room: Room, given: Profiles, last: int, budget: i
     while budget >= 2 * M * PER_PROFILE and M < LARGEST_FIELD:
         M, rounds = 2 * M, rounds + 1
     field = field_for(M, K, B)
-    drawn = max(int(DRAWN_SHARE * budget) - len(given.ends), 0)
+    random_count = max(int(DRAWN_SHARE * budget) - len(starts.ends), 0)
     in_rounds, stepwise = int(ROUNDS_SHARE * budget), int(STEPWISE_SHARE * budget)
-    gather(world, room, *given, (given.ends == last).argmax(axis=1) + 1, drawn, PROFILES, SAME, field)
+    gather(world, room, *starts, (starts.ends == last).argmax(axis=1) + 1, random_count, PROFILES, SAME_VALUE, field)
     sort(field, M)
     for stage in range(rounds + 2):
-        left = max(M >> stage, 1)
-        each = in_rounds // (rounds * left)
+        survivors = max(M >> stage, 1)
+        profile_budget = in_rounds // (rounds * survivors)
         if stage == rounds:
-            divide(field, min(ATTENTION_STEPS, last))
-            each = budget - drawn - in_rounds - stepwise
+            halve_phases(field, min(ATTENTION_STEPS, last))
+            profile_budget = budget - random_count - in_rounds - stepwise
         elif stage == rounds + 1:
-            select(world, room, given, field)
-            each = stepwise
-        for m in range(left):
-            used = field.phases[m]
-            if used > 0 and field.values[0] > 0.0:
-                one = field.ends[m, :used], field.commands[m, :used]
-                field.values[m], active = improve(world, room, *one, each, PROFILES, 0.0)
-                field.ends[m, max(active - 1, 0) : used] = last  # the episode ends before later phases begin
-        sort(field, left)
-    used = field.phases[0]
-    return compact(field.ends[0, :used], field.commands[0, :used]) if used else None
+            select(world, room, starts, field)
+            profile_budget = stepwise
+        for m in range(survivors):
+            phase_count = field.phases[m]
+            if phase_count > 0 and field.values[0] > 0.0:
+                profile = field.ends[m, :phase_count], field.commands[m, :phase_count]
+                field.values[m], active = improve(world, room, *profile, profile_budget, PROFILES, 0.0)
+                field.ends[m, max(active - 1, 0) : phase_count] = last  # the episode ends before later phases begin
+        sort(field, survivors)
+    phase_count = field.phases[0]
+    return compact(field.ends[0, :phase_count], field.commands[0, :phase_count]) if phase_count else None
 
 
-def sort(field: Field, left: int) -> None:
-    order = np.argsort(field.values[:left], kind="stable")
+def sort(field: Field, survivors: int) -> None:
+    order = np.argsort(field.values[:survivors], kind="stable")
     for array in field:
-        array[:left] = array[order]
+        array[:survivors] = array[order]
 
 
 def compact(ends: Ints, commands: Floats) -> Profiles:
@@ -148,11 +153,11 @@ def compact(ends: Ints, commands: Floats) -> Profiles:
     return Profiles(ends[np.append(changes, True)][np.newaxis], commands[np.append(True, changes)][np.newaxis])
 
 
-def divide(field: Field, attention: int) -> None:
+def halve_phases(field: Field, attention: int) -> None:
     """Halve phases of a field's best profile until it has K; always the longest in the first ``attention`` steps."""
-    used, K = field.phases[0], field.ends.shape[1]
-    if used > 0 and field.values[0] > 0.0:
-        (ends,), (commands,) = compact(field.ends[0, :used], field.commands[0, :used])
+    phase_count, K = field.phases[0], field.ends.shape[1]
+    if phase_count > 0 and field.values[0] > 0.0:
+        (ends,), (commands,) = compact(field.ends[0, :phase_count], field.commands[0, :phase_count])
         while len(ends) < K:
             length = np.diff(np.minimum(ends, attention), prepend=0)
             j = int(length.argmax())
@@ -161,14 +166,14 @@ def divide(field: Field, attention: int) -> None:
         field.ends[0], field.commands[0], field.phases[0] = ends, commands, K
 
 
-def select(world: World, room: Room, given: Profiles, field: Field) -> None:
-    """Put the best profile of ``field`` and ``given`` first in ``field``; from now on simulate step by step."""
+def select(world: World, room: Room, starts: Profiles, field: Field) -> None:
+    """Put the best profile of ``field`` and ``starts`` first in ``field``; from now on simulate step by step."""
     world.numbers[STEPWISE] = 1.0
     best, few = field_for(1, *field.commands.shape[1:]), slice(SMALLEST_FIELD)
     gather(world, room, field.ends[few], field.commands[few], field.phases[few], 0, PROFILES, 0.0, best)
-    gather(world, room, *given, np.full(len(given.ends), given.ends.shape[1]), 0, PROFILES, 0.0, best)
-    for array, one in zip(field, best, strict=True):
-        array[0] = one[0]
+    gather(world, room, *starts, np.full(len(starts.ends), starts.ends.shape[1]), 0, PROFILES, 0.0, best)
+    for array, best_array in zip(field, best, strict=True):
+        array[0] = best_array[0]
 
 
 def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 0) -> tuple[Floats, Floats]:
@@ -185,31 +190,31 @@ def refine(problem: Problem, commands_mps2: Floats, *, budget: int, seed: int = 
         raise InvalidInput(f"vehicles {problem.bodies.tolist()}: plans are searched for one controlled vehicle")
     plans, random = (
         Profiles.of_steps(commands_mps2[:, :, np.newaxis].copy(), problem.last_step),
-        seeded(problem.identity, seed),
+        random_states(problem.identity, seed),
     )
     problem.check(plans)
-    templates, theirs = int(TEMPLATE_SHARE * budget), int(THEIR_SHARE * budget)
+    templates, improvement_budget = int(TEMPLATE_SHARE * budget), int(IMPROVEMENT_SHARE * budget)
     times = ATTENTION_S, LONGEST_CHANGE_S, LONGEST_WHILE_S
     drawing = np.array([PLAN, *(max(int(time / problem.time_step_s + 0.5), 1) for time in times)])
     failed = []
-    for k, (ends, mine) in enumerate(zip(*plans, strict=True)):
-        world, room = prepared(problem, k, random, len(ends), True)
-        value, active = improve(world, room, ends, mine, budget - templates - theirs, drawing, NO_HARM)
+    for k, (ends, commands) in enumerate(zip(*plans, strict=True)):
+        world, room = prepare_world(problem, k, random, len(ends), True)
+        value, active = improve(world, room, ends, commands, budget - templates - improvement_budget, drawing, NO_HARM)
         if active == 0:
             failed.append(k)
         elif value > NO_HARM:
             best = field_for(1, 3, 1)
             best.values[0] = value + WORSE
             gather(world, room, *field_for(0, 3, 1)[:3], templates, drawing, 0.0, best)
-            other = np.ascontiguousarray(Profiles(best.ends, best.commands).stepwise(len(ends))[0])
-            if best.phases[0] and improve(world, room, ends, other, theirs, drawing, NO_HARM)[0] < value:
-                mine[:] = other
+            template = np.ascontiguousarray(Profiles(best.ends, best.commands).stepwise(len(ends))[0])
+            if best.phases[0] and improve(world, room, ends, template, improvement_budget, drawing, NO_HARM)[0] < value:
+                commands[:] = template
     if failed:
         raise PhysicsError(dict.fromkeys(failed, "the given commands cannot be simulated"))
     return plans.commands_mps2[:, :, 0], problem.value(problem.follow(plans))
 
 
-def seeded(identity: UInt64s, seed: int) -> UInt64s:
+def random_states(identity: UInt64s, seed: int) -> UInt64s:
     """Initial state of each world's random number generator, [n], from its ``identity`` [n] and the seed."""
     with np.errstate(over="ignore"):
         z = identity ^ np.uint64((int(seed) * 0xD1342543DE82EF95) % 2**64)
@@ -220,11 +225,11 @@ def seeded(identity: UInt64s, seed: int) -> UInt64s:
 
 def field_for(profiles: int, phases: int, controlled: int) -> Field:
     commands = np.zeros((profiles, phases, controlled))
-    ends, used = np.zeros((profiles, phases), np.int64), np.zeros(profiles, np.int64)
-    return Field(ends, commands, used, np.full(profiles, np.inf))
+    ends, phase_counts = np.zeros((profiles, phases), np.int64), np.zeros(profiles, np.int64)
+    return Field(ends, commands, phase_counts, np.full(profiles, np.inf))
 
 
-def prepared(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
+def prepare_world(problem: Problem, k: int, random: UInt64s, phases: int, stepwise: bool) -> tuple[World, Room]:
     state = problem.state
     numbers = np.array([problem.time_step_s, problem.aim, stepwise])
     count = problem.harm_count

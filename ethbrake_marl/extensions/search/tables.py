@@ -23,9 +23,9 @@ from ethbrake_marl.files.store import write_file
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
 
-FORMAT = 2
+TABLE_FORMAT = 2
 SIZE_LIMIT_BYTES, UNPACKED_LIMIT_BYTES = 64 << 20, 256 << 20
-SHIPPED = Path(__file__).with_name("_tables")
+TABLE_FOLDER = Path(__file__).with_name("_tables")
 ABOUT = ("scenario", "list_seed", "episodes", "vehicles")  # entries of the header that messages show
 ARRAYS = {"identity": ("<u8", 1)}  # name of an array -> its type and number of axes,
 OF_COUNT = {"harm": ("<f8", 1), "ends": ("<u2", 2), "commands": ("<f8", 3)}  # and of those of one count of harm
@@ -45,10 +45,10 @@ class BestHarmTable:
             raise InvalidInput(f"{path}: there is no such file; give the file of a table of best known harm")
         data = read_plain(path, SIZE_LIMIT_BYTES, refusal=CorruptBundle)
         try:
-            arrays = _unpacked(data)
+            arrays = _unpack_arrays(data)
             header = parse_strict_json(arrays.pop("header", np.zeros(0)).tobytes())
-            if not isinstance(header, dict) or header.pop("format", None) is not FORMAT:
-                raise ValueError(f"header: must be an object with the entry format: {FORMAT}")
+            if not isinstance(header, dict) or header.pop("format", None) is not TABLE_FORMAT:
+                raise ValueError(f"header: must be an object with the entry format: {TABLE_FORMAT}")
             counts = [count for count in COUNTS if f"{count}_harm" in arrays]
             _check(arrays, counts)
         except ValueError as error:
@@ -63,7 +63,7 @@ class BestHarmTable:
         write_file(path, self.content())
 
     def content(self) -> bytes:
-        header = np.frombuffer(json.dumps({"format": FORMAT, **self.header}).encode(), np.uint8)
+        header = np.frombuffer(json.dumps({"format": TABLE_FORMAT, **self.header}).encode(), np.uint8)
         arrays: dict[str, NDArray[Any]] = {"header": header, "identity": self.identity}
         for count, (ends, commands) in self.profiles.items():
             arrays[f"{count}_harm"], arrays[f"{count}_ends"] = self.harm[count], ends.astype("<u2")
@@ -84,13 +84,13 @@ class BestHarmTable:
         of coasting.
         """
         rows = self.rows(problem.identity)
-        known = rows >= 0
-        if count not in self.harm or not known.any():
+        in_table = rows >= 0
+        if count not in self.harm or not in_table.any():
             return np.full(problem.n, np.inf), problem.coasting()
         ends, commands = self.profiles[count].take(rows)
-        ends = np.where(known[:, np.newaxis], ends, problem.last_step[:, np.newaxis])
-        profiles = Profiles(ends, np.where(known[:, np.newaxis, np.newaxis], commands, 0.0))
-        return np.where(known, self.harm[count][rows], np.inf), profiles
+        ends = np.where(in_table[:, np.newaxis], ends, problem.last_step[:, np.newaxis])
+        profiles = Profiles(ends, np.where(in_table[:, np.newaxis, np.newaxis], commands, 0.0))
+        return np.where(in_table, self.harm[count][rows], np.inf), profiles
 
     def check_holds_any(self, identity: UInt64s) -> None:
         if not (self.rows(identity) >= 0).any():
@@ -102,38 +102,38 @@ class BestHarmTable:
 
 
 @cache
-def _shipped() -> tuple[BestHarmTable, ...]:
-    return tuple(BestHarmTable.load(path) for path in sorted(SHIPPED.glob("*.npz")))
+def _load_shipped() -> tuple[BestHarmTable, ...]:
+    return tuple(BestHarmTable.load(path) for path in sorted(TABLE_FOLDER.glob("*.npz")))
 
 
 def shipped_tables() -> tuple[BestHarmTable, ...]:
     """Shipped tables that were made with this installation's physics, in the order of their files' names."""
-    return tuple(table for table in _shipped() if table.header.get("physics") == physics_digest())
+    return tuple(table for table in _load_shipped() if table.header.get("physics") == physics_digest())
 
 
 def outdated_tables() -> dict[str, str]:
     """Why other shipped tables are not used: name of the scenario -> one line."""
     now = physics_digest()
-    others = {table.header["scenario"]: table.header.get("physics") for table in _shipped()}
+    physics_of_tables = {table.header["scenario"]: table.header.get("physics") for table in _load_shipped()}
     return {
         scenario: f"the shipped table of best known harm for {scenario} is not used, because it was made for other"
         f" physics ({then!r}) than this installation's ({now!r})"
-        for scenario, then in others.items()
+        for scenario, then in physics_of_tables.items()
         if then != now
     }
 
 
-def best_known(problem: Problem, count: str) -> tuple[Floats, Profiles]:
+def best_stored(problem: Problem, count: str) -> tuple[Floats, Profiles]:
     """Least harm of each world in the shipped tables, [n] m2/s2, and the commands (profiles) that do it.
 
     ``count``: which harm (``episode.counts``). A world that is in no table has infinite harm and coasts.
     """
-    found = [table.stored(problem, count) for table in shipped_tables()]
+    results = [table.stored(problem, count) for table in shipped_tables()]
     nothing = np.full(problem.n, np.inf), problem.coasting()
-    return best_of([each for each in found if np.isfinite(each[0]).any()] or [nothing])
+    return best_of([result for result in results if np.isfinite(result[0]).any()] or [nothing])
 
 
-def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
+def _unpack_arrays(data: bytes) -> dict[str, NDArray[Any]]:
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(member.file_size for member in archive.infolist())
@@ -146,10 +146,10 @@ def _unpacked(data: bytes) -> dict[str, NDArray[Any]]:
 
 
 def _check(arrays: Mapping[str, NDArray[Any]], counts: list[str]) -> None:
-    wanted = ARRAYS | {f"{count}_{name}": kind for count in counts for name, kind in OF_COUNT.items()}
-    for name in sorted(wanted.keys() ^ arrays.keys()):
-        raise ValueError(f"array {name!r}: {'is missing' if name in wanted else 'must not be in this file'}")
-    for name, (kind, axes) in wanted.items():
+    expected_arrays = ARRAYS | {f"{count}_{name}": kind for count in counts for name, kind in OF_COUNT.items()}
+    for name in sorted(expected_arrays.keys() ^ arrays.keys()):
+        raise ValueError(f"array {name!r}: {'is missing' if name in expected_arrays else 'must not be in this file'}")
+    for name, (kind, axes) in expected_arrays.items():
         if arrays[name].dtype != np.dtype(kind) or arrays[name].ndim != axes or not arrays[name].size:
             raise ValueError(f"array {name!r}: has type {arrays[name].dtype} and shape {arrays[name].shape}")
     for count in counts:

@@ -60,18 +60,18 @@ def falsify_command(
         from ethbrake_marl.cli.settings import read_settings
         from ethbrake_marl.evaluation.identity import about_scenario, versions
         from ethbrake_marl.extensions.studies.machine import this_machine
-        from ethbrake_marl.extensions.studies.weakness import Measure, states_of
+        from ethbrake_marl.extensions.studies.weakness import WeaknessMeasure, states_of
 
         out.check(output, ".csv", what="worlds")
         chosen = read_settings(settings, of_command=("harm_count",))
         count = chosen.command.get("harm_count", "first")
-        asked = Measure.of(measure, agent, against, chosen.change_scenario(scenario), count)
-        worlds, measured, scores = asked.falsify(
-            budget, seed, most=keep, on_round=lambda done: out.progress(agent, done, budget)
+        weakness = WeaknessMeasure.of(measure, agent, against, chosen.change_scenario(scenario), count)
+        worlds, measured, scores = weakness.falsify(
+            budget, seed, most=keep, on_round=lambda world_count: out.progress(agent, world_count, budget)
         )
-        states, good = states_of(worlds, asked.scenario), scores[np.isfinite(scores)]
-        columns = {name: each.tolist() for name, each in measured._asdict().items() if each is not None}
-        rows = [dict(zip(columns, each, strict=True)) for each in zip(*columns.values(), strict=True)]
+        states, good = states_of(worlds, weakness.scenario), scores[np.isfinite(scores)]
+        columns = {name: values.tolist() for name, values in measured._asdict().items() if values is not None}
+        rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
         share = float((good > 0.0).mean())
         if output is not None and rows:
             out.write(output, csv_text(states), what="the worlds")
@@ -82,9 +82,9 @@ def falsify_command(
             "measure": measure,
             "against": against,
             "harm_count": count,
-            "scenario": asked.scenario.name,
+            "scenario": weakness.scenario.name,
             "settings": list(chosen.texts),
-            **about_scenario(asked.scenario, seed),
+            **about_scenario(weakness.scenario, seed),
             "tried": budget,
             "counted": len(good),
             "share_above_zero": share,
@@ -94,15 +94,15 @@ def falsify_command(
             "machine": this_machine(),
             "versions": versions(),
         }
-        shown = [
+        sheet_rows = [
             (f"{row['score']:.4g}", f"{row['harm']:.2f}", ", ".join(f"{key} {state[key]:.4g}" for key in state))
             for row, state in zip(rows, states, strict=True)
         ]
         left_out = f" ({budget - len(good):,} of them rejected by the scenario)" if len(good) < budget else ""
         out.result(
             content,
-            *([Sheet("", (measure.capitalize(), "Harm", "State"), shown, gap=2)] if rows else []),
-            f"{asked.scenario.name}: {budget:,} worlds tried{left_out}; {measure} in m2/s2, {count} count: worst"
+            *([Sheet("", (measure.capitalize(), "Harm", "State"), sheet_rows, gap=2)] if rows else []),
+            f"{weakness.scenario.name}: {budget:,} worlds tried{left_out}; {measure} in m2/s2, {count} count: worst"
             f" {content['worst']:.4g}, median {content['median']:.4g}; above 0 in {100 * share:.1f} % of the worlds."
             " The search prefers bad worlds, so these numbers are no estimates for random worlds.",
         )

@@ -13,7 +13,7 @@ from ethbrake_marl.worlds.sampling import draw_once, has_early_impact
 from ethbrake_marl.worlds.scenario import Scenario
 
 _UNUSED = 0.5  # value of a random number without effect
-_TRIED = 16  # random worlds in which the effect of a number is looked for: a load matters for some types only
+_TRIAL_WORLDS = 16  # random worlds in which the effect of a number is looked for: a load matters for some types only
 
 Place = tuple[tuple[int, ...], int]  # stream of random numbers (``worlds.counters``), and column in it
 
@@ -27,11 +27,11 @@ class Cube(NamedTuple):
         index = np.arange(len(points), dtype=np.int64)
 
         def numbers(width: int, stream: tuple[int, ...]) -> Floats:
-            drawn = np.full((len(points), width), _UNUSED)
+            uniforms = np.full((len(points), width), _UNUSED)
             for (of, column), u in zip(self.places, points.T, strict=True):
                 if of == stream:
-                    drawn[:, column] = u
-            return drawn
+                    uniforms[:, column] = u
+            return uniforms
 
         return draw_once(self.scenario, numbers, index).worlds
 
@@ -58,23 +58,23 @@ def cube_of(scenario: Scenario) -> Cube:
         )
     widths: dict[tuple[int, ...], int] = {}
 
-    def noted(width: int, stream: tuple[int, ...]) -> Floats:
+    def note_width(width: int, stream: tuple[int, ...]) -> Floats:
         widths[stream] = width
         return np.full((1, width), _UNUSED)
 
-    draw_once(scenario, noted, np.zeros(1, np.int64))
+    draw_once(scenario, note_width, np.zeros(1, np.int64))
     places = [(stream, column) for stream in sorted(widths) for column in range(widths[stream])]
-    points = np.random.default_rng(0).random((2, len(places), _TRIED, len(places)))
+    points = np.random.default_rng(0).random((2, len(places), _TRIAL_WORLDS, len(places)))
     points[1] = points[0]
     for k in range(len(places)):
         points[1, k, :, k] = (points[0, k, :, k] + 0.5) % 1.0
-    worlds = Cube(scenario, tuple(places)).worlds(points.reshape(2 * len(places) * _TRIED, len(places)))
+    worlds = Cube(scenario, tuple(places)).worlds(points.reshape(2 * len(places) * _TRIAL_WORLDS, len(places)))
     half = worlds.n // 2
     differ = ((array[:half] != array[half:]).any(axis=(1, 2)) for array in (worlds.line, worlds.car))
-    matters = np.logical_or(*differ).reshape(len(places), _TRIED).any(axis=1)
+    matters = np.logical_or(*differ).reshape(len(places), _TRIAL_WORLDS).any(axis=1)
     if not matters.any():
         raise InvalidInput(
             f"scenario {scenario.name!r}: no quantity is random, so all its worlds are the same; give at least one"
             " quantity a distribution"
         )
-    return Cube(scenario, tuple(place for place, used in zip(places, matters, strict=True) if used))
+    return Cube(scenario, tuple(place for place, is_effective in zip(places, matters, strict=True) if is_effective))

@@ -12,7 +12,7 @@ from ethbrake_marl.motion.layout import Floats, Ints
 Score = Callable[[Floats], Floats]  # points [n, d] of [0, 1) -> scores [n]; minus infinity: the point is invalid
 
 ROUND = 256  # points that are scored together
-APART = 0.1  # least difference of two results, in at least one coordinate
+LEAST_DISTANCE = 0.1  # least difference of two results, in at least one coordinate
 
 _PARENTS = 24  # parents of the next round; they are far apart
 _EXPLORING = 0.5  # fraction of each round that is spread evenly over the cube
@@ -20,7 +20,7 @@ _NEAREST, _FARTHEST = 1e-3, 0.3  # smallest and largest typical step from a pare
 _LAST = np.nextafter(1.0, 0.0)
 
 
-def search(
+def search_cube(
     score: Score, dimensions: int, budget: int, seed: int, on_round: Callable[[int], None]
 ) -> tuple[Floats, Floats]:
     """Search the unit cube for points with a high score; return all tried points, [budget, d], and their scores.
@@ -56,14 +56,14 @@ def _spread(dimensions: int, seed: int) -> Iterator[Floats]:
 def far_apart(points: Floats, scores: Floats, count: int) -> Ints:
     """At most ``count`` rows of ``points`` [m, d] with high finite ``scores`` [m], highest first.
 
-    Any two of the points differ by at least ``APART`` in some coordinate.
+    Any two of the points differ by at least ``LEAST_DISTANCE`` in some coordinate.
     """
     order = np.argsort(-scores, kind="stable")
     order = order[np.isfinite(scores[order])]
     chosen: list[int] = []
     while len(order) and len(chosen) < count:
         chosen.append(int(order[0]))
-        order = order[np.abs(points[order] - points[order[0]]).max(axis=1) >= APART]
+        order = order[np.abs(points[order] - points[order[0]]).max(axis=1) >= LEAST_DISTANCE]
     return np.array(chosen, np.int64)
 
 
@@ -75,8 +75,8 @@ def _children(parents: Floats, count: int, rng: np.random.Generator) -> Floats:
     moved = rng.random(parent.shape) < 0.5
     moved[np.arange(count), rng.integers(parent.shape[1], size=count)] = True
     step = np.where(moved, size * rng.standard_normal(parent.shape), 0.0)
-    one, other = (parents[rng.integers(len(parents), size=count)] for _ in range(2))
+    first_parent, second_parent = (parents[rng.integers(len(parents), size=count)] for _ in range(2))
     crossing = rng.random((count, 1)) < 1.0 / 3.0
-    moved_to = parent + np.where(crossing, 0.5 * (one - other) + 0.1 * step, step)
+    moved_to = parent + np.where(crossing, 0.5 * (first_parent - second_parent) + 0.1 * step, step)
     inside: Floats = 1.0 - np.abs(np.mod(moved_to, 2.0) - 1.0)  # reflects points that left the cube at its faces
     return np.clip(inside, 0.0, _LAST)

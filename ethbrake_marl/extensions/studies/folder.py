@@ -42,8 +42,10 @@ def work_in(
                 before = read_object(folder / record)
             except InvalidInput as error:
                 raise InvalidInput(f"{error}; {advice}") from None
-            if other := _differences(before, now):
-                raise InvalidInput(f"{folder}: the folder contains {kind} with other settings ({other}); {advice}")
+            if differences := _differences(before, now):
+                raise InvalidInput(
+                    f"{folder}: the folder contains {kind} with other settings ({differences}); {advice}"
+                )
         remove_unfinished(folder)
         write_file(folder / record, (json.dumps(now, indent=2) + "\n").encode())
         yield

@@ -12,23 +12,23 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.extensions.studies.cube import cube_of
-from ethbrake_marl.extensions.studies.falsification import far_apart, search
+from ethbrake_marl.extensions.studies.falsification import far_apart, search_cube
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game, teams_of
 from ethbrake_marl.worlds.describe import fixed_columns, quantities_of
 from ethbrake_marl.worlds.scenario import Scenario
 
-MEASURES = ("harm", "regret", "bound")
+WEAKNESS_MEASURES = ("harm", "regret", "bound")
 HINDSIGHT = "best_harm"  # with what regret compares by default
 
 
-class Measured(NamedTuple):
+class WeaknessResult(NamedTuple):
     score: Floats  # [n] value of the measure, the larger the worse for the agent
     harm: Floats  # [n] harm of the agent
     reference: Floats | None  # [n] harm of the other agent, or bound of the agent's shield; None for ``harm``
 
 
-class Measure(NamedTuple):
+class WeaknessMeasure(NamedTuple):
     """Measure of how badly an agent does in a world.
 
     ``harm``: the agent's harm. ``regret``: its harm minus that of another agent, by default the best known harm.
@@ -42,43 +42,43 @@ class Measure(NamedTuple):
     harm_count: str  # (``episode.counts``)
 
     @classmethod
-    def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> Measure:
+    def of(cls, name: str, agent: Any, against: Any, scenario: Scenario, harm_count: str = "first") -> WeaknessMeasure:
         """Measure ``name`` of ``agent``.
 
         ``against``: the other agent; None: none, or the best known commands. Agents are names or objects, as for
         ``eb.evaluate``. Raises ``InvalidInput`` if ``against`` is not used, or a name means several agents, and the
         errors of ``teams_of``.
         """
-        if name not in MEASURES:
-            raise unknown_name("measure", name, MEASURES)
+        if name not in WEAKNESS_MEASURES:
+            raise unknown_name("measure", name, WEAKNESS_MEASURES)
         if name != "regret" and against is not None:
             raise InvalidInput(f"--against {against}: only --measure regret compares two agents; leave --against out")
         loaded, game = open_game(scenario)
         chosen = [agent] if name != "regret" else [agent, HINDSIGHT if against is None else against]
-        listed = (each if isinstance(each, str) else {"agent": each} for each in chosen)
-        teams = [tuple(teams_of(each, loaded, harm_count=harm_count).values()) for each in listed]
-        if any(len(each) != 1 for each in teams):
+        specs = (choice if isinstance(choice, str) else {"agent": choice} for choice in chosen)
+        teams = [tuple(teams_of(spec, loaded, harm_count=harm_count).values()) for spec in specs]
+        if any(len(group) != 1 for group in teams):
             raise InvalidInput(f"agent {agent!r}, --against {against!r}: a name means several agents; name one agent")
         return cls(name, loaded, game, sum(teams, ()), harm_count)
 
-    def __call__(self, worlds: State) -> Measured:
+    def __call__(self, worlds: State) -> WeaknessResult:
         """Measure in some worlds. Raises ``InvalidInput`` for ``bound`` without a shield."""
-        last, *other = (drive(self.game, worlds, team) for team in self.teams)
+        last, *rival_states = (drive(self.game, worlds, team) for team in self.teams)
         harm = last.harm(self.harm_count)
         if self.name == "harm":
-            return Measured(harm, harm, None)
+            return WeaknessResult(harm, harm, None)
         shielded = getattr(last.memories.get("shield"), "first", None)  # price of the shield's plan at the alert
-        reference = other[0].harm(self.harm_count) if other else shielded
+        reference = rival_states[0].harm(self.harm_count) if rival_states else shielded
         if reference is None:
             raise InvalidInput(
                 f"agent {self.teams[0].name!r} is not behind a shield that promises a bound at the alert; --measure"
                 " bound needs one, for instance ppo+step"
             )
-        return Measured(harm - reference, harm, reference)
+        return WeaknessResult(harm - reference, harm, reference)
 
     def falsify(
         self, budget: int, seed: int, *, most: int = 20, on_round: Callable[[int], None] | None = None
-    ) -> tuple[State, Measured, Floats]:
+    ) -> tuple[State, WeaknessResult, Floats]:
         """Search all worlds that the scenario can draw for those in which the agent does worst.
 
         Returns the at most ``most`` worst worlds at the alert, worst first, the measure in them, and the scores of all
@@ -96,7 +96,7 @@ class Measure(NamedTuple):
                 scores[rows] = self(worlds.take(rows)).score
             return scores
 
-        points, scores = search(score, len(cube.places), budget, seed, on_round or (lambda done: None))
+        points, scores = search_cube(score, len(cube.places), budget, seed, on_round or (lambda world_count: None))
         if not np.isfinite(scores).any():
             raise InvalidInput(
                 f"scenario {self.scenario.name!r}: in all {budget:,} tried worlds an impact happens before any agent"

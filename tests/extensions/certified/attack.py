@@ -7,7 +7,7 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.certified.robust import RobustShield, opened
+from ethbrake_marl.extensions.certified.robust import RobustShield, reset_without_shield
 from ethbrake_marl.names import open_game
 from tests.shields.attack import LINES, WAYS
 
@@ -30,7 +30,7 @@ class Wrongly(RobustShield):
         self.nominal = nominal
 
     def begin(self, game: Game, alert: State, state: State) -> Any:
-        return super().begin(game, self.nominal, opened(game, self.nominal))
+        return super().begin(game, self.nominal, reset_without_shield(game, self.nominal))
 
 
 class Episodes(NamedTuple):

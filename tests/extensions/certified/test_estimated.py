@@ -10,7 +10,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.certified.estimated import MedianLine, in_order
 from ethbrake_marl.extensions.certified.estimating import EstimatedEV2XBM, EstimatedShield
-from ethbrake_marl.extensions.certified.robust import opened
+from ethbrake_marl.extensions.certified.robust import reset_without_shield
 from ethbrake_marl.motion.layout import BRAKING, GAP, HIT, LATENCY, MASS, OWN_LATENCY, SPEED
 from tests.extensions.certified.attack import attacked
 from tests.refused import refused
@@ -35,7 +35,7 @@ def lines_at(
     loaded, game = eb.open_game(scenario)
     line, alert = MedianLine.of(loaded, 2), loaded.sample(n, 7)
     state = game.reset(alert)
-    median = line.heard(state, opened(game, line.at_alert(alert, state)))[0]
+    median = line.heard(state, reset_without_shield(game, line.at_alert(alert, state)))[0]
     for _ in range(steps):
         state = game.step(state, np.full((n, 1), action))[0]
         median = line.heard(state, game.follow(median, np.full((n, 1), action))[0])[0]

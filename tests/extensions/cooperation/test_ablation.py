@@ -10,9 +10,9 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COLUMN
-from ethbrake_marl.extensions.cooperation.ablation import Answer, Measured, can_imitate, least_known
+from ethbrake_marl.extensions.cooperation.ablation import Answer, LevelResult, can_imitate, least_known
 from ethbrake_marl.extensions.cooperation.levels import Level
-from ethbrake_marl.extensions.cooperation.results import compare, levels_csv
+from ethbrake_marl.extensions.cooperation.results import comparison, levels_csv
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.motion.layout import FAR_M, GAP
 from tests.fixtures.commands import Command
@@ -26,11 +26,11 @@ def columns(vehicles: list[list[float]]) -> dict[str, np.ndarray]:
     return {**borne, **line, "collided": each.any(axis=2)}
 
 
-def measured(level: str, vehicles: list[list[float]], algorithm: str | None, braking=None, before=None) -> Measured:
+def measured(level: str, vehicles: list[list[float]], algorithm: str | None, braking=None, before=None) -> LevelResult:
     scenario = eb.load_scenario(level)
     best = dict.fromkeys(COLUMN, np.ones((1, len(vehicles))))
     worlds = scenario.sample(1, 0)
-    return Measured(
+    return LevelResult(
         Level(level, scenario, before), algorithm, columns(vehicles), columns(braking or vehicles), worlds, best
     )
 
@@ -40,7 +40,7 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
     after = measured(
         "cooperation-1-front", [[1, 2, 3], [0, 2, 0], [1, 2, 0], [0, 0, 0]], "ppo", None, before.level.name
     )
-    (step,) = compare([before, after], 4)["steps"]
+    (step,) = comparison([before, after], 4)["steps"]
     assert (step["from"], step["to"], step["algorithm"]) == ("level-0-sensors", "cooperation-1-front", "ppo")
     for count in COLUMN:
         change = step[count]
@@ -52,11 +52,11 @@ def test_change__says_who_is_worse_off_and_by_how_much() -> None:
 
 def test_level__share_of_the_reduction_and_too_little_training_by_hand() -> None:
     one = measured("cooperation-1-front", [[1, 2, 0], [0, 2, 0]], "ppo", [[0, 6, 0], [0, 5, 0]])
-    found = compare([one], 2)
+    found = comparison([one], 2)
     share = found["levels"][0]["first"]["searched"]["share_of_possible_reduction"]
     assert share["value"] == pytest.approx((5.5 - 2.5) / (5.5 - 1.0)) and found["undertrained"] == []
     worse = measured("cooperation-1-front", [[0, 6, 0], [0, 5, 0]], "ppo", [[1, 2, 0], [0, 2, 0]])
-    (sentence,) = compare([worse], 2)["undertrained"]
+    (sentence,) = comparison([worse], 2)["undertrained"]
     assert "cooperation-1-front (ppo) with 5.50 (2.50 with full braking)" in sentence
 
 

@@ -15,11 +15,11 @@ from ethbrake_marl.extensions.cooperation.front import (
     observes_weights,
     search_front,
     weight_grid,
-    weighted,
+    weighted_harm,
 )
 from ethbrake_marl.extensions.cooperation.front_results import front_results, front_sheet, full_braking, hypervolumes
 from ethbrake_marl.extensions.search.pricing import problem_of
-from ethbrake_marl.extensions.search.tables import best_known
+from ethbrake_marl.extensions.search.tables import best_stored
 from ethbrake_marl.worlds.describe import clusters_of, columns_of
 from tests.evaluation.lines import recorded
 
@@ -40,7 +40,7 @@ def preferring(row: np.ndarray) -> eb.Scenario:
 
 def test_weighted__by_hand() -> None:
     """3 (1 * 2 + 4 * 5) / (1 + 4 + 0)."""
-    assert weighted(np.array([[2.0, 5.0, 100.0]]), np.array([1.0, 4.0, 0.0])).tolist() == [13.2]
+    assert weighted_harm(np.array([[2.0, 5.0, 100.0]]), np.array([1.0, 4.0, 0.0])).tolist() == [13.2]
 
 
 def test_means__golden(front: Front) -> None:
@@ -62,7 +62,7 @@ def test_point__is_never_beaten_under_its_weights_by_another_point_a_constant_or
     others = [*front.borne["first"], *constants, *(each for borne in front.agents.values() for each in borne["first"])]
     for row, least in zip(front.weights, front.amounts, strict=True):
         for borne in others:
-            assert (least <= weighted(borne, row)).all()
+            assert (least <= weighted_harm(borne, row)).all()
 
 
 def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None:
@@ -71,7 +71,7 @@ def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None
     scenario, game = eb.open_game(obstacle.replace(harm_weight=row.tolist(), objective="preference"))
     for name in ("universal", "vine-paper", "rollout-obstacle"):
         last = drive(game, scenario.sample(20, 777), Team(name, {2: eb.make_agent(name)}))
-        assert (found.amounts[0] <= weighted(last.borne_harm("total"), row)).all()
+        assert (found.amounts[0] <= weighted_harm(last.borne_harm("total"), row)).all()
 
 
 @pytest.mark.parametrize("spec", AGENTS)
@@ -91,7 +91,7 @@ def test_agents__that_do_not_observe_the_weights_drive_once() -> None:
 
 
 def test_equal_weights__are_as_good_as_the_tables(front: Front) -> None:
-    known = best_known(problem_of(eb.open_game(PAPER)[1], WORLDS), "first")[0]
+    known = best_stored(problem_of(eb.open_game(PAPER)[1], WORLDS), "first")[0]
     assert (front.borne["first"][3].sum(axis=1) <= known + 1e-9).all()
 
 
@@ -141,7 +141,7 @@ def test_two_learners__are_never_worse_than_one_nor_than_agents_that_drive_one_o
     )  # fmt: skip
     for row, least, *less in zip(rows, found.amounts, *(each.amounts for each in alone), strict=True):
         borne = [each[count] for front in (found, *alone) for each in front.agents.values()]
-        driven = [weighted(point, row) for points in borne for point in points]
+        driven = [weighted_harm(point, row) for points in borne for point in points]
         assert all((least <= other + 1e-9).all() for other in (*less, *driven))
     assert max(heard) == (3 * 2 * 3 * 8, 3 * 2 * 3 * 8)
 
@@ -169,7 +169,7 @@ def test_results__of_recorded_rows_have_intervals_by_recording() -> None:
     front = Front(np.ones((1, scenario.vehicles)), "first", less, {"agent": some})
     found = front_results(front, scenario, drawn, {"full_brake": borne}, 7)
     (point,), (driven,) = found["points"], found["agents"]["agent"]
-    amounts = [weighted(each["first"][0], front.weights[0]) for each in (less, some)]
+    amounts = [weighted_harm(each["first"][0], front.weights[0]) for each in (less, some)]
     assert found["beside"]["full_brake"]["total"][1] == mean(borne["total"][:, 1], by).to_json()
     assert point["amount"] == mean(amounts[0], by).to_json() and driven["ratio"] == pytest.approx(1.0 / 0.9)
     assert driven["above"] == difference(amounts[1], amounts[0], by).to_json()

@@ -15,7 +15,7 @@ from ethbrake_marl.extensions.cooperation.levels import (
     read_levels,
     sweep_levels,
 )
-from ethbrake_marl.worlds.mixture import WORDS
+from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS
 from tests.fixtures.commands import Refuse
 from tests.refused import refused
 
@@ -41,7 +41,7 @@ def test_parse__ranges_and_lists_in_ascending_order(text: str, settings: list[st
 def test_standard_levels__change_one_thing_each_in_the_same_worlds() -> None:
     levels = read_levels(STANDARD, NOTHING)
     assert [level.before for level in levels] == [None, *STANDARD[:-1]]
-    contents = [level.scenario.content(without=("name", *WORDS)) for level in levels]
+    contents = [level.scenario.content(without=("name", *DESCRIPTIVE_KEYS)) for level in levels]
     changes = [{key for key in one if one[key] != other[key]} for one, other in pairwise(contents)]
     assert changes == [{"v2x"}, {"roles", "objective"}, {"objective"}, {"roles"}, {"roles"}]  # at 1 nobody learns
     drawn = common_worlds(levels, 20, 7)

@@ -18,7 +18,7 @@ import torch
 from ethbrake_marl import kernel_store
 from ethbrake_marl.errors import CacheFault, InvalidInput, MissingExtra
 from ethbrake_marl.extensions.cuda import device, machine_code
-from ethbrake_marl.extensions.cuda.machine_code import PTX_VERSION, made, ptx_of
+from ethbrake_marl.extensions.cuda.machine_code import PTX_VERSION, compile_kernel, ptx_of
 from ethbrake_marl.extensions.cuda.worlds import Worlds
 from ethbrake_marl.motion import compiling
 from tests.extensions.cuda.test_worlds import SIX
@@ -49,12 +49,12 @@ def test_parameters__of_an_array_a_tuple_and_numbers() -> None:
 @pytest.mark.skipif(find_spec("numba_cuda") is not None, reason="numba-cuda is installed")
 def test_without_the_compiler__the_extra_is_named() -> None:
     with refused("ethbrake-marl[cuda]", MissingExtra):
-        made(lambda: None, (), (9, 0))
+        compile_kernel(lambda: None, (), (9, 0))
 
 
 def test_code_that_has_been_made__needs_no_compiler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(machine_code, "made", lambda kernel, *_: kernel)
+    monkeypatch.setattr(machine_code, "compile_kernel", lambda kernel, *_: kernel)
     assert ptx_of("play", lambda: "as before", (), (9, 0)) == "as before"
     for capability in ((9, 0), (12, 1)):  # a newer GPU runs it
         assert ptx_of("play", pytest.fail, (), capability) == "as before"
@@ -65,8 +65,8 @@ def test_code_that_has_been_made__needs_no_compiler(tmp_path: Path, monkeypatch:
 @pytest.mark.parametrize("name, capability", [("paper-random", (9, 0)), ("cooperation-4-five", (7, 5))])
 def test_machine_code__rounds_every_operation_as_a_processor_does(name: str, capability: tuple[int, int]) -> None:
     worlds = Worlds(name, 2, 4, "cpu")
-    given = device.like(worlds.arguments(torch.zeros(2, len(worlds.game.settings.learners)), 0))
-    code = made(worlds.kernel.thread(), (*given, 0), capability)
+    given = device.empty_arrays(worlds.arguments(torch.zeros(2, len(worlds.game.settings.learners)), 0))
+    code = compile_kernel(worlds.kernel.thread(), (*given, 0), capability)
     operations = set(re.findall(r"\b((?:fma|mul|add|sub|div|sqrt|rsqrt|rcp|ex2|lg2|sin|cos)\.[a-z.]*f\d\d)\b", code))
     allowed = {f"{name}.rn.{kind}" for name in ("mul", "add", "sub", "div", "sqrt") for kind in ("f32", "f64")}
     assert operations <= allowed and {"mul.rn.f64", "add.rn.f64", "div.rn.f64", "sqrt.rn.f64"} <= operations
@@ -102,7 +102,7 @@ def test_code__is_made_anew_when_the_threads_change(tmp_path: Path, monkeypatch:
     copied = shutil.copytree(Path(machine_code.__file__).parent, tmp_path / "cuda")
     monkeypatch.setattr(machine_code, "__file__", str(copied / "machine_code.py"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(machine_code, "made", lambda kernel, *_: kernel)
+    monkeypatch.setattr(machine_code, "compile_kernel", lambda kernel, *_: kernel)
     assert ptx_of("play", lambda: "old", (), (9, 0)) == "old"
     assert ptx_of("play", lambda: "new", (), (9, 0)) == "old"
     with (copied / "threads.py").open("a") as file:
@@ -116,8 +116,8 @@ def test_code__is_made_anew_when_the_threads_change(tmp_path: Path, monkeypatch:
 def test_code__that_is_damaged_is_made_anew(content: bytes | None, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(kernel_store, "_warned", [])
-    monkeypatch.setattr(machine_code, "made", lambda kernel, *_: kernel)
-    ptx_of("play", lambda: "made", (), (9, 0))
+    monkeypatch.setattr(machine_code, "compile_kernel", lambda kernel, *_: kernel)
+    ptx_of("play", lambda: "compile_kernel", (), (9, 0))
     [file] = (tmp_path / "ethbrake_marl").iterdir()
     file.unlink()
     file.mkdir() if content is None else file.write_bytes(content)

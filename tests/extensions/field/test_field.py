@@ -7,7 +7,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.errors import InvalidInput, UnknownName
-from ethbrake_marl.extensions.field.controllers import LAWS, Parameters, Seen, fuzzy
+from ethbrake_marl.extensions.field.controllers import LAWS, KnownMotion, Parameters, fuzzy_criteria
 from ethbrake_marl.motion.layout import GAP
 from ethbrake_marl.names import group, make_agent
 from tests.refused import refused
@@ -15,7 +15,7 @@ from tests.refused import refused
 
 def seen(gap, speed, front, front_force=0.0, own=0.0):
     columns = (np.atleast_1d(np.asarray(each, float)) for each in (gap, speed, front, front_force, own))
-    return Seen(*np.broadcast_arrays(*columns), 0.1)
+    return KnownMotion(*np.broadcast_arrays(*columns), 0.1)
 
 
 def called(name, *given, **parameters):
@@ -66,16 +66,16 @@ def test_fuzzy_model__by_hand() -> None:
     # The fuzzy criteria, 20 m/s behind 20 m/s: safe beyond 15 + 50 - 200/7 + 2 + 2 = 40.43 m of gap, unsafe within 15
     # + 33.33 - 28.57 + 2 = 21.76 m; 2 m/s closing adds the critical one: 1.5 + 4 / 8 = 2 m and 1.5 + 4 / 12 = 1.83 m.
     p = Parameters(**LAWS["r157_fsm"].parameters)
-    assert [np.round(each, 4).tolist() for each in fuzzy(seen([41, 31.0952381, 21], 20, 20), p)] == [
+    assert [np.round(each, 4).tolist() for each in fuzzy_criteria(seen([41, 31.0952381, 21], 20, 20), p)] == [
         [0.0, 0.5, 1.0],
         [0.0, 0.0, 0.0],
     ]
-    assert [np.round(each, 4).tolist() for each in fuzzy(seen([2.1, 1.9166667, 1.8], 20, 18), p)] == [
+    assert [np.round(each, 4).tolist() for each in fuzzy_criteria(seen([2.1, 1.9166667, 1.8], 20, 18), p)] == [
         [1.0, 1.0, 1.0],
         [0.0, 0.5, 1.0],
     ]
     # Braking with 4 m/s2 it will be slower than its front one after 0.75 s: what matters is 4 / 8 = 0.5 m.
-    assert fuzzy(seen([0.49, 0.51], 20, 18, 0, -4), p)[1].tolist() == [1.0, 0.0]
+    assert fuzzy_criteria(seen([0.49, 0.51], 20, 18, 0, -4), p)[1].tolist() == [1.0, 0.0]
 
 
 def test_un_r157__reacts_eases_off_and_brakes_with_a_jerk() -> None:
@@ -111,7 +111,8 @@ def test_nobody_is_ahead_until_news_of_it_have_come() -> None:
     assert driven("idm", late, 1)[0] < -3.0
     worlds = late.sample(1, 7)
     assert (
-        np.isinf(Seen.of(worlds, 2, 0.1).gap_m) and Seen.of(worlds._replace(know=0 * worlds.know), 2, 0.1).gap_m == 10
+        np.isinf(KnownMotion.of(worlds, 2, 0.1).gap_m)
+        and KnownMotion.of(worlds._replace(know=0 * worlds.know), 2, 0.1).gap_m == 10
     )
 
 

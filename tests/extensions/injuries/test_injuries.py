@@ -12,7 +12,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import UnknownName
 from ethbrake_marl.evaluation.named_measures import measures_called
-from ethbrake_marl.extensions.injuries.curves import injured, risks, speed_changes
+from ethbrake_marl.extensions.injuries.curves import expected_injuries, risks, speed_changes
 from tests.episode.lines import later, state_of
 from tests.episode.test_harm import met, of_objective
 from tests.evaluation.lines import FULL_BRAKE, PAIR, evaluated
@@ -54,8 +54,8 @@ def test_injured__by_the_larger_change_of_each_vehicle() -> None:
         (lambda dv: 1000 / (1 + np.exp(4.457 - 0.177 * dv))),
         (lambda dv: 1000 / (1 + np.exp(4.888 - 0.177 * dv))),
     )
-    assert injured(changes, "lr4s")[0] == pytest.approx([rear(4.0), rear(3.0), rear(3.0), 0.0])
-    assert injured(changes[:, ::-1], "lr4s")[0] == pytest.approx([front(4.0), front(3.0), rear(3.0), 0.0])
+    assert expected_injuries(changes, "lr4s")[0] == pytest.approx([rear(4.0), rear(3.0), rear(3.0), 0.0])
+    assert expected_injuries(changes[:, ::-1], "lr4s")[0] == pytest.approx([front(4.0), front(3.0), rear(3.0), 0.0])
 
 
 def test_changes_of_speed__between_two_states_by_hand() -> None:

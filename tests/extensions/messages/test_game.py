@@ -10,7 +10,7 @@ from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.belief import believed, require_pieces
 from ethbrake_marl.extensions.messages.game import MESSAGES_LAYER
-from ethbrake_marl.extensions.messages.links import NAME
+from ethbrake_marl.extensions.messages.links import MESSAGES_KEY
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import open_game
@@ -129,4 +129,4 @@ def test_usual_contents__written_out_change_no_bit_of_an_observation() -> None:
 def test_without_messages__there_is_no_memory_and_no_layer() -> None:
     game, state = played("nominal")
     assert game.layers == () and played(PERIODIC)[0].layers == (MESSAGES_LAYER,)
-    assert NAME not in stepped(game, state, 0.0).memories and game.own_infos(state) == {}
+    assert MESSAGES_KEY not in stepped(game, state, 0.0).memories and game.own_infos(state) == {}

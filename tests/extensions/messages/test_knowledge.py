@@ -7,7 +7,7 @@ import pytest
 
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.messages.belief import CAR_PIECES, ages_s, believed, known_pieces
-from ethbrake_marl.extensions.messages.links import NAME, P_ACCELERATION, P_INTENT, P_PLACE, P_SPEED
+from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, P_ACCELERATION, P_INTENT, P_PLACE, P_SPEED
 from ethbrake_marl.motion.layout import FORCE, GAP, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.extensions.messages.line import played, stepped
@@ -37,7 +37,7 @@ CHANNELS = {
 
 def altered(state: State, observer: int, rng: np.random.Generator) -> State:
     """The same episodes with random numbers for all that the observer has not received, the future included."""
-    known, memory = known_pieces(state, observer), state.memories[NAME]
+    known, memory = known_pieces(state, observer), state.memories[MESSAGES_KEY]
     present = known & (ages_s(state)[:, observer, :, np.newaxis] <= 0.0)
     present[:, 0] = True  # the obstacle has no message of its own
     line, car, know, wanted = state.line.copy(), state.car.copy(), state.know.copy(), state.wanted.copy()
@@ -64,7 +64,7 @@ def altered(state: State, observer: int, rng: np.random.Generator) -> State:
         channel = memory.channel.copy()
         channel[:, -1] += 1.0
         memory = memory._replace(news=news, samples=samples, links=links, channel=channel)
-    memories = {**state.memories, NAME: memory}
+    memories = {**state.memories, MESSAGES_KEY: memory}
     return state._replace(line=line, car=car, know=know, wanted=wanted, memories=memories)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.extensions.messages.belief import ages_s, believed
-from ethbrake_marl.extensions.messages.links import NAME, chance, moved_on
+from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, loss_number, moved_on
 from ethbrake_marl.motion.layout import GAP, HIT, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.extensions.messages.line import LINE, played, seen_by, stepped
@@ -44,7 +44,7 @@ def test_episode_that_has_ended__hears_no_more() -> None:
     while not state.ended[0]:
         state = stepped(game, state, -1.0)
     later = stepped(game, state, -1.0)
-    assert [a.tobytes() for a in later.memories[NAME]] == [a.tobytes() for a in state.memories[NAME]]
+    assert [a.tobytes() for a in later.memories[MESSAGES_KEY]] == [a.tobytes() for a in state.memories[MESSAGES_KEY]]
 
 
 def test_moved_on__by_hand() -> None:
@@ -58,7 +58,10 @@ def test_moved_on__by_hand() -> None:
 
 def test_chance__is_uniform_and_of_its_own_for_every_link_and_message() -> None:
     u = np.array(
-        [[[chance(key, link, number) for number in range(40)] for link in range(9)] for key in (0.0, 1.0, 2.0**53 - 1)]
+        [
+            [[loss_number(key, link, number) for number in range(40)] for link in range(9)]
+            for key in (0.0, 1.0, 2.0**53 - 1)
+        ]
     )
     assert len(np.unique(u)) == u.size and ((u >= 0.0) & (u < 1.0)).all()
     assert abs(u.mean() - 0.5) < 0.03
@@ -131,7 +134,13 @@ def test_world__hears_alone_what_it_hears_in_a_batch_and_after_a_put() -> None:
     mixed = mixed.put([2], whole.take([4])).put([5], whole.take([4]))
     for _ in range(12):
         whole, alone, mixed = stepped(game, whole, -0.3), stepped(game, alone, -0.3), stepped(game, mixed, -0.3)
-        expected = [game.observe_alike(alone, [2])[0].tobytes(), *(array.tobytes() for array in alone.memories[NAME])]
+        expected = [
+            game.observe_alike(alone, [2])[0].tobytes(),
+            *(array.tobytes() for array in alone.memories[MESSAGES_KEY]),
+        ]
         for state, row in ((whole, 4), (mixed, 2), (mixed, 5)):
             one = state.take([row])
-            assert [game.observe_alike(one, [2])[0].tobytes(), *(a.tobytes() for a in one.memories[NAME])] == expected
+            assert [
+                game.observe_alike(one, [2])[0].tobytes(),
+                *(a.tobytes() for a in one.memories[MESSAGES_KEY]),
+            ] == expected

@@ -11,7 +11,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert
 from ethbrake_marl.extensions.proofs import line as row
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
-from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, lacking
+from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, command_deviation
 from ethbrake_marl.extensions.proofs.flights import lead, widest_flight
 from ethbrake_marl.extensions.proofs.followers import after, after_rear, held_by_leader
 from ethbrake_marl.extensions.proofs.line import FRONT_FIRST, LARGE, REAR_FIRST
@@ -147,7 +147,7 @@ def test_decisions__leave_less_room_and_no_plan_is_below():
 
 
 def at(**given):
-    values = np.zeros(row.COLUMNS)
+    values = np.zeros(row.LINE_COLUMNS)
     for name, value in given.items():
         values[getattr(row, name)] = value
     return values
@@ -270,7 +270,7 @@ def test_command_in_force__the_way_to_a_gentle_contact_is_the_wrong_one_after_it
     # 0.5 s at c instead of -8 and braking earlier instead: the speed at the end is higher by (8 + c) / 2 times 0.5 s or
     # more. With 0.5 m/s more than the least, it brakes steeper by the share that is left before the command in force.
     steep = 0.5 / (1.0 - drive)
-    lack = [lacking(kind, values, start, 1.5, closing, closing + more, 1.0) for kind, start, more in (
+    lack = [command_deviation(kind, values, start, 1.5, closing, closing + more, 1.0) for kind, start, more in (
         (FRONT_FIRST, 1.5, 0.5), (FRONT_FIRST, 1.5, 0.0), (REAR_FIRST, 1.0, 0.0)
     )]  # fmt: skip
     assert lack == pytest.approx([8 - (1 + steep) / (1 + 0.5 * steep), 8, 0])

@@ -10,7 +10,7 @@ from ethbrake_marl.episode.counts import HARM
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.measures import Measure
 from ethbrake_marl.evaluation.summary import summarise
-from ethbrake_marl.extensions.report.best_known import AVOIDABLE, BEST, UNAVOIDABLE
+from ethbrake_marl.extensions.report.best_known import AVOIDABLE_COLUMN, BEST, UNAVOIDABLE
 from ethbrake_marl.names import teams_of
 
 AGENTS = ("full_brake", "constant:4.5", "ppo", "ppo+episode")
@@ -29,13 +29,13 @@ def with_best_known(compared: Compared) -> Compared:
         count: 0.5 * np.min([own[harm] for own in result.columns.values()], axis=0) for count, harm in HARM.items()
     }
     more = {BEST[count]: value for count, value in least.items()}
-    more[AVOIDABLE] = least["first"] == 0.0
+    more[AVOIDABLE_COLUMN] = least["first"] == 0.0
     more[UNAVOIDABLE] = least["first"] > 0.0
     columns = {agent: {**own, **more} for agent, own in result.columns.items()}
     searched = replace(
         result,
         columns=columns,
-        measures=(*result.measures, Measure("best_known"), Measure(AVOIDABLE), Measure(UNAVOIDABLE)),
+        measures=(*result.measures, Measure("best_known"), Measure(AVOIDABLE_COLUMN), Measure(UNAVOIDABLE)),
     )
     return compared._replace(result=searched, table=summarise(searched))
 

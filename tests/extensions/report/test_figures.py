@@ -17,7 +17,7 @@ from ethbrake_marl.extensions.report.figures import (
     harm_above,
     harm_against_total_gap,
     harm_by_agent,
-    over_seeds,
+    mean_over_seeds,
     trajectories,
     worlds_figure,
 )
@@ -154,8 +154,8 @@ def test_intervals__are_by_recording_wherever_worlds_come_from_recordings() -> N
 
 
 def test_curves__are_means_with_bands_and_lines() -> None:
-    curve = over_seeds([{0: 4.0, 10: 1.0, 15: 9.0}, {0: 8.0, 10: 3.0}])  # at the steps that all have
-    assert over_seeds([{5: 2.0}]) == {5.0: Estimate(2.0, (2.0, 2.0))}
+    curve = mean_over_seeds([{0: 4.0, 10: 1.0, 15: 9.0}, {0: 8.0, 10: 3.0}])  # at the steps that all have
+    assert mean_over_seeds([{5: 2.0}]) == {5.0: Estimate(2.0, (2.0, 2.0))}
     panels = {"harm": {"ppo": curve}, "return": {"ppo": {1: Estimate(-1.0, None)}}}
     figure = curves_figure(panels, "x", "c", lines={"harm": {"best known": 0.5}})
     left, right = figure.axes
@@ -202,7 +202,7 @@ def test_trajectories__of_a_team_show_the_commands_of_each_learner_and_the_obsta
 def test_deceleration_figure__marks_what_e_v2x_bm_predicts_and_does() -> None:
     """World 5 of seed 7: golden values of version 0.5."""
     scenario = eb.load_scenario("paper-random")
-    figure = deceleration_figure(scenario.sample(1, 7, first=5), scenario, known={"first": 14.41, "total": 14.84})
+    figure = deceleration_figure(scenario.sample(1, 7, first=5), scenario, best_known={"first": 14.41, "total": 14.84})
     words = legend(figure)
     assert "a* = 4.898 m/s², closed form: 17.74 predicted, 55.74 simulated" in words
     assert "a* = 6.188 m/s², coupled, least first-impact harm: 33.40" in words

@@ -9,7 +9,7 @@ import pytest
 
 from ethbrake_marl.errors import plain_text
 from ethbrake_marl.extensions.report.figures import SLIM_IN
-from ethbrake_marl.extensions.report.page import Section, data, drawing, part, table, whole_page as page_of
+from ethbrake_marl.extensions.report.page import Section, data, drawing, page_part, table, whole_page as page_of
 from ethbrake_marl.extensions.report.style import finish, new_figure
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
@@ -19,16 +19,16 @@ def whole_page(text: str) -> str:
     """A page in which the text stands in every place that a text can have."""
     body = [
         text,
-        part("paragraph", text, "note"),
+        page_part("paragraph", text, "note"),
         table(Sheet(text, [text, text], [[text, Shown(text, text)], text, [text, text]])),
         table(Sheet("", [text, Column(text)], [[text, text]])),
-        part("facts", {text: text}),
-        part("remarks", [text]),
-        part("box", text, {text: text}),
-        part("folded", text, [part("paragraph", text)]),
-        part("drawing", text, text, "slim", "", text),
+        page_part("facts", {text: text}),
+        page_part("remarks", [text]),
+        page_part("box", text, {text: text}),
+        page_part("folded", text, [page_part("paragraph", text)]),
+        page_part("drawing", text, text, "slim", "", text),
     ]
-    return page_of(text, text, [part("beside", part("watch", text), "")], [Section("Worst ten worlds", body)])
+    return page_of(text, text, [page_part("beside", page_part("watch", text), "")], [Section("Worst ten worlds", body)])
 
 
 HARMLESS = Page(whole_page("Harmless"))

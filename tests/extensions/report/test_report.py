@@ -14,7 +14,7 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episodes
 from ethbrake_marl.extensions.report.best_known import UNAVOIDABLE
 from ethbrake_marl.extensions.report.episodes import (
-    SAMPLE_S,
+    MOTION_SAMPLE_S,
     episode_data,
     pieces_of,
     replaced_at_s,
@@ -22,7 +22,7 @@ from ethbrake_marl.extensions.report.episodes import (
     worst_rows,
 )
 from ethbrake_marl.extensions.report.report import (
-    Report,
+    ReportPage,
     Test as OtherTest,
     avoidable_section,
     first_sentence,
@@ -47,7 +47,7 @@ def player_data(html: str) -> Any:
 def html(compared: Compared) -> str:
     other = OtherTest("Another test.", compared_by("paper-random-obstacle", AGENTS, 30))
     settings = {"Training seed": 5, "Command": "ethbrake run"}
-    return Report(
+    return ReportPage(
         "A page", compared, "One million steps.", settings, tests={"Obstacle test": other}, remarks=["Stopped early."]
     ).html
 
@@ -79,7 +79,7 @@ def test_first_sentence__of_the_honest_cost() -> None:
 
 
 def test_page__of_the_honest_cost_shows_it_beside_both_harms() -> None:
-    page = Page(Report("Mine", compared_by("paper-random", "full_brake,e_v2x_bm", 60, "honest"), "Short.", {}).html)
+    page = Page(ReportPage("Mine", compared_by("paper-random", "full_brake,e_v2x_bm", 60, "honest"), "Short.", {}).html)
     assert "Honest cost of each agent" in page.text
     assert "First-impact harm Total harm Honest cost Push (m/s)" in page.text
 
@@ -219,7 +219,9 @@ def test_pieces__are_the_motion_of_the_episode(name: str) -> None:
     scenario, game = eb.open_game(name)
     (team,) = teams_of("constant:3", scenario).values()
     worlds = scenario.sample(4, 7)
-    for record, fine in zip(*(record_episodes(worlds, team, game, step) for step in (SAMPLE_S, 1e-3)), strict=True):
+    for record, fine in zip(
+        *(record_episodes(worlds, team, game, step) for step in (MOTION_SAMPLE_S, 1e-3)), strict=True
+    ):
         pieces, N = pieces_of(record), scenario.vehicles
         assert len(pieces) < 0.3 * len(record.time_s)
         near = np.abs(fine.time_s[:, np.newaxis] - record.impacts.time_s).min(axis=1, initial=1.0) < 0.01
@@ -250,7 +252,7 @@ def test_page__says_who_did_not_repeat_itself(html: str) -> None:
         def act(self, state: eb.State, memory: Any, body: int) -> tuple[Any, Any]:
             return memory, memory
 
-    text = Report("t", compared_by("paper-random", {"fickle": Fickle()}, 5), "s", {}).html
+    text = ReportPage("t", compared_by("paper-random", {"fickle": Fickle()}, 5), "s", {}).html
     assert re.search(r"In [1-5] worlds? of these, fickle drove differently", text) and "drove differently" not in html
 
 
@@ -278,7 +280,7 @@ def test_page__hostile_names_are_text_everywhere() -> None:
     names = [text[:200] for text in HOSTILE]
     agents = {name: "constant:4" for name in names if name.isprintable()}  # others are refused
     found, words = compared_by("paper-random", agents, 3), " ".join(names)
-    html = Report(words, found, words, {name: name for name in names}, focus=next(iter(agents))).html
+    html = ReportPage(words, found, words, {name: name for name in names}, focus=next(iter(agents))).html
     page = Page(html)
     assert page.open == [] and not set(html) & UNSEEN and html.count("<script") == 2
     assert not any(key.startswith("on") for _, attributes in page.tags for key in attributes)

@@ -12,7 +12,7 @@ from ethbrake_marl.errors import _EXTRA_OF
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.extensions.report.paper_rows import HYBRID_TEST, RANDOM_TEST, is_papers_test, printed_sheet
 from ethbrake_marl.extensions.report.run import learners_sheets, telling_row
-from ethbrake_marl.extensions.report.three_tests import TESTS, brief, is_as_shipped, other_tests
+from ethbrake_marl.extensions.report.three_tests import TESTS, is_as_shipped, other_tests, short_sheet
 from ethbrake_marl.training.experiment import run_experiment
 from tests.cli.test_run import ctrl_c_when, status_of
 from tests.extensions.report.conftest import compared_by
@@ -122,7 +122,7 @@ def test_three_tests__are_each_others_and_of_the_shipped_scenarios_only() -> Non
 def test_brief__has_both_harms_of_each_test_and_the_honest_cost_with_the_push(count: str) -> None:
     main = compared_by("paper-random", "full_brake,coast,constant:3", 30, count)
     other = compared_by("paper-random-obstacle", "full_brake,coast", 30, count)
-    sheet = brief(main, {"paper-random-obstacle": other})
+    sheet = short_sheet(main, {"paper-random-obstacle": other})
     names = ["collision_rate", "first_impact_harm", "total_harm"]
     names += ["honest_cost", "pushed_mps"] if count == "honest" else []
     assert sheet.names[1:] == names and sheet.keep is None

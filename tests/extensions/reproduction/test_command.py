@@ -6,7 +6,7 @@ import pytest
 
 from ethbrake_marl.errors import AlreadyExists
 from ethbrake_marl.extensions.reproduction import items
-from ethbrake_marl.extensions.reproduction.made import Item, Made, Settings
+from ethbrake_marl.extensions.reproduction.made import Item, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.verdicts import Claim
 from ethbrake_marl.files.sheet import Column, Estimate, Sheet
 from tests.fixtures.commands import Command, Refuse, rows_of, told_json
@@ -65,7 +65,7 @@ def planted(why: str) -> Item:
 
 
 def test_page__by_hand_and_results_are_replaced_by_force_alone(tmp_path: Path) -> None:
-    settings = Settings(tmp_path / "out", episodes=24)
+    settings = ReproductionSettings(tmp_path / "out", episodes=24)
     items.reproduce(settings, [planted("b")], "a machine")
     text = (tmp_path / "out/README.md").read_text("utf-8")
     _, rest = text.split("| Where | The paper | Ours, as stated | Ours, nearest reading | Why |\n")
@@ -79,14 +79,14 @@ def test_page__by_hand_and_results_are_replaced_by_force_alone(tmp_path: Path) -
     with refused("README.md: already exists", AlreadyExists):
         items.reproduce(settings, [planted("c")], "m")
     items.reproduce(settings, [planted("d")], "m", force=True)
-    assert "agrees: d" in (settings.folder / items.PAGE).read_text()
+    assert "agrees: d" in (settings.folder / items.RESULTS_FILE).read_text()
 
 
 def test_interrupted__training_makes_no_item(tmp_path: Path, monkeypatch, ethbrake: Command) -> None:
     monkeypatch.setattr(items, "train", lambda *given: False)
     done = ethbrake("reproduce", "gaps", "--output", str(tmp_path / "again"))
     assert done.status == 130 and "interrupted; finished trainings remain; repeat the command" in done.err
-    assert not (tmp_path / "again" / items.PAGE).exists()
+    assert not (tmp_path / "again" / items.RESULTS_FILE).exists()
 
 
 @pytest.mark.parametrize(

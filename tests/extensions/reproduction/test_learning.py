@@ -8,8 +8,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.reproduction import learning
-from ethbrake_marl.extensions.reproduction.learning import HIGH, LOW, RANDOM, STOPPED, Course, Plan
-from ethbrake_marl.extensions.reproduction.made import Settings
+from ethbrake_marl.extensions.reproduction.learning import HIGH, LOW, RANDOM, STOPPED, Course, TrainingPlan
+from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
 from ethbrake_marl.extensions.reproduction.readings import STATED
 from ethbrake_marl.extensions.reproduction.tables import process_sheet
 from ethbrake_marl.extensions.reproduction.trajectories import all_records
@@ -42,7 +42,7 @@ def test_statements__by_planted_courses() -> None:
     low = {"SAC": runs(-90, -10, -10, -8, -12, -8), "PPO": three}  # SAC is at nine tenths sooner, and restless
 
     def outcomes(delay: str, high: dict[str, Course], low: dict[str, Course]) -> list[str]:
-        claims = learning.judged(delay, {HIGH: high, LOW: low})
+        claims = learning.judge_courses(delay, {HIGH: high, LOW: low})
         assert [each.paper for each in claims] == [*learning.STATEMENTS[delay]]
         assert {each.where for each in claims} == {learning.FIGURE[delay]}
         return [each.outcome for each in claims]
@@ -58,7 +58,7 @@ def test_statements__by_planted_courses() -> None:
         "undecided",
     ]  # three seeds cannot tell the last
     assert outcomes(LOW, low, high) == ["differs", "undecided", "agrees", "undecided"]
-    _, faster, *_ = learning.judged(LOW, {HIGH: high, LOW: low})
+    _, faster, *_ = learning.judge_courses(LOW, {HIGH: high, LOW: low})
     assert faster.ours == "by decisions it holds" and "SAC after 33 of 100 decisions, PPO after 67" in faster.why
     wide = {name: course([-90, 0, -9], [-90, 0, -2], [-90, 0, -9], [-90, 0, -2]) for name in low}
     assert outcomes(LOW, high, wide)[3] == "agrees" and outcomes(LOW, wide, high)[3] == "differs"
@@ -74,9 +74,9 @@ def plant(run: Path, end: float, status: str = "finished") -> None:
 
 
 def test_curves__have_the_columns_of_the_runs(tmp_path: Path) -> None:
-    full = Settings(tmp_path, full=True)
+    full = ReproductionSettings(tmp_path, full=True)
     for delay in (HIGH, LOW):
-        for number, plan in enumerate(learning.GROUPS[delay]):
+        for number, plan in enumerate(learning.TRAINING_GROUPS[delay]):
             for seed, run in enumerate(learning.runs_of(tmp_path, delay, plan)):
                 plant(run, 10.0 * number + seed)
     made = learning.reproduce_curves(HIGH, full)
@@ -85,16 +85,18 @@ def test_curves__have_the_columns_of_the_runs(tmp_path: Path) -> None:
     returns, harm = made.figures[0].figure.axes
     assert returns.lines[0].get_xdata().tolist() == [25.0, 50.0, 75.0, 100.0]
     assert harm.lines[1].get_ydata().tolist() == [13.0, 11.0] and harm.get_xlabel() == "Training progress (%)"
-    (learning.runs_of(tmp_path, LOW, learning.GROUPS[LOW][1])[2] / "run.json").write_text('{"status": "interrupted"}')
-    assert [*learning.trained(tmp_path, LOW)] == ["ppo-paper"]  # one seed of three is not finished
+    (learning.runs_of(tmp_path, LOW, learning.TRAINING_GROUPS[LOW][1])[2] / "run.json").write_text(
+        '{"status": "interrupted"}'
+    )
+    assert [*learning.finished_runs(tmp_path, LOW)] == ["ppo-paper"]  # one seed of three is not finished
     assert learning.seconds_left(tmp_path, [HIGH, LOW]) == 240.0
-    for settings in (full, Settings(tmp_path)):
+    for settings in (full, ReproductionSettings(tmp_path)):
         missing = learning.reproduce_curves(HIGH, settings)
         assert [each.outcome for each in missing.claims] == ["not run"] * 2 and not missing.figures
 
 
 def test_plans__are_of_the_papers_map_and_shipped_recipes() -> None:
-    for group, plans in learning.GROUPS.items():
+    for group, plans in learning.TRAINING_GROUPS.items():
         for plan in plans:
             recipe, _ = eb.load_recipe(plan.recipe), eb.load_scenario(plan.scenario)
             expected = (1, False, 100_000) if group == STOPPED else (5 if group == RANDOM else 3, True, None)
@@ -107,37 +109,37 @@ TINY = {"n_steps": 16, "batch_size": 64, "n_epochs": 1, "total_steps": 1024, "ne
 
 
 @pytest.fixture
-def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ReproductionSettings:
     load = eb.load_recipe
     monkeypatch.setattr(eb, "load_recipe", lambda name: load("ppo-paper").replace(name=name, **TINY))
     stopped, process = (
-        Plan("paper-random", "ppo", 1, 6.0, 512, mapped=False),
-        Plan("paper-random", "ppo-paper", 2, 200.0),
+        TrainingPlan("paper-random", "ppo", 1, 6.0, 512, mapped=False),
+        TrainingPlan("paper-random", "ppo-paper", 2, 200.0),
     )
     monkeypatch.setattr(learning, "GROUPS", {STOPPED: (stopped,), RANDOM: (process,)})
-    return Settings(tmp_path, full=True, episodes=20)
+    return ReproductionSettings(tmp_path, full=True, episodes=20)
 
 
-def test_trainings__stop_and_continue(tiny: Settings) -> None:
+def test_trainings__stop_and_continue(tiny: ReproductionSettings) -> None:
     def stop(progress: eb.Progress) -> None:
         if progress.done:
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        learning.train(replace(tiny, tell=stop), [STOPPED])
-    assert learning.trained(tiny.folder, STOPPED) == {} and learning.seconds_left(tiny.folder, [STOPPED]) == 6.0
-    assert learning.train(tiny, [STOPPED]) and learning.seconds_left(tiny.folder, [STOPPED]) == 0.0
+        learning.train_groups(replace(tiny, tell=stop), [STOPPED])
+    assert learning.finished_runs(tiny.folder, STOPPED) == {} and learning.seconds_left(tiny.folder, [STOPPED]) == 6.0
+    assert learning.train_groups(tiny, [STOPPED]) and learning.seconds_left(tiny.folder, [STOPPED]) == 0.0
     agent = eb.make_agent(learning.unconverged(tiny.folder), scenario="paper-random")
     assert agent.policy.manifest.steps == 512
 
 
 @pytest.mark.filterwarnings("error")
-def test_process__is_trained_once_in_the_papers_map_and_shown(tiny: Settings) -> None:
+def test_process__is_trained_once_in_the_papers_map_and_shown(tiny: ReproductionSettings) -> None:
     assert process_sheet(tiny, STATED, 20) == []
-    assert learning.train(tiny, [RANDOM])
-    seeds = learning.trained(tiny.folder, RANDOM)["ppo-paper"]
+    assert learning.train_groups(tiny, [RANDOM])
+    seeds = learning.finished_runs(tiny.folder, RANDOM)["ppo-paper"]
     before = [(run / "run.json").stat().st_mtime_ns for run in seeds]
-    assert learning.train(tiny, [RANDOM]) and before == [(run / "run.json").stat().st_mtime_ns for run in seeds]
+    assert learning.train_groups(tiny, [RANDOM]) and before == [(run / "run.json").stat().st_mtime_ns for run in seeds]
     mapped = eb.load_scenario("paper-random").replace(physics="paper-map")
     for run in seeds:
         assert '"physics": "paper-map"' in (run / "config.json").read_text("utf-8")

@@ -10,8 +10,8 @@ from ethbrake_marl.extensions.report.style import picture_bytes
 from ethbrake_marl.extensions.reproduction import curves, strategies, tables
 from ethbrake_marl.extensions.reproduction.documents import markdown
 from ethbrake_marl.extensions.reproduction.items import ITEMS
-from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, Settings
-from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED, reported
+from ethbrake_marl.extensions.reproduction.made import PAPER_EPISODES, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.random_test import NON_E, SHIPPED_SPECS, report_outcome
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, STATED
 from ethbrake_marl.extensions.reproduction.verdicts import claims_sheet
 from ethbrake_marl.motion.digest import physics_digest
@@ -39,10 +39,10 @@ def claims_of(page: str) -> list[str]:
 
 
 def test_results__have_every_claim_that_the_code_makes_and_no_other(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(strategies, "process", lambda settings: {name: [spec] for name, spec in SHIPPED.items()})
+    monkeypatch.setattr(strategies, "process", lambda settings: {name: [spec] for name, spec in SHIPPED_SPECS.items()})
     for module in (curves, tables):
         monkeypatch.setattr(module, "unconverged", lambda folder: "ppo-obstacle")
-    settings = Settings(tmp_path, episodes=20)
+    settings = ReproductionSettings(tmp_path, episodes=20)
     made = [claim for item in ITEMS for claim in item.make(settings).claims]
     committed = [re.split(r" ?\| ?", row)[1:3] for row in claims_of(RESULTS)]
     assert committed == [[each.where, each.paper.replace("H*", r"H\*")] for each in made]
@@ -50,7 +50,7 @@ def test_results__have_every_claim_that_the_code_makes_and_no_other(tmp_path, mo
 
 def test_results__are_those_of_this_version_and_the_non_ethical_row_of_today() -> None:
     assert f"version {__version__}, physics {physics_digest()})" in " ".join(RESULTS.split())
-    stated, nearest = ({NON_E: reported(NON_E, reading, PAPER_EPISODES)} for reading in (STATED, NEAREST))
+    stated, nearest = ({NON_E: report_outcome(NON_E, reading, PAPER_EPISODES)} for reading in (STATED, NEAREST))
     own = tables.number_claims("Table III", RANDOM_TEST[:1], stated, nearest, 0.0 * stated[NON_E][1])
     rows = markdown(claims_sheet(own)).splitlines()[2:]
     assert rows == [row for row in claims_of(RESULTS) if row.startswith(f"| Table III | {NON_E}, ")]

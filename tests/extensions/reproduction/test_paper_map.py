@@ -5,7 +5,7 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.episode.reward import RewardParams
-from ethbrake_marl.extensions.reproduction.paper_map import collision, sample
+from ethbrake_marl.extensions.reproduction.paper_map import paper_collision, sample
 from ethbrake_marl.motion.layout import GAP, HIT, IMPACTS, LATENCY, SPEED
 from ethbrake_marl.training.experiment import run_experiment
 from tests.refused import refused
@@ -124,9 +124,9 @@ def test_step__reports_and_rewards_what_happens() -> None:
 def test_collision__counts_every_sample_of_an_overlap_with_the_weight_of_its_pair() -> None:
     overlap = at_a_sample([-0.5, -0.1], [10.0, 20.0, 15.0])  # the front pair closes at 10, the rear one separates at 5
     params = RewardParams(harm=0.0, collision=1.0, k_energy=(0.5, 2.0))
-    assert collision(params, overlap, None, None).tolist() == [-(0.5 * 100.0 + 2.0 * 25.0)]
+    assert paper_collision(params, overlap, None, None).tolist() == [-(0.5 * 100.0 + 2.0 * 25.0)]
     apart = at_a_sample([0.5, 0.1], [10.0, 20.0, 15.0])
-    assert collision(params, apart, None, None).tolist() == [0.0]
+    assert paper_collision(params, apart, None, None).tolist() == [0.0]
 
 
 def test_k_energy__of_each_pair_in_exact_physics() -> None:

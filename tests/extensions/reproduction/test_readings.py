@@ -8,10 +8,10 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.agents.drive import drive
-from ethbrake_marl.agents.pairwise import pairwise, predicted_harm
+from ethbrake_marl.agents.pairwise import harm_of_deceleration, pairwise
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.reproduction import register
-from ethbrake_marl.extensions.reproduction.made import Settings
+from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
 from ethbrake_marl.extensions.reproduction.random_test import (
     E_V2X_BM,
     HYBRID_PPO,
@@ -19,17 +19,17 @@ from ethbrake_marl.extensions.reproduction.random_test import (
     NON_E,
     brake,
     plan,
-    reported,
+    report_outcome,
     table_of,
 )
 from ethbrake_marl.extensions.reproduction.readings import NEAREST, RANDOM, STATED, Reading
-from ethbrake_marl.extensions.reproduction.register import distance, numbers_of
+from ethbrake_marl.extensions.reproduction.register import distance, rates_and_harms
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
 from ethbrake_marl.names import open_game, teams_of
 from tests.refused import refused
 
 WORLDS = 100
-SETTINGS = Settings(Path("unused"), episodes=20)
+SETTINGS = ReproductionSettings(Path("unused"), episodes=20)
 
 EARLY = Reading(acts_s=0.2)
 DRIVEN_EARLY = register.EARLY_DRIVEN
@@ -65,7 +65,7 @@ GOLDEN = {  # in the first 100 worlds: collision rate and mean harm of Non-E, E-
 
 @pytest.mark.parametrize("name", ROWS)
 def test_numbers__are_as_recorded(name: str) -> None:
-    assert numbers_of(table_of(ROWS[name], WORLDS)).ravel() == pytest.approx(GOLDEN[name], abs=1e-6)
+    assert rates_and_harms(table_of(ROWS[name], WORLDS)).ravel() == pytest.approx(GOLDEN[name], abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +81,7 @@ def test_numbers__are_as_recorded(name: str) -> None:
 def test_hybrid__is_what_the_shield_does(reading: Reading, spec: str) -> None:
     scenario = reading.scenario(RANDOM)
     shield = eb.evaluate(scenario, spec, episodes=WORLDS, harm_count=reading.counted)[spec]
-    collided, harm = reported(HYBRID_PPO, reading, WORLDS, "ppo")
+    collided, harm = report_outcome(HYBRID_PPO, reading, WORLDS, "ppo")
     column = "total_harm" if reading.counted == "total" else "first_impact_harm"
     assert np.array_equal(harm, shield[column]) and np.array_equal(collided, shield["collided"])
 
@@ -90,10 +90,10 @@ def test_hybrid__is_what_the_shield_does(reading: Reading, spec: str) -> None:
 def test_baselines__are_what_the_agents_do(reading: Reading) -> None:
     result = eb.evaluate(reading.scenario(RANDOM), "full_brake,e_v2x_bm:pairwise", episodes=WORLDS)
     for row, name in ((NON_E, "full_brake"), (E_V2X_BM, "e_v2x_bm:pairwise")):
-        collided, harm = reported(row, reading, WORLDS)
+        collided, harm = report_outcome(row, reading, WORLDS)
         assert np.array_equal(harm, result[name]["first_impact_harm"])
         assert np.array_equal(collided, result[name]["collided"])
-    predicted = reported(E_V2X_BM, reading._replace(baseline="predicted"), WORLDS)[1]
+    predicted = report_outcome(E_V2X_BM, reading._replace(baseline="predicted"), WORLDS)[1]
     assert np.array_equal(predicted, result["e_v2x_bm:pairwise"]["predicted_harm"])
 
 
@@ -102,14 +102,14 @@ def test_predicted__harm_of_the_hybrid_is_what_algorithm_1_expects() -> None:
     team = teams_of("ppo+episode:pairwise", scenario)["ppo+episode:pairwise"]
     memory = drive(game, scenario.sample(WORLDS, 7), team).memories["shield"]
     expected = np.minimum(memory.policy_harm, memory.bound_harm)
-    collided, harm = reported(HYBRID_PPO, STATED._replace(hybrid="predicted"), WORLDS, "ppo")
+    collided, harm = report_outcome(HYBRID_PPO, STATED._replace(hybrid="predicted"), WORLDS, "ppo")
     assert np.array_equal(harm, expected) and np.array_equal(collided, expected > 0.0)
 
 
 def test_mixed__report_has_the_collisions_that_happen_and_the_harm_that_was_predicted() -> None:
-    collided, harm = reported(E_V2X_BM, DRIVEN_EARLY, WORLDS)
+    collided, harm = report_outcome(E_V2X_BM, DRIVEN_EARLY, WORLDS)
     assert np.array_equal(harm, plan(DRIVEN_EARLY, WORLDS).harm)
-    assert np.array_equal(collided, reported(E_V2X_BM, DRIVEN_EARLY._replace(baseline="realised"), WORLDS)[0])
+    assert np.array_equal(collided, report_outcome(E_V2X_BM, DRIVEN_EARLY._replace(baseline="realised"), WORLDS)[0])
     assert collided.sum() > (harm > 0.0).sum()
 
 
@@ -125,7 +125,7 @@ def test_ends_of_a_star__do_equally_little_harm_and_nothing_beyond_them_does() -
         car = alert.car[k].copy()
 
         def at(deceleration: float, k: int = k, car: np.ndarray = car) -> float:
-            return predicted_harm(alert.line[k], car[BRAKING], car[LATENCY], 2, deceleration)
+            return harm_of_deceleration(alert.line[k], car[BRAKING], car[LATENCY], 2, deceleration)
 
         assert max(at(low[k]), at(high[k])) < 1e-9
         assert at(low[k] - 1e-3) > 0.0 and (high[k] == 7.0 or at(high[k] + 1e-3) > 0.0)
@@ -180,7 +180,7 @@ def test_register__shows_every_alternative() -> None:
     assert measured.rows[0][:2] == ("our defaults", "as stated")
     for reading in (STATED, DRIVEN_EARLY, NEAREST):
         (row,) = (row for row in measured.rows if row[1] == reading.name)
-        numbers = numbers_of(table_of(reading, 20))
+        numbers = rates_and_harms(table_of(reading, 20))
         assert row[2] == distance(numbers)
         assert [each.value for each in row[3:7]] == numbers[:, 1].tolist() and [*row[7:]] == numbers[:, 0].tolist()
 
@@ -195,7 +195,7 @@ def test_register__shows_every_alternative() -> None:
     ids=lambda reading: reading.name,
 )  # fmt: skip
 def test_register__quantities_without_effect_have_none(reading: Reading) -> None:
-    assert np.array_equal(numbers_of(table_of(reading, WORLDS)), numbers_of(table_of(STATED, WORLDS)))
+    assert np.array_equal(rates_and_harms(table_of(reading, WORLDS)), rates_and_harms(table_of(STATED, WORLDS)))
 
 
 def test_policies__can_be_others() -> None:

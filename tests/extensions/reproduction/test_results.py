@@ -10,13 +10,20 @@ import ethbrake_marl as eb
 from ethbrake_marl.extensions.report.paper_rows import PAPER_NOTE, PaperRow
 from ethbrake_marl.extensions.reproduction import curves, strategies, tables, trajectories
 from ethbrake_marl.extensions.reproduction.curves import DISTANCE, EXPECTED, PROVEN
-from ethbrake_marl.extensions.reproduction.made import Made, Settings
-from ethbrake_marl.extensions.reproduction.random_test import E_V2X_BM, HYBRID_PPO, NON_E, SHIPPED, plan, reported
+from ethbrake_marl.extensions.reproduction.made import Made, ReproductionSettings
+from ethbrake_marl.extensions.reproduction.random_test import (
+    E_V2X_BM,
+    HYBRID_PPO,
+    NON_E,
+    SHIPPED_SPECS,
+    plan,
+    report_outcome,
+)
 from ethbrake_marl.extensions.reproduction.readings import RANDOM, STATED, Reading
 from ethbrake_marl.extensions.reproduction.strategies import COUPLED, PREDICTED
-from ethbrake_marl.extensions.reproduction.verdicts import Outcome, judge_statement
+from ethbrake_marl.extensions.reproduction.verdicts import Verdict, judge_statement
 
-SETTINGS = Settings(Path("unused"), episodes=100)
+SETTINGS = ReproductionSettings(Path("unused"), episodes=100)
 
 # collisions, first-impact harm, total harm, predicted harm in the first 100 worlds, by version 0.5
 GOLDEN = {
@@ -38,8 +45,8 @@ GOLDEN = {
 
 @pytest.mark.parametrize("reading", GOLDEN, ids=lambda reading: reading.name)
 def test_strategies__have_the_numbers_of_version_0_5(reading: Reading) -> None:
-    found = strategies.strategies(reading, 100, SHIPPED)
-    least = strategies.least_harm(reading, 100)
+    found = strategies.strategies(reading, 100, SHIPPED_SPECS)
+    least = strategies.proven_least_harm(reading, 100)
     for name, (collisions, first, total, predicted) in GOLDEN[reading].items():
         own = found[name]
         close = {"rel": 5e-4} if name == COUPLED else {"rel": 1e-12}  # the search for its deceleration is another
@@ -73,7 +80,7 @@ CONTRIBUTION_2 = "contribution 2: the hybrid is more reliable than learning alon
 
 def test_conclusions__by_planted_harm() -> None:
     found = outcomes(NonE=10.0, EV2X=5.0, SAC=3.5, PPO=2.0, HSAC=3.0, HPPO=2.5)
-    judged = {text: judge_statement(parts) for text, parts in tables.conclusions(found, SHIPPED).items()}
+    judged = {text: judge_statement(parts) for text, parts in tables.conclusions(found, SHIPPED_SPECS).items()}
     assert {text: each[:2] for text, each in judged.items()} == {
         "E-V2X-BM reduces the collisions of Non-E": ("does not hold", "differs"),
         "the hybrids collide least": ("holds in 0 of 4", "undecided"),
@@ -85,7 +92,7 @@ def test_conclusions__by_planted_harm() -> None:
     }
     assert judged[CONTRIBUTION_2][2].startswith("Hybrid PPO minus PPO")
     worse = outcomes(NonE=4.0, EV2X=5.0, SAC=6.0, PPO=6.0, HSAC=5.5, HPPO=4.5)
-    assert [judge_statement(parts)[:2] for parts in tables.conclusions(worse, SHIPPED).values()] == [
+    assert [judge_statement(parts)[:2] for parts in tables.conclusions(worse, SHIPPED_SPECS).values()] == [
         ("does not hold", "differs"), ("holds in 0 of 4", "differs"), ("holds in 0 of 6", "differs"),
         ("holds in 2 of 8", "differs"), ("holds in 0 of 4", "differs"), ("holds in 0 of 2", "differs"),
         ("holds in 4 of 6", "differs"),
@@ -114,7 +121,7 @@ def test_numbers__by_hand() -> None:
     ]  # fmt: skip
 
 
-def by_text(made: Made) -> dict[str, tuple[str, str, Outcome]]:
+def by_text(made: Made) -> dict[str, tuple[str, str, Verdict]]:
     texts = {each.paper: each[2:5] for each in made.claims}
     assert len(texts) == len(made.claims)
     return texts
@@ -128,7 +135,7 @@ def ppo_is_unconverged(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def process_is_shipped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(strategies, "process", lambda settings: {name: [spec] for name, spec in SHIPPED.items()})
+    monkeypatch.setattr(strategies, "process", lambda settings: {name: [spec] for name, spec in SHIPPED_SPECS.items()})
 
 
 @pytest.mark.usefixtures("process_is_shipped")
@@ -140,7 +147,7 @@ def test_random_table__has_every_printed_number_and_the_papers_process() -> None
     assert rate == ("80.0 % [71.1, 86.7]", "96.0 % [90.2, 98.4], undecided", "differs")
     rows = {name: [each and each.value for each in cells] for name, *cells in stated.rows}
     assert rows[E_V2X_BM] == pytest.approx([0.6, *GOLDEN[STATED][E_V2X_BM][1:]])
-    assert rows["least possible (proven)"][1] == pytest.approx(strategies.least_harm(STATED, 100).mean())
+    assert rows["least possible (proven)"][1] == pytest.approx(strategies.proven_least_harm(STATED, 100).mean())
     driven = eb.evaluate("paper-random-map", "full_brake,ppo", episodes=100)
     rows = {name: cells for name, *cells in process.rows}
     assert [*rows] == [NON_E, E_V2X_BM, "PPO", HYBRID_PPO, "SAC", "Hybrid SAC"]
@@ -157,7 +164,7 @@ def test_hybrid_table__cannot_be_and_its_bound_does_not_hold() -> None:
     assert len(found) == 6 + 3
     assert found["the hybrid avoids 2,005 collisions, E-V2X-BM 737 and DRL 1,263"] == ("", "", "cannot be")
     does, bound = (
-        reported(HYBRID_PPO, Reading(hybrid=each), 100, "ppo-obstacle")[1] for each in ("realised", "predicted")
+        report_outcome(HYBRID_PPO, Reading(hybrid=each), 100, "ppo-obstacle")[1] for each in ("realised", "predicted")
     )
     above = (does > bound + 1e-9).sum()
     assert above > 0 and found["H* is a safety bound of the hybrid"] == (f"not in {above} of 100 worlds", "", "differs")
@@ -179,7 +186,7 @@ def test_statements__of_the_distance_by_planted_harm() -> None:
     harm = {NON_E: (5.0, 9.0), E_V2X_BM: (7.0, 1.0), "SAC": (6.0, 0.5), "PPO": (8.0, 0.1)}
     lines = {name: np.where(near, *values) + k * tenths for k, (name, values) in enumerate(harm.items())}
     groups = {"10-12 m": (lines, near), "12-14 m": (lines, far)}
-    judged = [judge_statement(parts) for parts in curves.statements(groups, SHIPPED).values()]
+    judged = [judge_statement(parts) for parts in curves.statements(groups, SHIPPED_SPECS).values()]
     assert [each[:2] for each in judged] == [
         ("holds", "agrees"), ("holds in 1 of 2", "differs"), ("holds", "agrees"), ("holds in 3 of 4", "differs"),
     ]  # fmt: skip
@@ -264,7 +271,7 @@ def test_trajectories_and_accelerations__have_these_numbers() -> None:
 
 
 def test_figures__of_positions_and_commands_are_those_of_the_records() -> None:
-    record = trajectories.record_all(STATED, tuple(SHIPPED.items()))["PPO", 1]
+    record = trajectories.record_all(STATED, tuple(SHIPPED_SPECS.items()))["PPO", 1]
     road = trajectories.road_figure(dict.fromkeys([(name, 1) for name in "abcd"], record), "c").axes[0]
     arrows = [line for line in road.lines if line.get_marker() == ">"]
     assert len(arrows) == 3

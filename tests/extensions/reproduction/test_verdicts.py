@@ -8,7 +8,7 @@ from ethbrake_marl.extensions.reproduction.verdicts import (
     PERCENT,
     Claim,
     Less,
-    chance,
+    chance_difference,
     claims_sheet,
     judge,
     judge_number,
@@ -40,8 +40,8 @@ def test_number__by_hand(printed: float, ours: Estimate, least: Estimate | None,
 
 
 def test_chance__is_root_two_times_half_of_the_interval() -> None:
-    assert chance(around(5.0, 1.0)) == pytest.approx(2.0**0.5)
-    assert chance(Estimate(5.0, None)) == 0.0
+    assert chance_difference(around(5.0, 1.0)) == pytest.approx(2.0**0.5)
+    assert chance_difference(Estimate(5.0, None)) == 0.0
 
 
 A, D, OPEN, WRONG = (Less(name, around(by, 1.0)) for name, by in (("a", -3.0), ("d", -5.0), ("b", -0.5), ("c", 2.0)))

@@ -7,10 +7,17 @@ import ethbrake_marl as eb
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.extensions.search.best_harm import best_harm, search_list, starting_profiles
-from ethbrake_marl.extensions.search.extremes import KEPT
+from ethbrake_marl.extensions.search.extremes import KEPT_PROFILES
 from ethbrake_marl.extensions.search.kernels import try_all
 from ethbrake_marl.extensions.search.pricing import MOST_PHASES, Problem, Profiles, problem_of
-from ethbrake_marl.extensions.search.search import compact, joined, prepared, refine, search_profiles, seeded
+from ethbrake_marl.extensions.search.search import (
+    compact,
+    join_profiles,
+    prepare_world,
+    random_states,
+    refine,
+    search_profiles,
+)
 from ethbrake_marl.extensions.search.tables import BestHarmTable
 from ethbrake_marl.motion.layout import DROVE, MOVING
 from tests.extensions.proofs.worlds import worlds
@@ -101,7 +108,7 @@ def test_best_harm__is_never_worse_than_one_vehicle_alone_or_what_it_is_given_or
     constant = eb.evaluate(alert, "e_v2x_bm", scenario="paper-random")["e_v2x_bm"]["first_impact_harm"]
     assert (both.harm["first"] <= alone.harm["first"] + 1e-12).all() and [*both.harm] == ["first"]
     assert (alone.harm["first"] <= constant + 1e-9).all() and (alone.harm["first"] < constant - 1.0).any()
-    again = best_harm(game, alert, budget=5, seed=3, given=[both.profiles["first"]], **options)
+    again = best_harm(game, alert, budget=5, seed=3, first_profiles=[both.profiles["first"]], **options)
     assert (again.harm["first"] <= both.harm["first"]).all()
     assert problem_of(game, alert).values(both.profiles["first"])["first"].tolist() == both.harm["first"].tolist()
 
@@ -141,11 +148,11 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
 @pytest.mark.parametrize("stepwise", [False, True])
 def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
     problem, values = PROBLEM.counting("honest"), np.empty(1)
-    driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), seeded(problem.identity, 0)
+    driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), random_states(problem.identity, 0)
     last = problem.follow(driving)
     assert last.line[:, MOVING].any(axis=1).all()
     for k, cost in enumerate(last.harm("honest")):
-        world, room = prepared(problem, k, random, driving.ends.shape[1], stepwise)
+        world, room = prepare_world(problem, k, random, driving.ends.shape[1], stepwise)
         try_all(world, room, driving.ends[[k]], driving.commands_mps2[[k]], values)
         assert values[0] == pytest.approx(cost, rel=1e-6)
 
@@ -162,7 +169,7 @@ def test_extremes__are_better_than_constants() -> None:
     _, constants, extremes = starting_profiles(PROBLEM, WORLDS)
     least = [
         PROBLEM.take(np.repeat(np.arange(6), number)).values(each)["first"].reshape(6, number).min(axis=1)
-        for each, number in ((extremes, KEPT), (constants, 29))
+        for each, number in ((extremes, KEPT_PROFILES), (constants, 29))
     ]
     assert least[0] == pytest.approx([5.600547589835766, 20.05159792, 0.0, 0.0, 0.0, 14.29558235], abs=1e-8)
     assert (least[0] <= least[1] + 1e-9).all()
@@ -182,7 +189,7 @@ def test_profiles__compact_short_and_joined() -> None:
     long = Profiles(np.arange(1, 15)[np.newaxis], -np.arange(14.0).reshape(1, 14, 1)).shortened()
     assert long.ends.tolist() == [[1, 2, 3, 4, 6, 8, 11, 14, 14, 14, 14, 14]]
     assert long.commands_mps2[0, :8, 0].tolist() == [-0.0, -1.0, -2.0, -3.0, -4.0, -6.0, -8.0, -11.0]
-    both = joined([Profiles(np.array([[3], [4]]), np.full((2, 1, 1), each)) for each in (0.0, 1.0)], 2)
+    both = join_profiles([Profiles(np.array([[3], [4]]), np.full((2, 1, 1), each)) for each in (0.0, 1.0)], 2)
     assert both.ends[:, :, -1].tolist() == [[3, 3], [4, 4]]
     assert both.commands_mps2[:, :, 0, 0].tolist() == [[0, 1], [0, 1]]
 
@@ -200,14 +207,14 @@ def test_search_list__goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
     assert search_list(GAME, WORLDS, **options).content() == table.content() and first.stat().st_mtime_ns == before
     assert search_list(GAME, WORLDS, **{**options, "budget": 61}).header["budget"] == 61
     assert len([*tmp_path.iterdir()]) == 4
-    again = search_list(GAME, WORLDS, known=table, budget=1).harm["total"]
+    again = search_list(GAME, WORLDS, known_table=table, budget=1).harm["total"]
     assert (again <= table.harm["total"]).all()
     team = eb.Team("best_harm", {2: eb.make_agent("best_harm", scenario=SCENARIO)})  # drives shipped profiles
     driven = eb.evaluate(WORLDS, {"best": team}, scenario=SCENARIO)["best"]["first_impact_harm"]
     better = search_list(GAME, WORLDS, teams=[team], budget=1).harm["first"]
     assert (better <= driven).all() and (driven < table.harm["first"] - 0.01).any()
     with refused("holds none of the 6 worlds; use the scenario, seed and vehicles for which it was made"):
-        search_list(GAME, SCENARIO.sample(6, seed=8), known=table)
+        search_list(GAME, SCENARIO.sample(6, seed=8), known_table=table)
 
 
 REFUSED = {

@@ -13,7 +13,7 @@ import ethbrake_marl as eb
 from ethbrake_marl.errors import CorruptBundle
 from ethbrake_marl.extensions.search.best_harm import best_harm
 from ethbrake_marl.extensions.search.pricing import problem_of
-from ethbrake_marl.extensions.search.tables import BestHarmTable, best_known, outdated_tables, shipped_tables
+from ethbrake_marl.extensions.search.tables import BestHarmTable, best_stored, outdated_tables, shipped_tables
 from ethbrake_marl.motion.digest import physics_digest
 from tests.refused import refused
 
@@ -46,7 +46,7 @@ def test_shipped__hold_the_first_worlds_of_their_list_with_the_harm_of_their_pro
         assert table.harm[count].mean() == pytest.approx(mean, abs=6e-4)
         harm, profiles = table.stored(problem, count)
         assert problem.values(profiles)[count] == pytest.approx(harm, abs=1e-9)
-        known, best = best_known(problem, count)
+        known, best = best_stored(problem, count)
         assert (known <= harm).all() and problem.values(best)[count] == pytest.approx(known, abs=1e-9)
 
 
@@ -61,13 +61,13 @@ def test_shipped__are_for_this_physics_as_new_ones_are(table: BestHarmTable) -> 
 def test_shipped__are_not_used_under_another_impact_law(other_law: str) -> None:
     scenario, game = eb.open_game("paper-random")
     problem = problem_of(game, scenario.sample(5, seed=7))
-    assert shipped_tables() == () and np.isinf(best_known(problem, "first")[0]).all()
+    assert shipped_tables() == () and np.isinf(best_stored(problem, "first")[0]).all()
     assert outdated_tables().keys() == MEANS.keys()
     assert outdated_tables()["paper-random"].endswith(f"than this installation's ({other_law!r})")
 
 
 def test_best_known__of_no_table_is_infinite_and_coasting() -> None:
-    harm, profiles = best_known(PROBLEM, "first")
+    harm, profiles = best_stored(PROBLEM, "first")
     assert np.isinf(harm).all() and not profiles.commands_mps2.any()
     PROBLEM.check(profiles)
 

@@ -8,8 +8,8 @@ import pytest
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.studies.cube import cube_of
-from ethbrake_marl.extensions.studies.falsification import APART, far_apart, search
-from ethbrake_marl.extensions.studies.weakness import Measure
+from ethbrake_marl.extensions.studies.falsification import LEAST_DISTANCE, far_apart, search_cube
+from ethbrake_marl.extensions.studies.weakness import WeaknessMeasure
 from ethbrake_marl.motion.layout import Bools, Floats
 from tests.fixtures.commands import Command, Refuse, told_json
 from tests.refused import refused
@@ -34,7 +34,7 @@ class Holed:
 
 
 def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds() -> None:
-    measure = Measure.of("regret", Holed(), "full_brake", SCENARIO)
+    measure = WeaknessMeasure.of("regret", Holed(), "full_brake", SCENARIO)
     worlds, measured, scores = measure.falsify(4_000, 0)
     assert in_hole(worlds).all() and worlds.n >= 3
     assert (np.diff(measured.score) <= 0.0).all() and measured.score[-1] > 0.0
@@ -44,7 +44,7 @@ def test_falsify__finds_a_hole_in_a_thousandth_of_the_worlds() -> None:
 
 
 def test_bound__of_the_shield_holds_where_it_is_tightest() -> None:
-    measure = Measure.of("bound", "coast+step", None, SCENARIO, "total")
+    measure = WeaknessMeasure.of("bound", "coast+step", None, SCENARIO, "total")
     worlds, measured, _ = measure.falsify(256, 1)
     assert measured.score.max() <= 0.0 and worlds.n > 3 and measured.harm.max() > 0.0
     listed = SCENARIO.sample(200, 3)
@@ -54,7 +54,7 @@ def test_bound__of_the_shield_holds_where_it_is_tightest() -> None:
 
 
 def test_harm__is_the_score_that_an_evaluation_gives() -> None:
-    worlds, measured, _ = Measure.of("harm", "full_brake", None, SCENARIO, "total").falsify(64, 2, most=5)
+    worlds, measured, _ = WeaknessMeasure.of("harm", "full_brake", None, SCENARIO, "total").falsify(64, 2, most=5)
     assert measured.reference is None and (measured.score == measured.harm).all()
     result = eb.evaluate(worlds, "full_brake", scenario=SCENARIO)
     assert (result["full_brake"]["total_harm"] == measured.harm).all()
@@ -89,7 +89,7 @@ def test_search__climbs_a_peak_that_random_points_stay_away_from() -> None:
     def peak(points: Floats) -> Floats:
         return -np.abs(points - 0.7).sum(axis=1)
 
-    found = search(peak, 6, 2_000, 3, lambda done: None)[1].max()
+    found = search_cube(peak, 6, 2_000, 3, lambda done: None)[1].max()
     assert found > 0.6 * peak(np.random.default_rng(0).random((2_000, 6))).max()
 
 
@@ -99,15 +99,15 @@ def test_search__finds_several_peaks_that_are_apart_and_is_repeated_to_the_bit()
     def hills(points: Floats) -> Floats:
         return -np.abs(points[:, np.newaxis] - centres).max(axis=2).min(axis=1)
 
-    points, scores = search(hills, 3, 1_500, 0, lambda done: None)
+    points, scores = search_cube(hills, 3, 1_500, 0, lambda done: None)
     rows = far_apart(points, scores, 3)
     nearest = np.abs(points[rows][:, np.newaxis] - centres).max(axis=2)
     assert sorted(nearest.argmin(axis=1)) == [0, 1, 2] and (nearest.min(axis=1) < 0.04).all()
     chosen = points[far_apart(points, scores, 20)]
     for k, point in enumerate(chosen):
-        assert (np.abs(np.delete(chosen, k, axis=0) - point).max(axis=1) >= APART).all()
+        assert (np.abs(np.delete(chosen, k, axis=0) - point).max(axis=1) >= LEAST_DISTANCE).all()
     assert ((points > 0.0) & (points < np.nextafter(1.0, 0.0))).all()  # reflected at the faces, not cut off there
-    again = search(hills, 3, 1_500, 0, lambda done: None)
+    again = search_cube(hills, 3, 1_500, 0, lambda done: None)
     assert again[0].tobytes() == points.tobytes()
 
 
@@ -160,4 +160,4 @@ def test_falsify__is_refused(options: str, key: str, refuse: Refuse, empty_folde
 def test_scenario__whose_worlds_are_all_rejected_is_refused() -> None:
     lost = eb.load_scenario("paper-random").replace(gaps_m={"uniform": [0.1, 0.2]}, speeds_mps=[10, 20, 30])
     with refused("in all 10 tried worlds an impact happens before any agent may act"):
-        Measure.of("harm", "coast", None, lost).falsify(10, 0)
+        WeaknessMeasure.of("harm", "coast", None, lost).falsify(10, 0)

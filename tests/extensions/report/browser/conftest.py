@@ -11,7 +11,7 @@ import pytest
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.extensions.report.figures import harm_against_total_gap
 from ethbrake_marl.extensions.report.page import drawing
-from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.report.report import ReportPage
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 
@@ -75,5 +75,5 @@ def report_file(compared: Compared, tmp_path_factory: pytest.TempPathFactory) ->
     """The report of ``compared``."""
     figure = drawing(harm_against_total_gap(compared.result), "Harm against the gap", "Mean harm by gap.")
     path = tmp_path_factory.mktemp("report") / "report.html"
-    Report("paper-random: four agents", compared, "Four agents.", {"Seed": 7}, figures=[figure]).write(path)
+    ReportPage("paper-random: four agents", compared, "Four agents.", {"Seed": 7}, figures=[figure]).write(path)
     return path

@@ -9,7 +9,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.record import record_episode
-from ethbrake_marl.extensions.report.report import Report
+from ethbrake_marl.extensions.report.report import ReportPage
 from tests.extensions.report.browser.conftest import wait_until
 from tests.extensions.report.conftest import AGENTS, compared_by
 from tests.extensions.report.test_page import whole_page
@@ -27,7 +27,7 @@ def report_page(open_page: Open, report_file: Path) -> Any:
 
 def write_report(path: Path, names: tuple[str, ...]) -> Path:
     found = compared_by("paper-random", {name: f"constant:{k + 1}.5" for k, name in enumerate(names)}, 12)
-    Report("t", found, "s", {names[0]: "1", names[1]: "y" * 64}, focus=names[0]).write(path)
+    ReportPage("t", found, "s", {names[0]: "1", names[1]: "y" * 64}, focus=names[0]).write(path)
     return path
 
 
@@ -56,7 +56,7 @@ def test_page__never_scrolls_sideways_and_is_no_giant(open_page: Open, name: str
 
 def test_first_table__shows_the_push_without_scrolling(open_page: Open, tmp_path: Path) -> None:
     path = tmp_path / "report.html"
-    Report("t", compared_by("paper-random", "full_brake,e_v2x_bm:pairwise", 60, "honest"), "s", {}).write(path)
+    ReportPage("t", compared_by("paper-random", "full_brake,e_v2x_bm:pairwise", 60, "honest"), "s", {}).write(path)
     page = open_page(path.as_uri(), width=1_100)
     for width in (1_100, 900):  # beside the figure, below it
         page.set_viewport_size({"width": width, "height": 900})
