@@ -50,8 +50,10 @@ class UserScript:
 
 def guard_scripts(scripts: Mapping[int, Any]) -> dict[int, Any]:
     """The scripts, body -> script, those of users each in a ``UserScript``. Scripts of this package are trusted."""
-    ours = {body: type(script).__module__.startswith("ethbrake_marl.") for body, script in scripts.items()}
-    return {body: script if ours[body] else UserScript(script) for body, script in scripts.items()}
+    return {
+        body: script if type(script).__module__.startswith("ethbrake_marl.") else UserScript(script)
+        for body, script in scripts.items()
+    }
 
 
 def name_of(script: Any) -> str:

@@ -258,7 +258,7 @@ def test_game__has_the_training_worlds_and_sees_an_obstacle() -> None:
 
 
 def test_catalogue__has_groups() -> None:
-    assert len(list_scenarios()) == 46
+    assert len(list_scenarios()) == 47
     assert len(group_of_scenarios("benchmark")) == 10
     assert group_of_scenarios("stress") == ["stress-wide", "stress-wide-obstacle"]
     assert group_of_scenarios("nothing") == []
