@@ -7,5 +7,5 @@ PARTS = {
         "injury_reference": "measures:REFERENCE",
         "injury_gidas": "measures:GIDAS",
     },
-    "objectives": {"injury": "curves:OBJECTIVE"},
+    "objectives": {"injury": "curves:INJURY_OBJECTIVE"},
 }

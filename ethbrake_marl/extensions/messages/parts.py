@@ -3,7 +3,7 @@
 PARTS = {
     "features": {
         "age": "features:AGE",
-        "intent": "features:INTENT",
+        "intent": "features:INTENT_FEATURE",
         "place_known": "features:KNOWN.place",
         "speed_known": "features:KNOWN.speed",
         "acceleration_known": "features:KNOWN.acceleration",
@@ -12,5 +12,5 @@ PARTS = {
         "mass_known": "features:KNOWN.mass",
         "intent_known": "features:KNOWN.intent",
     },
-    "v2x_extensions": {"persistence": "declared:MESSAGES", "tells": "declared:MESSAGES", "reports": "reports:REPORTS"},
+    "v2x_extensions": {"persistence": "declared:DEFAULT_MESSAGES", "tells": "declared:DEFAULT_MESSAGES", "reports": "reports:REPORTS"},
 }
