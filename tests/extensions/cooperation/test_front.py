@@ -110,7 +110,7 @@ def test_corner__decides_between_equals_by_the_others(front: Front) -> None:
 
 
 def test_front__does_not_depend_on_the_other_worlds_or_threads(front: Front, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.extensions.cooperation.front.CHUNK", 2)
+    monkeypatch.setattr("ethbrake_marl.extensions.cooperation.front.FRONT_CHUNK", 2)
     some, heard = np.array([3, 17, 11]), []
     again = search_front(
         PAPER, WORLDS.take(some), WEIGHTS, count="first", budget=300, agents=AGENTS, threads=3,

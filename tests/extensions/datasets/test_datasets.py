@@ -46,7 +46,7 @@ def test_file__replays_bit_for_bit_in_an_environment(agent: str, tmp_path: Path)
 
 def test_file__has_the_episodes_of_an_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of agents whose commands are float32 actions; batch by batch, one episode after the other."""
-    monkeypatch.setattr(datasets, "AT_ONCE", 3)
+    monkeypatch.setattr(datasets, "EPISODES_AT_ONCE", 3)
     to_parquet(tmp_path / "a.parquet", "full_brake,ppo", scenario=PAPER, episodes=5)
     table = parquet.read_table(tmp_path / "a.parquet")
     result = eb.evaluate(PAPER, "full_brake,ppo", episodes=5)

@@ -83,7 +83,7 @@ def test_page__by_hand_and_results_are_replaced_by_force_alone(tmp_path: Path) -
 
 
 def test_interrupted__training_makes_no_item(tmp_path: Path, monkeypatch, ethbrake: Command) -> None:
-    monkeypatch.setattr(items, "train", lambda *given: False)
+    monkeypatch.setattr(items, "train_groups", lambda *given: False)
     done = ethbrake("reproduce", "gaps", "--output", str(tmp_path / "again"))
     assert done.status == 130 and "interrupted; finished trainings remain; repeat the command" in done.err
     assert not (tmp_path / "again" / items.RESULTS_FILE).exists()

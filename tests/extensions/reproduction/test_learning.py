@@ -116,7 +116,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ReproductionSetting
         TrainingPlan("paper-random", "ppo", 1, 6.0, 512, mapped=False),
         TrainingPlan("paper-random", "ppo-paper", 2, 200.0),
     )
-    monkeypatch.setattr(learning, "GROUPS", {STOPPED: (stopped,), RANDOM: (process,)})
+    monkeypatch.setattr(learning, "TRAINING_GROUPS", {STOPPED: (stopped,), RANDOM: (process,)})
     return ReproductionSettings(tmp_path, full=True, episodes=20)
 
 

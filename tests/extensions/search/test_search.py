@@ -195,7 +195,7 @@ def test_profiles__compact_short_and_joined() -> None:
 
 
 def test_search_list__goes_on_where_it_stopped(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("ethbrake_marl.extensions.search.best_harm.CHUNK", 4)
+    monkeypatch.setattr("ethbrake_marl.extensions.search.best_harm.SEARCH_CHUNK", 4)
     done: list[tuple[int, int]] = []
     options = {"budget": 60, "threads": 1, "chunks": tmp_path}
     table = search_list(GAME, WORLDS, on_progress=lambda *each: done.append(each), **options)
