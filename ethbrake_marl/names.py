@@ -29,7 +29,7 @@ from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.game import AnyScenario, game_of
-from ethbrake_marl.worlds.roles import HELD, LEARNER, check_role
+from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER, check_role
 from ethbrake_marl.worlds.scenario import Scenario
 
 NAME_PATTERN = re.compile(r"[a-z][a-z0-9_-]*(\.[a-z0-9_-]+)*")
@@ -344,7 +344,7 @@ def scripts_of(scenario: Scenario) -> Mapping[int, Script]:
     """Body -> agent, for the scripts that look at the state."""
     scripts = {}
     for body, (vehicle, role) in enumerate(scenario.roles.items(), 1):
-        if role.partition(":")[0] not in (LEARNER, *HELD):
+        if role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
             where = f"scenario {scenario.name!r}: roles.{vehicle} = {role}"
             check_role(role)
             try:

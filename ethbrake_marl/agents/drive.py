@@ -84,11 +84,11 @@ class Team(NamedTuple):
         Raises ``InvalidInput`` unless the team drives exactly the learners, for a shield without learners, and if the
         game already has another shield.
         """
-        driven, wanted = sorted(self.drivers), sorted(game.settings.learners.tolist())
-        if driven != wanted:
-            theirs, right = (", ".join(f"vehicle_{i}" for i in each) or "nobody" for each in (driven, wanted))
-            raise InvalidInput(f"team {self.name!r}: drives {theirs}; must drive exactly {right}")
-        if self.shield is not None and not wanted:
+        driven, learners = sorted(self.drivers), sorted(game.settings.learners.tolist())
+        if driven != learners:
+            names, right = (", ".join(f"vehicle_{i}" for i in bodies) or "nobody" for bodies in (driven, learners))
+            raise InvalidInput(f"team {self.name!r}: drives {names}; must drive exactly {right}")
+        if self.shield is not None and not learners:
             raise InvalidInput(
                 f"team {self.name!r}: the scenario has no learner that its shield could guard; leave out the shield, or"
                 " make a vehicle a learner: scenario.with_learners(['vehicle_2'])"
@@ -103,7 +103,7 @@ class Team(NamedTuple):
 
 def check_agent(agent: Any, where: str) -> None:
     """Raise ``InvalidInput`` unless ``agent`` has all parts of an agent; the message begins with ``where``."""
-    missing = [each for each in ("name", "knows", "begin", "act") if not hasattr(agent, each)]
+    missing = [part for part in ("name", "knows", "begin", "act") if not hasattr(agent, part)]
     if missing:
         raise InvalidInput(
             f"{where}: has no {' and no '.join(missing)}; must be an agent, which has name, knows, begin(alert, body)"
@@ -115,7 +115,7 @@ def check_agent(agent: Any, where: str) -> None:
 def check_knows(knows: Any, where: str) -> None:
     """Raise ``InvalidInput`` unless ``knows`` is one of the texts of ``KNOWLEDGE``, or ``UNSTATED``."""
     if not isinstance(knows, str) or knows not in (*KNOWLEDGE, UNSTATED):
-        right = ", ".join(repr(each) for each in KNOWLEDGE)
+        right = ", ".join(repr(text) for text in KNOWLEDGE)
         raise InvalidInput(f"{where}: knows = {knows!r:.60}: must be one of {right}, or {UNSTATED!r}")
 
 

@@ -22,7 +22,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
-from ethbrake_marl.worlds.roles import HELD, LEARNER
+from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER
 
 FIRST_PARTS = 64  # number of cells into which the range of decelerations is divided first
 SUBCELLS = 8  # number of cells into which a cell is divided
@@ -53,12 +53,12 @@ def coupled(alert: State, body: int, count: str = "first", horizon_s: float | Fl
     return ConstantDeceleration(best, harm[0])
 
 
-def harms(alert: State, body: int, tried: Floats, count: str, until_s: Floats) -> Floats:
-    """Harm if vehicle ``body`` holds each of the decelerations ``tried`` [n, C] (m/s2), [2, n, C].
+def harms(alert: State, body: int, decelerations: Floats, count: str, until_s: Floats) -> Floats:
+    """Harm if vehicle ``body`` holds each of the decelerations ``decelerations`` [n, C] (m/s2), [2, n, C].
 
     The first row is the harm in ``count``, the second in the count that breaks ties.
     """
-    return hold(alert, alert.wanted, [body], -tried[:, :, np.newaxis], until_s, count)
+    return hold(alert, alert.wanted, [body], -decelerations[:, :, np.newaxis], until_s, count)
 
 
 def search_deceleration(alert: State, body: int, count: str, until_s: Floats) -> Floats:
@@ -94,12 +94,12 @@ def find_cells(rows, at, harm, step, best, cells):
     """
     count, last = 0, at.shape[1] - 1
     for j in range(at.shape[0]):
-        known, better = best[rows[j]], False
+        best_so_far, better = best[rows[j]], False
         for c in range(last + 1):
-            if compare_harm(harm[:, j, c], known) < 0:
-                known[1], known[2], better = harm[0, j, c], harm[1, j, c], True
+            if compare_harm(harm[:, j, c], best_so_far) < 0:
+                best_so_far[1], best_so_far[2], better = harm[0, j, c], harm[1, j, c], True
         if better:
-            take_middle(at[j], harm[:, j], known)
+            take_middle(at[j], harm[:, j], best_so_far)
     for j in range(at.shape[0]):
         if step[rows[j]] <= NARROWEST_MPS2:
             continue
@@ -114,27 +114,27 @@ def find_cells(rows, at, harm, step, best, cells):
 
 
 @kernel
-def take_middle(at, harm, known):
+def take_middle(at, harm, best_so_far):
     """Set ``known[0]`` to the middle one of the decelerations ``at`` [C] whose ``harm`` [2, C] equals ``known[1:]``.
 
-    ``known`` [3] is the best deceleration so far (m/s2), with its harm in both counts.
+    ``best_so_far`` [3] is the best deceleration so far (m/s2), with its harm in both counts.
     """
     ties = 0
     for c in range(len(at)):
-        ties += 1 if compare_harm(harm[:, c], known) == 0 else 0
+        ties += 1 if compare_harm(harm[:, c], best_so_far) == 0 else 0
     for c in range(len(at)):
-        ties -= 2 if compare_harm(harm[:, c], known) == 0 else 0
+        ties -= 2 if compare_harm(harm[:, c], best_so_far) == 0 else 0
         if ties <= 0:
-            known[0] = at[c]
+            best_so_far[0] = at[c]
             return
 
 
 @kernel
-def compare_harm(harm, known):
-    """-1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more (``known`` as in ``take_middle``)."""
+def compare_harm(harm, best_so_far):
+    """-1 if ``harm`` [2] is less than ``known[1:]``, 0 if equal, 1 if more (``best_so_far`` as in ``take_middle``)."""
     for count in range(2):  # the other count decides ties
-        if abs(harm[count] - known[count + 1]) > TIE_MARGIN:
-            return -1 if harm[count] < known[count + 1] else 1
+        if abs(harm[count] - best_so_far[count + 1]) > TIE_MARGIN:
+            return -1 if harm[count] < best_so_far[count + 1] else 1
     return 0
 
 
@@ -164,10 +164,10 @@ class EV2XBM:
 
     def begin(self, alert: State, body: int) -> BaselineMemory:
         """Choose the deceleration. Raises ``InvalidInput`` if another vehicle is driven by an agent."""
-        for other, role in self.agents.items():
-            if other != body:
+        for vehicle, role in self.agents.items():
+            if vehicle != body:
                 raise InvalidInput(
-                    f"agent {self.name!r}: vehicle_{other} is driven by {role!r}, whose commands are not known at the"
+                    f"agent {self.name!r}: vehicle_{vehicle} is driven by {role!r}, whose commands are not known at the"
                     " alert; use e_v2x_bm:pairwise, which assumes that its neighbours brake fully"
                 )
         wanted, learners = alert.wanted.copy(), self.settings.learners
@@ -210,7 +210,7 @@ def make_e_v2x_bm(argument: str | None, settings: Any) -> EV2XBM | EV2XBMPairwis
         raise InvalidInput(f"agent {settings.spec!r}: must be e_v2x_bm or e_v2x_bm:pairwise")
     scenario = settings.needed_scenario()
     roles = dict(enumerate(scenario.roles.values(), 1))
-    agents = {body: role for body, role in roles.items() if role.partition(":")[0] not in (LEARNER, *HELD)}
+    agents = {body: role for body, role in roles.items() if role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS)}
     step_settings = StepSettings(np.array(scenario.learners, np.int64), scenario.time_step_s, scenario.horizon_s)
     return EV2XBM(step_settings, agents, settings.harm_count)
 

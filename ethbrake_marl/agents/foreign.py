@@ -58,17 +58,19 @@ def ask_of(policy: Any, who: str) -> Ask:
     return ask_function
 
 
-def ask_function(function: Any, seen: Observations) -> Any:
-    return function(seen)
+def ask_function(function: Any, observations: Observations) -> Any:
+    return function(observations)
 
 
-def ask_model(model: Any, seen: Observations) -> Any:
+def ask_model(model: Any, observations: Observations) -> Any:
     """Deterministic actions of an object with ``predict``; a ``VecNormalize`` of its training is applied.
 
     Raises ``InvalidInput`` if the model also returns a state.
     """
     statistics = statistics_of(model)
-    answer = model.predict(seen if statistics is None else statistics.normalize_obs(seen), deterministic=True)
+    answer = model.predict(
+        observations if statistics is None else statistics.normalize_obs(observations), deterministic=True
+    )
     if not isinstance(answer, tuple):
         return answer
     actions, *states = answer
@@ -80,20 +82,20 @@ def ask_model(model: Any, seen: Observations) -> Any:
     return actions
 
 
-def ask_torch(module: Any, seen: Observations) -> Any:
+def ask_torch(module: Any, observations: Observations) -> Any:
     torch = sys.modules["torch"]
     usual = torch.zeros(0, dtype=torch.float32, device="cpu")
     parameter = next(filter(torch.is_floating_point, module.parameters()), usual)
     with torch.no_grad():
-        answer = module(torch.from_numpy(seen).to(parameter))
+        answer = module(torch.from_numpy(observations).to(parameter))
         return answer.float() if getattr(answer, "dtype", None) == torch.bfloat16 else answer  # which numpy lacks
 
 
-def ask_onnx(session: Any, seen: Observations) -> Any:
+def ask_onnx(session: Any, observations: Observations) -> Any:
     """Output ``action`` of an ONNX model, or its first output."""
     session = session_of(session)
     names = [output.name for output in session.get_outputs()]
-    return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: seen})[0]
+    return session.run(["action" if "action" in names else names[0]], {session.get_inputs()[0].name: observations})[0]
 
 
 def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
@@ -106,9 +108,9 @@ def onnx_file(path: str | os.PathLike[str], who: str) -> bytes:
     return read_plain(file, MOST_ONNX_BYTES)
 
 
-def session_of(given: Any) -> Any:
+def session_of(model: Any) -> Any:
     """ONNX session for the bytes of a file; a session is returned unchanged."""
-    return _opened(given) if isinstance(given, bytes) else given
+    return _opened(model) if isinstance(model, bytes) else model
 
 
 @lru_cache(16)
@@ -136,32 +138,32 @@ def _refuse_training_mode(module: Any, who: str) -> None:
 def features_of(policy: Any, ask: Ask) -> tuple[str, ...] | None:
     """Names of the features that a model was trained on, or None if it does not record them."""
     if ask is ask_onnx:
-        listed = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
-        return tuple(listed.split(",")) if listed else None
+        feature_list = session_of(policy).get_modelmeta().custom_metadata_map.get("features")
+        return tuple(feature_list.split(",")) if feature_list else None
     return getattr(getattr(policy, "observation_space", None), "features", None)
 
 
-def count_of_actions(policy: Any, given: int | None, who: str) -> int | None:
+def count_of_actions(policy: Any, count: int | None, who: str) -> int | None:
     """Number of discrete actions of a policy; None if it returns numbers in [-1, 1].
 
-    ``given`` is the number that the user states, or None. Raises ``InvalidInput``, beginning with ``who``, if the
-    policy's action space does not fit: ``given`` actions, or without it a box from -1 to 1.
+    ``count`` is the number that the user states, or None. Raises ``InvalidInput``, beginning with ``who``, if the
+    policy's action space does not fit: ``count`` actions, or without it a box from -1 to 1.
     """
     space: Any = getattr(policy, "action_space", None)
-    if given is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
-        given = int(space.n)
-    if given is None:
+    if count is None and getattr(space, "evenly_spaced", False):  # of an environment of this package
+        count = int(space.n)
+    if count is None:
         fits = [np.asarray(getattr(space, end, None)).tolist() for end in ("low", "high")] == [[-1.0], [1.0]]
         right = "a number in [-1, 1]; for indices of K evenly spaced actions pass actions=K"
     else:
-        fits = (getattr(space, "n", None), getattr(space, "start", None)) == (given, 0)
-        right = f"an index from 0 to {given - 1} (actions={given})"
+        fits = (getattr(space, "n", None), getattr(space, "start", None)) == (count, 0)
+        right = f"an index from 0 to {count - 1} (actions={count})"
     if space is not None and not fits:
         raise InvalidInput(
             f"{who}: the actions of the policy are in {space}; must be {right}; or write a function around the policy"
             " that converts its actions"
         )
-    return given
+    return count
 
 
 def statistics_of(model: Any) -> Any:
@@ -196,9 +198,9 @@ def wrappers_of(env: Any) -> Iterator[Any]:
     yield env
     for name in WRAPPED_ATTRIBUTES:
         inside = getattr(env, "__dict__", {}).get(name, ())  # its own: wrappers forward attributes
-        for each in inside if isinstance(inside, list | tuple) else (inside,):
-            if hasattr(each, "step") or hasattr(each, "step_wait"):
-                yield from wrappers_of(each)
+        for wrapper in inside if isinstance(inside, list | tuple) else (inside,):
+            if hasattr(wrapper, "step") or hasattr(wrapper, "step_wait"):
+                yield from wrappers_of(wrapper)
 
 
 def _was_normalised(model: Any) -> bool:
@@ -209,6 +211,6 @@ def _was_normalised(model: Any) -> bool:
     """
     if getattr(model, "_last_original_obs", None) is not None and not hasattr(model, "replay_buffer"):
         return True
-    seen, space = getattr(model, "_last_obs", None), getattr(model, "observation_space", None)
+    observation, space = getattr(model, "_last_obs", None), getattr(model, "observation_space", None)
     low, high = getattr(space, "low", -np.inf), getattr(space, "high", np.inf)
-    return isinstance(seen, np.ndarray) and not np.all((low <= seen) & (seen <= high))
+    return isinstance(observation, np.ndarray) and not np.all((low <= observation) & (observation <= high))

@@ -27,7 +27,7 @@ from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import MESSAGES, Layer, view_through
 from ethbrake_marl.episode.observe import View
-from ethbrake_marl.episode.state import NUMBER, State, mapped
+from ethbrake_marl.episode.state import NUMBER, State, map_arrays
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar, check_whole_number
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.motion.layout import Floats
@@ -88,8 +88,8 @@ class LearnedAgent:
     def act(self, state: State, memory: None, body: int) -> tuple[Floats, None]:
         policy = self.policy
         view = self.observation or policy.observation
-        seen = view.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
-        return commands_of(state, body, policy(seen)[:, 0].astype(np.float64)), None
+        observations = view.observe(state, np.array([body]), policy.manifest.time_step_s)[:, 0]
+        return commands_of(state, body, policy(observations)[:, 0].astype(np.float64)), None
 
 
 @dataclass(frozen=True)
@@ -128,15 +128,15 @@ class PolicyAgent:
 
         Raises ``AgentFailed`` for actions of a wrong shape or outside their range.
         """
-        seen = self.observation.observe(state, np.array([body]), self.time_step_s)[:, 0]
+        observations = self.observation.observe(state, np.array([body]), self.time_step_s)[:, 0]
         if self.initial_state is None:
-            answer = self.ask(self.policy, seen)
+            answer = self.ask(self.policy, observations)
         else:
-            both = self.policy(seen, self._own(memory, state.n))
-            if not isinstance(both, tuple) or len(both) != 2:
+            pair = self.policy(observations, self._own(memory, state.n))
+            if not isinstance(pair, tuple) or len(pair) != 2:
                 right = "with initial_state must return a pair of actions and state"
-                raise AgentFailed(self.name, None, f"vehicle_{body}: returned {both!r:.60}; {right}")
-            answer, memory = both[0], self._own(both[1], state.n)
+                raise AgentFailed(self.name, None, f"vehicle_{body}: returned {pair!r:.60}; {right}")
+            answer, memory = pair[0], self._own(pair[1], state.n)
         return commands_of(state, body, self._actions(answer, state, body)), memory
 
     def _own(self, memory: Any, n: int) -> Any:
@@ -147,18 +147,18 @@ class PolicyAgent:
                 raise AgentFailed(self.name, None, f"its memory has {array.dtype} of the shape {array.shape}; {right}")
             return array
 
-        return mapped(copied, memory)
+        return map_arrays(copied, memory)
 
     def _actions(self, answer: Any, state: State, body: int) -> Floats:
-        given, n, last = to_array(answer), state.n, (self.actions or 0) - 1
+        action_array, n, last = to_array(answer), state.n, (self.actions or 0) - 1
         kinds, low, high, right = "fiu", -1.0, 1.0, "a number in [-1, 1]"
         if self.actions is not None:
             kinds, low, high, right = "iu", 0.0, float(last), f"an index from 0 to {last}"
-        if given.shape not in ((n,), (n, 1)) or given.dtype.kind not in kinds:
-            what = f"{answer!r:.40}, {given.dtype} of shape {given.shape}"
+        if action_array.shape not in ((n,), (n, 1)) or action_array.dtype.kind not in kinds:
+            what = f"{answer!r:.40}, {action_array.dtype} of shape {action_array.shape}"
             reason = f"returned {what}; must return {right} for each of {n} worlds, in the shape ({n}, 1)"
             raise AgentFailed(self.name, None, f"vehicle_{body}: {reason}")
-        values = given.reshape(n).astype(np.float64)
+        values = action_array.reshape(n).astype(np.float64)
         if self.clip:
             values = np.clip(values, low, high)
         good = (values >= low * LARGEST_ACTION) & (values <= high * LARGEST_ACTION)
@@ -232,7 +232,7 @@ def policy_agent(
         actions = count_of_actions(policy, actions, who)
     trained_on, trained_in = features_of(policy, ask), None if scenario is None else load_scenario(scenario)
     view = _view(observation, trained_on, trained_in, who)
-    if trained_in is None and any(each.partition(".")[0] in GROUPS for each in view.names):
+    if trained_in is None and any(feature.partition(".")[0] in GROUPS for feature in view.names):
         raise InvalidInput(
             f"{who}: observes forecasts, which need the time between two decisions; pass scenario= for the scenario of"
             " its training"
@@ -242,10 +242,10 @@ def policy_agent(
     return PolicyAgent(policy, name, ask, view, is_assumed, time_step_s, initial_state, clip, actions)
 
 
-def _view(given: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
-    """Features that a policy observes: ``given``, its own, or those of its training scenario's learners."""
-    if given is not None:
-        view = given if isinstance(given, View) else View(given)
+def _view(observation: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario | None, who: str) -> View:
+    """Features that a policy observes: ``observation``, its own, or those of its training scenario's learners."""
+    if observation is not None:
+        view = observation if isinstance(observation, View) else View(observation)
         if trained_on not in (None, view.names):
             raise InvalidInput(
                 f"{who}: observation lists other features than the policy was trained on, which are"
@@ -257,9 +257,9 @@ def _view(given: Any, trained_on: tuple[str, ...] | None, trained_in: Scenario |
     if trained_in is None:
         return View()
     views = views_of(trained_in)
-    seen = {views[body - 1] for body in trained_in.learners} or set(views)
-    if len(seen) > 1:
+    learner_views = {views[body - 1] for body in trained_in.learners} or set(views)
+    if len(learner_views) > 1:
         raise InvalidInput(
             f"{who}: the learners of scenario {trained_in.name!r} observe different features; pass observation=[...]"
         )
-    return seen.pop()
+    return learner_views.pop()

@@ -34,7 +34,9 @@ def make_trained(argument: str | None, settings: Any) -> Agent | Team:
         return LearnedAgent(load_shipped(name), spec)
     if any(Path(path, "policy").glob("vehicle_[1-9]*")):  # each learner has its own
         policies = load_drivers(Path(path) / "policy")
-        driver: Agent | Team = Team.of({vehicle: LearnedAgent(each, spec) for vehicle, each in policies.items()}, spec)
+        driver: Agent | Team = Team.of(
+            {vehicle: LearnedAgent(learner_policy, spec) for vehicle, learner_policy in policies.items()}, spec
+        )
         policy = next(iter(policies.values()))
     else:
         policy = load_policy(path)

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from ethbrake_marl.episode.functions import described
+from ethbrake_marl.episode.functions import description_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, RELEASE_RATE, WEIGHT, Floats, Ints
@@ -76,7 +76,7 @@ LISTS = {  # a name for several features of different groups
 SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 
-class Own(NamedTuple):
+class ComputedFeature(NamedTuple):
     """A feature of the observer or of a neighbour, computed by a function of its own (``register_feature``)."""
 
     feature: Feature
@@ -105,16 +105,16 @@ def _weight_share(state: State, body: int) -> Floats:
     return state.car[:, WEIGHT, body] / state.car[:, WEIGHT, 1:].sum(axis=1)
 
 
-def _of_both(
+def _own_and_neighbour(
     name: str, unit: str, high: float, function: Callable[[State, int], Floats], meaning: str
-) -> dict[str, Own]:
+) -> dict[str, ComputedFeature]:
     """Two features with the same function: ``own_NAME`` of the observer, and ``NAME`` of a neighbour."""
     return {
-        f"own_{name}": Own(Feature(f"own_{name}", unit, 1.0, 0.0, high, f"own {meaning}"), "own", function),
-        name: Own(
+        f"own_{name}": ComputedFeature(Feature(f"own_{name}", unit, 1.0, 0.0, high, f"own {meaning}"), "own", function),
+        name: ComputedFeature(
             Feature(name, unit, 1.0, 0.0, high, f"the neighbour's {meaning}"),
             "neighbour",
-            lambda state, body, other: function(state, other),
+            lambda state, body, neighbour: function(state, neighbour),
         ),
     }
 
@@ -147,7 +147,9 @@ def register_feature(
         unknown: value for an unknown neighbour, in ``unit``.
 
     """
-    meaning = described("feature", name, function, r"[a-z][a-z0-9_]{0,63}", "a-z, 0-9 and _, beginning with a letter")
+    meaning = description_of(
+        "feature", name, function, r"[a-z][a-z0-9_]{0,63}", "a-z, 0-9 and _, beginning with a letter"
+    )
     if name in WHOLE_GROUPS or name in GROUPS or name in LISTS or SIDE.fullmatch(name):
         raise InvalidInput(f"feature {name!r}: this is the name of a group; give another name")
     groups = {**WHOLE_GROUPS, "front_1": NEIGHBOUR}
@@ -165,8 +167,10 @@ def register_feature(
         )
     if of not in get_args(Of):
         raise InvalidInput(f"feature {name!r}: of = {of!r}: must be 'own' or 'neighbour'")
-    entry = Own(Feature(name, str(unit), float(scale), float(low), float(high), meaning), of, function, float(unknown))
-    FEATURES.add(name, entry, lambda other: other == entry)
+    entry = ComputedFeature(
+        Feature(name, str(unit), float(scale), float(low), float(high), meaning), of, function, float(unknown)
+    )
+    FEATURES.add(name, entry, lambda registered: registered == entry)
 
 
 def register_feature_group(
@@ -181,22 +185,26 @@ def register_feature_group(
     belong to ``features``. Groups with the same function share one call.
     """
     group = Group(tuple(features), function, columns)
-    GROUPS.add(name, group, lambda other: other == group)
+    GROUPS.add(name, group, lambda registered: registered == group)
 
 
-FEATURES: Registry[Own] = Registry(
+FEATURES: Registry[ComputedFeature] = Registry(
     "feature",
     "features",
     register_feature,
     {
-        "place": Own(
+        "place": ComputedFeature(
             Feature("place", "1", 1.0, 0.0, 63.0, "number of vehicles ahead in the line"),
             "own",
             lambda state, body: np.full(state.n, body - 1.0),
         ),
-        **_of_both("build_up_time", "s", 4.0, _build_up_s, "time until brakes are fully applied; 0 if at once"),
-        **_of_both("release_time", "s", 4.0, _release_s, "time until full brakes are released; 0 if at once"),
-        **_of_both("harm_weight", "1", 1.0, _weight_share, "share in the weights of harm (objective: preference)"),
+        **_own_and_neighbour(
+            "build_up_time", "s", 4.0, _build_up_s, "time until brakes are fully applied; 0 if at once"
+        ),
+        **_own_and_neighbour("release_time", "s", 4.0, _release_s, "time until full brakes are released; 0 if at once"),
+        **_own_and_neighbour(
+            "harm_weight", "1", 1.0, _weight_share, "share in the weights of harm (objective: preference)"
+        ),
     },
 )
 GROUPS: Registry[Group] = Registry("group of features", "feature_groups", register_feature_group)
@@ -219,13 +227,13 @@ def group_named(name: str) -> tuple[Feature, ...] | None:
 
 def feature_named(name: str) -> Feature:
     """Feature with the full name ``front_1.gap``, ``place`` or the like. Raises ``UnknownName``."""
-    group, dot, own = name.partition(".")
+    group, dot, feature_name = name.partition(".")
     if not dot and name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature
-    if side_of(group) is not None and own in FEATURES and FEATURES[own].of == "neighbour":
-        return FEATURES[own].feature._replace(name=name)
+    if side_of(group) is not None and feature_name in FEATURES and FEATURES[feature_name].of == "neighbour":
+        return FEATURES[feature_name].feature._replace(name=name)
     for feature in group_named(group) or () if dot else ():
-        if feature.name == own:
+        if feature.name == feature_name:
             return feature._replace(name=name)
     if name in FEATURES:
         raise InvalidInput(f"feature {name!r} describes a neighbour; write front_1.{name} or rear_1.{name}")
@@ -239,23 +247,27 @@ def known_names() -> list[str]:
     return [*groups, *LISTS, *inside, *(name if FEATURES[name].of == "own" else f"front_1.{name}" for name in FEATURES)]
 
 
-def _names_of(listed: str) -> list[str]:
-    group = group_named(listed)
-    return [feature_named(listed).name] if group is None else [f"{listed}.{feature.name}" for feature in group]
+def _names_of(group_or_feature: str) -> list[str]:
+    group = group_named(group_or_feature)
+    return (
+        [feature_named(group_or_feature).name]
+        if group is None
+        else [f"{group_or_feature}.{feature.name}" for feature in group]
+    )
 
 
-def listed_features(listed: object) -> tuple[str, ...]:
+def listed_features(observation: object) -> tuple[str, ...]:
     """Full names for an ``observation:`` list: ``["own", "front_1.gap"]`` gives ``("own.speed", ..., "front_1.gap")``.
 
     Raises ``InvalidInput`` unless it is a list of known, different names.
     """
-    if isinstance(listed, str) or not isinstance(listed, Sequence) or not listed:
+    if isinstance(observation, str) or not isinstance(observation, Sequence) or not observation:
         raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")
     names: list[str] = []
-    for each in listed:
-        if not isinstance(each, str):
-            raise InvalidInput(f"observation: {each!r:.60}: must be the name of a group or of a feature")
-        for name in LISTS.get(each) or _names_of(each):
+    for group_or_feature in observation:
+        if not isinstance(group_or_feature, str):
+            raise InvalidInput(f"observation: {group_or_feature!r:.60}: must be the name of a group or of a feature")
+        for name in LISTS.get(group_or_feature) or _names_of(group_or_feature):
             if name in names:
                 raise InvalidInput(f"observation: {name} is listed twice; list it once")
             names.append(name)

@@ -16,21 +16,23 @@ OWN_VIEW = View(["own"])
 
 def state_features(vehicles: int, horizon_s: float, obstacle: bool) -> tuple[Feature, ...]:
     """Features of ``full_state``, in order: 7 of each vehicle, 2 of each pair, the time, and 2 of an obstacle."""
-    own = [f._replace(name=f"vehicle_{i}.{f.name}") for i in range(1, vehicles + 1) for f in OWN]
+    vehicle_features = [f._replace(name=f"vehicle_{i}.{f.name}") for i in range(1, vehicles + 1) for f in OWN]
     pairs = [f._replace(name=f"pair_{p}.{f.name}") for p in range(1, vehicles) for f in OF_PAIR.values()]
     time = Feature("time", "s", horizon_s, 0.0, 1.0, "time since the alert; scale: the horizon")
-    ahead = [f._replace(name=f"obstacle.{f.name}") for f in OF_OBSTACLE.values()] if obstacle else []
-    return (*own, *pairs, time, *ahead)
+    obstacle_features = [f._replace(name=f"obstacle.{f.name}") for f in OF_OBSTACLE.values()] if obstacle else []
+    return (*vehicle_features, *pairs, time, *obstacle_features)
 
 
 def full_state(state: State, horizon_s: float, obstacle: bool) -> Observations:
     """Values of all ``state_features``, [n, features] float32, whether or not a vehicle knows them."""
     car = state.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
-    own = OWN_VIEW.observe(state._replace(car=car), np.arange(1, state.vehicles + 1), 0.0).reshape(state.n, -1)
+    vehicle_values = OWN_VIEW.observe(state._replace(car=car), np.arange(1, state.vehicles + 1), 0.0).reshape(
+        state.n, -1
+    )
     columns = [state.line[:, row, p] for p in range(1, state.vehicles) for row in (GAP, HIT)] + [state.time_s]
     if obstacle:
         columns += [state.obstacle_gap_m, state.line[:, HIT, 0]]
-    features = state_features(state.vehicles, horizon_s, obstacle)[own.shape[1] :]
-    rest = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]
-    return np.concatenate([own, np.stack(rest, axis=1)], axis=1, dtype=np.float32)
+    features = state_features(state.vehicles, horizon_s, obstacle)[vehicle_values.shape[1] :]
+    other_values = [np.clip(c / f.scale, f.low, f.high) for c, f in zip(columns, features, strict=True)]
+    return np.concatenate([vehicle_values, np.stack(other_values, axis=1)], axis=1, dtype=np.float32)

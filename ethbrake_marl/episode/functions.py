@@ -12,7 +12,7 @@ from ethbrake_marl.errors import InvalidInput, describe_error
 from ethbrake_marl.motion.layout import Floats
 
 
-def described(kind: str, name: object, function: object, pattern: str, form: str) -> str:
+def description_of(kind: str, name: object, function: object, pattern: str, form: str) -> str:
     """Docstring, on one line, of a ``function`` that is being registered as a ``kind``, such as ``term``.
 
     Raises ``InvalidInput`` if there is none, or for a name that does not match ``pattern``, which ``form`` says in
@@ -25,13 +25,15 @@ def described(kind: str, name: object, function: object, pattern: str, form: str
     return " ".join(str(function.__doc__).split())
 
 
-def called(what: str, function: Callable[..., Any], given: tuple[Any, ...], *shapes: tuple[int, ...]) -> Floats:
+def call_function(
+    what: str, function: Callable[..., Any], arguments: tuple[Any, ...], *shapes: tuple[int, ...]
+) -> Floats:
     """Result of ``function(*given)``, as an array of numbers.
 
     Raises ``InvalidInput``, beginning with ``what``, if it fails or its result has none of the ``shapes``.
     """
     try:
-        value = np.asarray(function(*given))
+        value = np.asarray(function(*arguments))
     except InvalidInput as error:
         raise InvalidInput(f"{what}: {error}") from error
     except Exception as error:

@@ -27,7 +27,7 @@ import numpy as np
 from ethbrake_marl.episode.commands import action_of
 from ethbrake_marl.episode.counts import COUNTS, amount_so_far
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.state import LISTED, NUMBER, TIME, State, split_world
+from ethbrake_marl.episode.state import FIRST_IN_LIST, NUMBER, TIME, State, split_world
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.motion.compiling import large
 from ethbrake_marl.motion.layout import FIRST, FORCE, IMPACTS, MASS, TOTAL, Floats, Ints
@@ -78,9 +78,9 @@ def numbers(state: State, bodies: Ints) -> Floats:
 def names_of_worlds(state: State, seed: Any) -> dict[str, Any]:
     """Seed, number and list of each world, name -> [n]; ``seed`` is one for all worlds, or [n]."""
     number = state.clock[:, NUMBER].astype(np.int64)
-    listed = number <= LISTED
-    named = np.where(listed, LISTED - number, number)
-    return {"world_seed": np.full(state.n, seed), "world": named, "world_listed": listed}
+    in_evaluation_list = number <= FIRST_IN_LIST
+    number_in_list = np.where(in_evaluation_list, FIRST_IN_LIST - number, number)
+    return {"world_seed": np.full(state.n, seed), "world": number_in_list, "world_listed": in_evaluation_list}
 
 
 def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str, Any]:
@@ -108,11 +108,11 @@ def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies:
 def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, Any]]:
     """Split columns, [n] or [n, N], into one dictionary for each world and body, world by world."""
     shared = {name: value.tolist() for name, value in columns.items() if value.ndim == 1}
-    own = {name: value[:, bodies - 1].tolist() for name, value in columns.items() if value.ndim == 2}
+    vehicle_columns = {name: value[:, bodies - 1].tolist() for name, value in columns.items() if value.ndim == 2}
     rows = []
     for k in range(n):
         common = {name: column[k] for name, column in shared.items()}
-        rows += [common | {name: column[k][o] for name, column in own.items()} for o in range(len(bodies))]
+        rows += [common | {name: column[k][o] for name, column in vehicle_columns.items()} for o in range(len(bodies))]
     return rows
 
 

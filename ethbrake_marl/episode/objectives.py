@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import pair_amounts
-from ethbrake_marl.episode.functions import called, described
+from ethbrake_marl.episode.functions import call_function, description_of
 from ethbrake_marl.episode.state import State, split_harm
 from ethbrake_marl.errors import InvalidInput, unknown_name
 from ethbrake_marl.files.yaml import parse_numeral
@@ -62,20 +62,20 @@ class Harm(NamedTuple):
         The rear vehicle of a pair bears its conduct alone; the two share the rest by their masses.
         """
         pairs, unshared = amounts
-        whole, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
+        line_harm, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
         for p in range(pairs.shape[1]):  # from the obstacle to the rear
-            whole = whole + pairs[:, p]
+            line_harm = line_harm + pairs[:, p]
         impacts = np.maximum(pairs - unshared, 0.0)
         split_harm(impacts, car[:, MASS], borne)
-        return cls(impacts, borne + unshared[:, :-1], whole, car)
+        return cls(impacts, borne + unshared[:, :-1], line_harm, car)
 
     def weighted(self, weights: Floats) -> Floats:
         """``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for ``weights`` [n, N]; summed from front to rear."""
-        harm, whole = np.zeros(len(self.borne)), np.zeros(len(self.borne))
+        harm, total_weight = np.zeros(len(self.borne)), np.zeros(len(self.borne))
         for j in range(self.borne.shape[1]):
             harm = harm + weights[:, j] * self.borne[:, j]
-            whole = whole + weights[:, j]
-        return self.borne.shape[1] * harm / whole
+            total_weight = total_weight + weights[:, j]
+        return self.borne.shape[1] * harm / total_weight
 
 
 class Kind(NamedTuple):
@@ -122,9 +122,9 @@ class Objective(NamedTuple):
         Raises ``InvalidInput`` unless the objective is a weighted sum.
         """
         if self.kind.weights is None:
-            known = ", ".join(kind.form for kind in OBJECTIVES.loaded.values() if kind.weights)
+            forms = ", ".join(kind.form for kind in OBJECTIVES.loaded.values() if kind.weights)
             raise InvalidInput(
-                f"objective {self.kind.form!r}: is not a weighted sum of the vehicles' harm; use one of {known}"
+                f"objective {self.kind.form!r}: is not a weighted sum of the vehicles' harm; use one of {forms}"
             )
         weights = self.kind.weights(car, vehicle, self)
         return np.broadcast_to(weights, (len(car), car.shape[2] - 1)).astype(np.float64)
@@ -153,8 +153,8 @@ def parse_objective(text: str) -> Objective:
         if argument not in kind.arguments:
             raise unknown_name(f"argument of the objective {name}", argument, kind.arguments)
         return Objective(kind, argument=argument)
-    written = [parse_numeral(part.strip()) for part in argument.split(",")]
-    numbers = tuple(number for number in written if number is not None) if None not in written else ()
+    numerals = [parse_numeral(part.strip()) for part in argument.split(",")]
+    numbers = tuple(number for number in numerals if number is not None) if None not in numerals else ()
     if name == "social":
         if len(numbers) != 1 or not 0.0 <= numbers[0] <= 90.0:
             raise InvalidInput(f"objective {text!r}: social needs an angle from 0 to 90 degrees, as in social:45")
@@ -168,13 +168,13 @@ def parse_objective(text: str) -> Objective:
 
 
 def _first_and_then(text: str, argument: str) -> tuple[Objective, ...]:
-    written = argument.split(",then:")
-    if len(written) != 2 or not all(written) or any(name_of(part) == "first" for part in written):
+    texts = argument.split(",then:")
+    if len(texts) != 2 or not all(texts) or any(name_of(part) == "first" for part in texts):
         raise InvalidInput(
             f"objective {text!r}: first needs one objective, and then another one, as in first:vehicle_3,then:total;"
             " neither may contain first"
         )
-    return tuple(parse_objective(part) for part in written)
+    return tuple(parse_objective(part) for part in texts)
 
 
 def name_of(text: str) -> str:
@@ -184,19 +184,19 @@ def name_of(text: str) -> str:
 
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
     """Objective of each vehicle, front to rear. Raises ``InvalidInput`` for a bad text or the wrong number of texts."""
-    each = [declared] * vehicles if isinstance(declared, str) else declared
-    if not isinstance(each, Sequence) or not all(isinstance(text, str) for text in each):
+    texts = [declared] * vehicles if isinstance(declared, str) else declared
+    if not isinstance(texts, Sequence) or not all(isinstance(text, str) for text in texts):
         raise InvalidInput(
             "objective: must be the name of an objective, for instance own or social:45, or a list with one name per"
             " vehicle"
         )
-    if len(each) != vehicles:
+    if len(texts) != vehicles:
         raise InvalidInput(
-            f"objective: the list has {len(each)} entries; must have {vehicles}, one per vehicle; or give one objective"
-            " for all vehicles, without a list"
+            f"objective: the list has {len(texts)} entries; must have {vehicles}, one per vehicle; or give one"
+            " objective for all vehicles, without a list"
         )
-    parsed = tuple(parse_objective(text) for text in each)
-    for text, objective in zip(each, parsed, strict=True):
+    parsed = tuple(parse_objective(text) for text in texts)
+    for text, objective in zip(texts, parsed, strict=True):
         for part in objective.parts or (objective,):
             _check_vehicles(text, part, vehicles)
     return parsed
@@ -231,15 +231,17 @@ def amounts(objectives: Sequence[Objective], before: State | None, after: State,
     A weighted sum is computed from the harm since then; other objectives are amount after minus amount before.
     ``count`` says which harm (``episode.counts``).
     """
-    now = pair_amounts(after.line, count)
-    whole = Harm.of(now, after.car)
+    amounts_after = pair_amounts(after.line, count)
+    harm_so_far = Harm.of(amounts_after, after.car)
     if before is None:
-        return np.stack([each.amount(whole, i) for i, each in enumerate(objectives)], axis=1)
-    earlier = pair_amounts(before.line, count)
-    since, then = Harm.of(now - earlier, after.car), Harm.of(earlier, after.car)
+        return np.stack([objective.amount(harm_so_far, i) for i, objective in enumerate(objectives)], axis=1)
+    amounts_before = pair_amounts(before.line, count)
+    growth, harm_before = Harm.of(amounts_after - amounts_before, after.car), Harm.of(amounts_before, after.car)
     columns = [
-        each.amount(since, i) if each.is_sum else each.amount(whole, i) - each.amount(then, i)
-        for i, each in enumerate(objectives)
+        objective.amount(growth, i)
+        if objective.is_sum
+        else objective.amount(harm_so_far, i) - objective.amount(harm_before, i)
+        for i, objective in enumerate(objectives)
     ]
     return np.stack(columns, axis=1)
 
@@ -259,15 +261,15 @@ def _shares(weights: Floats) -> Floats:
     return weights * (weights.shape[1] / weights.sum(axis=1, keepdims=True))
 
 
-def _own(car: Floats, vehicle: int) -> Floats:
+def _unit_weights(car: Floats, vehicle: int) -> Floats:
     return np.eye(car.shape[2] - 1)[vehicle]
 
 
-def _social(harm: Harm, vehicle: int, own: float, others: float) -> Floats:
-    return own * harm.borne[:, vehicle] + others * (harm.whole - harm.borne[:, vehicle])
+def _social(harm: Harm, vehicle: int, own_weight: float, others_weight: float) -> Floats:
+    return own_weight * harm.borne[:, vehicle] + others_weight * (harm.whole - harm.borne[:, vehicle])
 
 
-def _joined(first_and_then: Sequence[Floats]) -> Floats:
+def _lexicographic_sum(first_and_then: Sequence[Floats]) -> Floats:
     return FIRST_WEIGHT * first_and_then[0] + first_and_then[1]
 
 
@@ -280,19 +282,19 @@ def register_objective(name: str, function: Callable[..., Floats], *, arguments:
     docstring.
     """
     form = "a-z, 0-9, - and _, beginning with a letter or digit, and no name of a vehicle"
-    meaning = described("objective", name, function, r"(?!vehicle_\d+$)[a-z0-9][a-z0-9_-]{0,63}", form)
+    meaning = description_of("objective", name, function, r"(?!vehicle_\d+$)[a-z0-9][a-z0-9_-]{0,63}", form)
 
-    def amount(harm: Harm, vehicle: int, written: Objective) -> Floats:
+    def amount(harm: Harm, vehicle: int, objective: Objective) -> Floats:
         what = f"objective {name!r} of vehicle_{vehicle + 1}"
-        given = (harm, vehicle, written.argument) if arguments else (harm, vehicle)
-        value = called(what, function, given, harm.whole.shape)
+        call_arguments = (harm, vehicle, objective.argument) if arguments else (harm, vehicle)
+        value = call_function(what, function, call_arguments, harm.whole.shape)
         if not np.isfinite(value).all():
             raise InvalidInput(f"{what}: its value is not finite in row {int(np.argmin(np.isfinite(value)))}")
         return value.astype(np.float64)
 
     form = f"{name}:{'|'.join(arguments)}" if arguments else name
     kind = Kind(form, meaning, amount, function=function, arguments=tuple(arguments))
-    OBJECTIVES.add(name, kind, lambda other: other.function is function)
+    OBJECTIVES.add(name, kind, lambda registered: registered.function is function)
 
 
 OBJECTIVES: Registry[Kind] = Registry(
@@ -306,12 +308,12 @@ OBJECTIVES: Registry[Kind] = Registry(
         ),
         "own": Kind(
             "own", "harm that the vehicle itself bears", lambda harm, i, written: harm.borne[:, i],
-            lambda car, i, written: _own(car, i),
+            lambda car, i, written: _unit_weights(car, i),
         ),
         "social": Kind(
             "social:ANGLE", "social value orientation: own harm at 0 degrees, harm of the others at 90 degrees",
             lambda harm, i, written: _social(harm, i, *written.numbers),
-            lambda car, i, written: np.where(_own(car, i), *written.numbers),
+            lambda car, i, written: np.where(_unit_weights(car, i), *written.numbers),
         ),
         "maximin": Kind(
             "maximin", "harm of the vehicle that bears most", lambda harm, i, written: harm.borne.max(axis=1)
@@ -334,12 +336,12 @@ OBJECTIVES: Registry[Kind] = Registry(
         "vehicle_K": Kind(
             "vehicle_K", "harm that Vehicle K bears",
             lambda harm, i, written: harm.borne[:, int(written.numbers[0]) - 1],
-            lambda car, i, written: _own(car, int(written.numbers[0]) - 1),
+            lambda car, i, written: _unit_weights(car, int(written.numbers[0]) - 1),
         ),
         "first": Kind(
             "first:OBJECTIVE,then:OBJECTIVE", "one objective; another one, a thousand times lighter, breaks its ties",
-            lambda harm, i, written: _joined([part.amount(harm, i) for part in written.parts]),
-            lambda car, i, written: _joined([part.weights(car, i) for part in written.parts]),
+            lambda harm, i, written: _lexicographic_sum([part.amount(harm, i) for part in written.parts]),
+            lambda car, i, written: _lexicographic_sum([part.weights(car, i) for part in written.parts]),
         ),
     },
 )  # fmt: skip

@@ -16,15 +16,15 @@ from ethbrake_marl.episode.features import (
     OBSTACLE_FEATURES,
     OWN,
     ROLE,
+    ComputedFeature,
     Feature,
     Group,
-    Own,
     feature_named,
     group_named,
     listed_features,
     side_of,
 )
-from ethbrake_marl.episode.functions import called, check_finite_values
+from ethbrake_marl.episode.functions import call_function, check_finite_values
 from ethbrake_marl.episode.state import TIME, State
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
@@ -63,7 +63,7 @@ class ObservationPlan(NamedTuple):
     obstacle: bool
     places: Ints  # [F] index of each feature in the kernel's ``value``; -1: of ``groups`` or ``own``; empty: in order
     groups: tuple[tuple[Group, list[int], list[int]], ...]  # of other packages: group, columns, features in the group
-    own: tuple[tuple[int, Own, int], ...]  # column, feature, offset (0: of the vehicle itself)
+    own: tuple[tuple[int, ComputedFeature, int], ...]  # column, feature, offset (0: of the vehicle itself)
     scaling: Floats  # [3, F] 1 / scale, low and high
 
 
@@ -96,54 +96,57 @@ class View:
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
         """Observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
         plan = self.plan
-        seen = np.empty((state.n, len(observers), len(self.names)), np.float32)
+        observations = np.empty((state.n, len(observers), len(self.names)), np.float32)
         observe_worlds(
             state.line, state.car, state.clock, state.know, observers, plan.offsets, plan.role, plan.obstacle,
-            plan.places, plan.scaling, np.empty(N_OWN + N_NEIGHBOUR * len(plan.offsets) + N_ROLE + N_OBSTACLE), seen,
+            plan.places, plan.scaling, np.empty(N_OWN + N_NEIGHBOUR * len(plan.offsets) + N_ROLE + N_OBSTACLE),
+            observations,
         )  # fmt: skip
         if not plan.groups and not plan.own:
-            return seen
+            return observations
         functions = {group.function for group, *_ in plan.groups}
         values = {function: function(state, observers, time_step_s) for function in functions}
         for group, columns, places in plan.groups:
             parts = values[group.function][..., group.columns][..., places]
-            seen[:, :, columns] = scaled(parts, plan.scaling[:, columns])
-        for column, own, offset in plan.own:
+            observations[:, :, columns] = scale_values(parts, plan.scaling[:, columns])
+        for column, entry, offset in plan.own:
             for o, body in enumerate(observers.tolist()):
-                seen[:, o, column] = own_feature(own, state, body, offset, knows(state, body, body + offset))
-        return seen
+                observations[:, o, column] = observe_computed(
+                    entry, state, body, offset, knows(state, body, body + offset)
+                )
+        return observations
 
     @cached_property
     def plan(self) -> ObservationPlan:
-        listed = list(dict.fromkeys(name.partition(".")[0] for name in self.names if "." in name))
-        offsets = [offset for name in listed if (offset := side_of(name)) is not None]
-        inside = ["own", *(name for name in listed if side_of(name) is not None)]
-        inside += [name for name in ("role", "obstacle") if name in listed]
-        known = [f"{group}.{feature.name}" for group in inside for feature in group_named(group) or ()]
-        place = {name: number for number, name in enumerate(known)}
+        group_names = list(dict.fromkeys(name.partition(".")[0] for name in self.names if "." in name))
+        offsets = [offset for name in group_names if (offset := side_of(name)) is not None]
+        kernel_groups = ["own", *(name for name in group_names if side_of(name) is not None)]
+        kernel_groups += [name for name in ("role", "obstacle") if name in group_names]
+        kernel_names = [f"{group}.{feature.name}" for group in kernel_groups for feature in group_named(group) or ()]
+        place = {name: number for number, name in enumerate(kernel_names)}
         groups = []
-        for group in (name for name in listed if name in GROUPS):
+        for group in (name for name in group_names if name in GROUPS):
             names = [f"{group}.{feature.name}" for feature in GROUPS[group].features]
             columns = [column for column, name in enumerate(self.names) if name in names]
             groups.append((GROUPS[group], columns, [names.index(self.names[column]) for column in columns]))
         split = [name.rpartition(".") for name in self.names]
-        own = [
-            (column, FEATURES[last], side_of(side) or 0)
-            for column, (side, _, last) in enumerate(split)
+        computed_features = [
+            (column, FEATURES[feature_name], side_of(side) or 0)
+            for column, (side, _, feature_name) in enumerate(split)
             if self.names[column] not in place and side not in GROUPS
         ]
-        places = [] if list(self.names) == known else [place.get(name, -1) for name in self.names]
+        places = [] if list(self.names) == kernel_names else [place.get(name, -1) for name in self.names]
         return ObservationPlan(
-            np.array(offsets, np.int64), "role" in listed, "obstacle" in listed, np.array(places, np.int64),
-            tuple(groups), tuple(own), scaling_of(self.features),
+            np.array(offsets, np.int64), "role" in group_names, "obstacle" in group_names, np.array(places, np.int64),
+            tuple(groups), tuple(computed_features), scaling_of(self.features),
         )  # fmt: skip
 
 
-def knows(state: State, body: int, other: int) -> NDArray[np.bool_]:
+def knows(state: State, body: int, neighbour: int) -> NDArray[np.bool_]:
     """Whether a body knows another one already and may react to it, [n]; False if the other one does not exist."""
-    if not 0 < other <= state.vehicles:
+    if not 0 < neighbour <= state.vehicles:
         return np.zeros(state.n, np.bool_)
-    return np.asarray(state.time_s >= state.know[:, body, other])
+    return np.asarray(state.time_s >= state.know[:, body, neighbour])
 
 
 def has_unknown(state: State, body: int) -> NDArray[np.bool_]:
@@ -157,28 +160,28 @@ def scaling_of(features: Sequence[Feature]) -> Floats:
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
-def scaled(values: Floats, scaling: Floats) -> Floats:
+def scale_values(values: Floats, scaling: Floats) -> Floats:
     return np.clip(values * scaling[0], scaling[1], scaling[2])
 
 
-def own_feature(own: Own, state: State, body: int, offset: int, known: NDArray[np.bool_]) -> Floats:
+def observe_computed(entry: ComputedFeature, state: State, body: int, offset: int, known: NDArray[np.bool_]) -> Floats:
     """Observed value of a feature that has a function, [n].
 
     ``offset`` leads from the body to the neighbour that is described (-1: the vehicle ahead), where it is ``known``
     [n]; 0: the feature describes the body itself.
     """
-    what = f"feature {own.feature.name!r} of vehicle_{body}"
+    what = f"feature {entry.feature.name!r} of vehicle_{body}"
     if offset and not known.any():
-        value = np.full(state.n, own.unknown)
+        value = np.full(state.n, entry.unknown)
     else:
-        given = (state.read_only(), body, body + offset) if offset else (state.read_only(), body)
-        value = called(what, own.function, given, (state.n,))
+        arguments = (state.read_only(), body, body + offset) if offset else (state.read_only(), body)
+        value = call_function(what, entry.function, arguments, (state.n,))
         if offset:
-            lost = np.isnan(value)  # a layer shows what a vehicle does not know as NaN
-            known = known & ~(lost & has_unknown(state, body + offset)) if lost.any() else known
-            value = np.where(known, value, own.unknown)
+            is_missing = np.isnan(value)  # a layer shows what a vehicle does not know as NaN
+            known = known & ~(is_missing & has_unknown(state, body + offset)) if is_missing.any() else known
+            value = np.where(known, value, entry.unknown)
     check_finite_values(what, value, state.time_s)
-    return scaled(value, scaling_of([own.feature])[:, 0])
+    return scale_values(value, scaling_of([entry.feature])[:, 0])
 
 
 @kernel
@@ -203,7 +206,7 @@ def fitting_deceleration(speed, latency_left, room):
 
 
 @kernel
-def bounded(value, scaling, f):
+def scale_value(value, scaling, f):
     return min(max(value * scaling[0, f], scaling[1, f]), scaling[2, f])
 
 
@@ -221,11 +224,11 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
         w, c, time = line[k], car[k], clock[k, TIME]
         for o in range(len(observers)):
             i = observers[o]
-            left = max(c[OWN_LATENCY, i] - time, 0.0)
-            own_stop = full_stop_m(w[SPEED, i], left, capacity(c, BRAKING, i, time))
+            latency_left = max(c[OWN_LATENCY, i] - time, 0.0)
+            own_stop = full_stop_m(w[SPEED, i], latency_left, capacity(c, BRAKING, i, time))
             value[OWN_SPEED], value[OWN_ACCELERATION], value[OWN_MASS] = w[SPEED, i], w[FORCE, i], c[MASS, i]
             value[OWN_BRAKING], value[OWN_DRIVING] = c[BRAKING, i], c[DRIVING, i]
-            value[OWN_LATENCY_LEFT], value[OWN_RESTITUTION] = left, c[RESTITUTION, i]
+            value[OWN_LATENCY_LEFT], value[OWN_RESTITUTION] = latency_left, c[RESTITUTION, i]
             f = N_OWN
             for offset in offsets:
                 j = i + offset
@@ -243,7 +246,7 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
                     near[NEAR_BRAKING], near[NEAR_MASS], near[NEAR_LATENCY_LEFT] = c[BRAKING, j], c[MASS, j], wait
                     near[NEAR_HIT] = w[HIT, i - 1 if front else i]
                     near[NEAR_STOPPING_MARGIN] = gap + stop - own_stop if front else gap + own_stop - stop
-                    near[NEAR_FITTING_DECELERATION] = fitting_deceleration(w[SPEED, i], left, room)
+                    near[NEAR_FITTING_DECELERATION] = fitting_deceleration(w[SPEED, i], latency_left, room)
                 f += N_NEIGHBOUR
             if role:
                 value[f + ROLE_AHEAD], value[f + ROLE_BEHIND] = i - 1, bodies - 1 - i
@@ -257,10 +260,10 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
                         gap += w[GAP, p]
                     ahead[OBSTACLE_KNOWN], ahead[OBSTACLE_GAP], ahead[OBSTACLE_HIT] = 1.0, gap, w[HIT, 0]
                     ahead[OBSTACLE_STOPPING_MARGIN] = gap - own_stop
-                    ahead[OBSTACLE_FITTING_DECELERATION] = fitting_deceleration(w[SPEED, i], left, gap)
+                    ahead[OBSTACLE_FITTING_DECELERATION] = fitting_deceleration(w[SPEED, i], latency_left, gap)
             if len(places) == 0:
                 for f in range(scaling.shape[1]):
-                    out[k, o, f] = bounded(value[f], scaling, f)
+                    out[k, o, f] = scale_value(value[f], scaling, f)
             for f in range(len(places)):
                 if places[f] >= 0:
-                    out[k, o, f] = bounded(value[places[f]], scaling, f)
+                    out[k, o, f] = scale_value(value[places[f]], scaling, f)

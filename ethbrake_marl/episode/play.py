@@ -29,12 +29,12 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, we
         while clock[k, ENDED] == 0.0 and harm <= most[k]:
             actions = plans[k, min(int(clock[k, STEPS]), plans.shape[1] - 1)]
             write_commands(car[k], wanted[k], learners, actions, clock[k, TIME])
-            met, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
-            harm = math.inf if met == FAILED else amount_so_far(line[k], weights)
+            outcome, _ = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
+            harm = math.inf if outcome == FAILED else amount_so_far(line[k], weights)
         out[k] = harm
 
 
-def played(
+def follow_plans(
     game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf, *, donate: bool = False
 ) -> tuple[State, Floats]:
     """Last states of episodes whose learners follow plans from ``state`` on, and the harm, [n] m2/s2.
@@ -47,8 +47,8 @@ def played(
     if game.scripts or game.physics is not None:
         rows = np.arange(len(plans))
         while (~state.ended & (state.harm(count) <= most)).any():
-            now = np.minimum(state.steps, plans.shape[1] - 1)
-            state, _ = game.follow(state, plans[rows, now])
+            decision = np.minimum(state.steps, plans.shape[1] - 1)
+            state, _ = game.follow(state, plans[rows, decision])
         return state, state.harm(count)
     line, car, clock, know, wanted, memories = state
     if not donate:
@@ -62,5 +62,5 @@ def played(
 
 
 def price(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> Floats:
-    """Harm of every episode, [n] m2/s2, if its learners follow ``plans`` from now on (arguments of ``played``)."""
-    return played(game, state, plans, count, most)[1]
+    """Harm of every episode, [n] m2/s2, if its learners follow ``plans`` from now on (see ``follow_plans``)."""
+    return follow_plans(game, state, plans, count, most)[1]

@@ -95,16 +95,19 @@ class RewardParams(FileModel):
     def _own_terms(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             return value
-        beside = {name: weight for name, weight in value.items() if name in own_terms()}
-        inside = value.get("terms", {})
-        if beside and (not isinstance(inside, dict) or beside.keys() & inside.keys()):
+        outside_weights = {name: weight for name, weight in value.items() if name in own_terms()}
+        inside_weights = value.get("terms", {})
+        if outside_weights and (not isinstance(inside_weights, dict) or outside_weights.keys() & inside_weights.keys()):
             raise ValueError(
                 "write the weight of a registered term either in the mapping terms or next to the other settings, not"
                 " in both places"
             )
-        if not beside:
+        if not outside_weights:
             return value
-        return {**{name: each for name, each in value.items() if name not in beside}, "terms": {**inside, **beside}}
+        return {
+            **{name: setting for name, setting in value.items() if name not in outside_weights},
+            "terms": {**inside_weights, **outside_weights},
+        }
 
     @field_validator("terms")
     @classmethod
@@ -131,12 +134,12 @@ class RewardParams(FileModel):
     def _harm_is_meant(self) -> Self:
         """Refuse weights of other terms without a weight of harm, because its default is 1."""
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
-        beside = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
+        weighted_terms = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
         right = (
-            f"must be given together with {''.join(beside[:1])}, because its default weight is 1; write harm: 1, or"
-            " harm: 0 for a reward without harm"
+            f"must be given together with {''.join(weighted_terms[:1])}, because its default weight is 1; write harm: 1,"
+            " or harm: 0 for a reward without harm"
         )
-        require(not beside or "harm" in names, ("harm",), UNSHOWN, right)
+        require(not weighted_terms or "harm" in names, ("harm",), UNSHOWN, right)
         right = "has no effect, because it changes only the term harm, whose weight is 0; leave it out or give a weight"
         require(self.objective is None or self.harm > 0.0, ("objective",), UNSHOWN, right)
         return self
@@ -213,7 +216,7 @@ class Rewarding(NamedTuple):
             objectives = objectives_of(declared, vehicles)
         except InvalidInput as error:
             raise InvalidInput(f"reward: {error}") from None
-        line_only = all(each.kind is OBJECTIVES["total"] for each in objectives)
+        line_only = all(vehicle_objective.kind is OBJECTIVES["total"] for vehicle_objective in objectives)
         if isinstance(report, str) or not isinstance(report, Sequence):
             raise InvalidInput(f"report = {report!r}: must be a list of names of terms, such as ['risk', 'jerk']")
         for name in report:
@@ -249,8 +252,10 @@ class Rewarding(NamedTuple):
             **{name: TERMS[name].value for name in reported if name not in BUILT_IN},
             **{name: component(name, params.harm_count) for name in components if name not in counted},
         }
-        needed = {*reported, *components} - ({"harm"} if line_only else set())
-        terms = tuple((n, params.weights.get(n, 0.0), function) for n, function in functions.items() if n in needed)
+        needed_terms = {*reported, *components} - ({"harm"} if line_only else set())
+        terms = tuple(
+            (n, params.weights.get(n, 0.0), function) for n, function in functions.items() if n in needed_terms
+        )
         shaping = Shaping(settings, params.shaping_discount) if "shaping" in reported else None
         return cls(params, counted, reported, terms, shaping, components), settings
 
@@ -271,19 +276,21 @@ class Rewarding(NamedTuple):
         if self.params.shaping:
             extra += self.params.shaping * values["shaping"]
         extra[before.ended] = 0.0
-        known = {**self.shared(step), **values}
-        step = step._replace(reward=step.reward + extra, terms=known)
+        reward_terms = {**self.shared(step), **values}
+        step = step._replace(reward=step.reward + extra, terms=reward_terms)
         if self.components:
-            step = step._replace(terms={name: known[name] for name in known if name in self.reported})
-            vector = np.stack([np.broadcast_to(_wide(known[name]), extra.shape) for name in self.components], axis=2)
+            step = step._replace(terms={name: reward_terms[name] for name in reward_terms if name in self.reported})
+            vector = np.stack(
+                [np.broadcast_to(_wide(reward_terms[name]), extra.shape) for name in self.components], axis=2
+            )
             vector[before.ended] = 0.0
             step = step._replace(vector=vector)
         return after, step
 
     def shared(self, step: Step) -> dict[str, Floats]:
         """Values of the terms that the compiled step computes, name -> [n]."""
-        known = {"harm": -step.cost, "terminal": step.out[SAFE_END]}
-        return {name: value for name, value in known.items() if name in self.reported}
+        term_values = {"harm": -step.cost, "terminal": step.out[SAFE_END]}
+        return {name: value for name, value in term_values.items() if name in self.reported}
 
 
 def _wide(value: Floats) -> Floats:

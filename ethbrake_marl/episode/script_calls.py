@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.episode.state import NUMBER, State, mapped
+from ethbrake_marl.episode.state import NUMBER, State, map_arrays
 from ethbrake_marl.errors import AgentFailed, EthBrakeError, describe_error
 from ethbrake_marl.motion.forces import capacities
 from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
@@ -46,7 +46,7 @@ class UserScript:
             view.setflags(write=False)
             return view
 
-        return mapped(view_of, memory)
+        return map_arrays(view_of, memory)
 
 
 def guard_scripts(scripts: Mapping[int, Any]) -> dict[int, Any]:

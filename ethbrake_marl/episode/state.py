@@ -36,7 +36,7 @@ LAST = 3  # number of the last step, unless all vehicles come to rest before
 ENDED = 4  # 1 once the episode has ended
 NUMBER = 5  # number of the world in its list; -1: the caller has made it
 END = 6  # time at which the last step ends (s): the horizon, or earlier after `StepSettings.most_steps`
-LISTED = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
+FIRST_IN_LIST = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
 CLOCK_COLUMNS = 7
 
 PHYSICS = "physics"  # a memory of this name marks worlds whose impacts are not exact (`State.is_exact`)
@@ -79,7 +79,7 @@ class State(NamedTuple):
 
         ``merged`` turns a list of arrays, one per state, into one array; by default it concatenates them.
         """
-        state: State = mapped(lambda *arrays: merged(arrays), *parts)
+        state: State = map_arrays(lambda *arrays: merged(arrays), *parts)
         return state
 
     def read_only(self) -> State:
@@ -232,39 +232,42 @@ def check_exact(state: State, what: str) -> None:
         )
 
 
-def mapped(function: Callable[..., Any], memory: Any, *others: Any) -> Any:
-    """A memory with ``function(array, ...)`` in place of each array; ``others`` are memories of the same structure.
+def map_arrays(function: Callable[..., Any], memory: Any, *siblings: Any) -> Any:
+    """A memory with ``function(array, ...)`` in place of each array; ``siblings`` are memories of the same structure.
 
     A memory is None, an array with one row per world, or a tuple or mapping of memories (a state is one, too).
     """
     if isinstance(memory, np.ndarray):  # first, because the check for a mapping is slow
-        return function(memory, *others)
+        return function(memory, *siblings)
     if isinstance(memory, tuple):
-        parts = [mapped(function, *each) for each in zip(memory, *others, strict=True)]
+        parts = [map_arrays(function, *aligned_parts) for aligned_parts in zip(memory, *siblings, strict=True)]
         return type(memory)(*parts) if hasattr(memory, "_fields") else tuple(parts)
     if isinstance(memory, Mapping):
-        return {who: mapped(function, each, *(other[who] for other in others)) for who, each in memory.items()}
-    return None if memory is None else function(memory, *others)
+        return {
+            owner: map_arrays(function, part, *(sibling[owner] for sibling in siblings))
+            for owner, part in memory.items()
+        }
+    return None if memory is None else function(memory, *siblings)
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """``rows`` of every array in a memory (``mapped``). Slices are copied: compiled code then gets the usual layout."""
+    """``rows`` of every array in a memory (``map_arrays``). Slices are copied, to give compiled code the usual layout."""
     if isinstance(rows, slice):
-        return mapped(lambda array: array[rows].copy(), memory)
+        return map_arrays(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)
     places = np.flatnonzero(places) if places.dtype == np.bool_ else places
-    return mapped(lambda array: array.take(places, axis=0), memory)  # more than twice as fast as array[rows]
+    return map_arrays(lambda array: array.take(places, axis=0), memory)  # more than twice as fast as array[rows]
 
 
 def put_rows(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
-    """A memory (``mapped``) with ``new`` in ``rows``: a copy, or with ``donate`` the same writable arrays."""
+    """A memory (``map_arrays``) with ``new`` in ``rows``: a copy, or with ``donate`` the same writable arrays."""
 
-    def written(old: Any, part: Any) -> Any:
+    def write_rows(old: Any, part: Any) -> Any:
         array = old if donate and old.flags.writeable else old.copy()
         array[rows] = part
         return array
 
-    return mapped(written, memory, new)
+    return map_arrays(write_rows, memory, new)
 
 
 @large

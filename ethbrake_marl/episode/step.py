@@ -14,7 +14,7 @@ from ethbrake_marl.episode.script_calls import ask_scripts
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, END, ENDED, FIRST_DECISION, LAST, NUMBER, STEPS, TIME, State
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
-from ethbrake_marl.motion.interval import FAILED, MET, move_line, move_lines
+from ethbrake_marl.motion.interval import EVENT_BY_EVENT, FAILED, move_line, move_lines
 from ethbrake_marl.motion.layout import (
     FORCE,
     IMPACTS,
@@ -117,14 +117,14 @@ def step(
         line, clock, wanted = line.copy(), clock.copy(), wanted.copy()
     reward, out = np.empty((len(clock), wanted.shape[1] - 1)), np.empty((OUT_ROWS, len(clock)))
     scratch = scratch_for(wanted.shape[1])
-    refused, failed = step_worlds(
+    refused_row, failed_row = step_worlds(
         line, car, clock, wanted, actions, scratch, out, reward, settings.learners, settings.time_step_s, settings.harm,
         settings.terminal, settings.weights,
     )  # fmt: skip
-    if refused >= 0:
-        check_actions(settings.learners, actions[refused])
-    if failed >= 0:
-        raise failure(state, failed, state.time_s[failed], clock[failed, TIME])
+    if refused_row >= 0:
+        check_actions(settings.learners, actions[refused_row])
+    if failed_row >= 0:
+        raise failure(state, failed_row, state.time_s[failed_row], clock[failed_row, TIME])
     return State(line, car, clock, know, wanted, memories), Step(reward, out, settings.time_step_s)
 
 
@@ -153,13 +153,13 @@ def step_worlds(
             continue
         write_commands(car[k], wanted[k], learners, actions[k], clock[k, TIME])
         before = beside_harm(line[k], weights)
-        met, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
-        if met == FAILED:
+        outcome, at_rest = advance(line[k], car[k], clock[k], wanted[k], scratch, time_step_s)
+        if outcome == FAILED:
             failed = k
         impacts = 0.0
         for p in range(bodies - 1):
             impacts += line[k, IMPACTS, p]
-            if met == MET:
+            if outcome == EVENT_BY_EVENT:
                 out[HARM, k] += scratch[NEW_FIRST, p]
                 out[TOTAL_HARM, k] += scratch[NEW_TOTAL, p]
         over = clock[k, ENDED] == 1.0
@@ -185,13 +185,13 @@ def advance(line, car, clock, wanted, scratch, time_step_s):
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
     until = clock[END] if over else clock[FIRST_DECISION] + clock[STEPS] * time_step_s
-    met = move_line(line, car, wanted, scratch, clock[TIME], until)
+    outcome = move_line(line, car, wanted, scratch, clock[TIME], until)
     clock[TIME] = until
-    at_rest = met != FAILED and stands(line, wanted)
-    clock[ENDED] = 1.0 if over or at_rest or met == FAILED else 0.0
+    at_rest = outcome != FAILED and stands(line, wanted)
+    clock[ENDED] = 1.0 if over or at_rest or outcome == FAILED else 0.0
     if over:
         note_motion(line)
-    return met, at_rest
+    return outcome, at_rest
 
 
 @kernel
@@ -226,7 +226,7 @@ def first_decision(alert: State, deciders: Ints, settings: StepSettings) -> Stat
     Until then all vehicles hold ``alert.wanted``.
     """
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
-    state, most = advanced(alert, first), settings.most_steps
+    state, most = hold_commands(alert, first), settings.most_steps
     state.clock[:, FIRST_DECISION] = first
     steps = steps_to_horizon(first, settings)
     state.clock[:, LAST] = np.minimum(steps, most)
@@ -239,7 +239,7 @@ def steps_to_horizon(first_s: Any, settings: StepSettings) -> Any:
     return np.ceil((settings.horizon_s - first_s) / settings.time_step_s - ROUNDING)
 
 
-def advanced(state: State, until_s: Floats) -> State:
+def hold_commands(state: State, until_s: Floats) -> State:
     """State at ``until_s`` [n] if all vehicles hold their commands."""
     line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
     car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others

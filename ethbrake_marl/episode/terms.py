@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.counts import ROWS, pair_amounts
-from ethbrake_marl.episode.functions import called, check_finite_values, described
+from ethbrake_marl.episode.functions import call_function, check_finite_values, description_of
 from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
 from ethbrake_marl.episode.state import END, State, check_exact
@@ -57,8 +57,8 @@ class Term(NamedTuple):
 
     def value(self, before: State, step: Step, after: State) -> Floats:
         """Value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns anything else."""
-        what, given = f"term {self.name!r}", (before.read_only(), step, after.read_only())
-        value = called(what, self.function, given, (after.n,), (after.n, after.vehicles))
+        what, arguments = f"term {self.name!r}", (before.read_only(), step, after.read_only())
+        value = call_function(what, self.function, arguments, (after.n,), (after.n, after.vehicles))
         running = ~before.ended
         value = np.where(running if value.ndim == 1 else running[:, np.newaxis], value, 0.0)
         check_finite_values(what, value, after.time_s)
@@ -78,11 +78,11 @@ def register_term(name: str, function: TermFunction, *, unit: str = "1") -> None
 
     """
     form = "a-z, 0-9 and _, beginning with a letter and not ending in _ and a number"
-    meaning = described("term", name, function, r"(?!.*_[0-9]+\Z)[a-z][a-z0-9_]{0,63}", form)
+    meaning = description_of("term", name, function, r"(?!.*_[0-9]+\Z)[a-z][a-z0-9_]{0,63}", form)
     if name in BUILT_IN:
         raise AlreadyExists(f"term {name!r}: this name is already in use; give another name")
     term = Term(name, function, str(unit), meaning)
-    TERMS.add(name, term, lambda other: other == term)
+    TERMS.add(name, term, lambda registered: registered == term)
 
 
 TERMS: Registry[Term] = Registry("term", "terms", register_term)
@@ -110,8 +110,8 @@ def collision(params: Any, before: State, step: Step, after: State) -> Floats:
 
 def pair_energies(params: Any, vehicles: int) -> Floats:
     """``k_energy`` of every pair, [N + 1], from ``RewardParams``; the obstacle's is that of the first two vehicles."""
-    each = params.k_energy if isinstance(params.k_energy, tuple) else (params.k_energy,) * (vehicles - 1)
-    return np.array([each[0], *each, 0.0])
+    factors = params.k_energy if isinstance(params.k_energy, tuple) else (params.k_energy,) * (vehicles - 1)
+    return np.array([factors[0], *factors, 0.0])
 
 
 def jerk(before: State, step: Step, after: State) -> Floats:
@@ -165,9 +165,9 @@ def potential(settings: StepSettings, state: State) -> Floats:
     """
     learners = settings.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
-    further = state.line.copy()
-    further[:, ROWS] = 0.0
-    state = state._replace(line=further)
+    line = state.line.copy()
+    line[:, ROWS] = 0.0
+    state = state._replace(line=line)
     _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], settings.weights)
     least[state.ended] = 0.0
     return -least
@@ -223,16 +223,18 @@ def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[s
     ``counted`` are the terms of the reward, which can be components too. Raises ``InvalidInput`` for an empty list or a
     repeated name, ``UnknownName`` for an unknown one.
     """
-    each = [f"harm_{k + 1}" for k in range(vehicles)]
+    vehicle_components = [f"harm_{k + 1}" for k in range(vehicles)]
     if isinstance(vector, str) and vector == "vehicles":
-        return tuple(each)
-    listed = isinstance(vector, Sequence) and not isinstance(vector, str) and all(isinstance(n, str) for n in vector)
-    if not listed or not vector or len(set(vector)) < len(vector):
+        return tuple(vehicle_components)
+    is_list_of_names = (
+        isinstance(vector, Sequence) and not isinstance(vector, str) and all(isinstance(n, str) for n in vector)
+    )
+    if not is_list_of_names or not vector or len(set(vector)) < len(vector):
         raise InvalidInput(
             f"reward_vector = {vector!r}: must be 'vehicles', or a list of different components of harm, for instance"
             " ['harm_1', 'harm_2', 'harm_3']"
         )
-    known = [*each, *(f"pair_{k + 1}_{k + 2}" for k in range(vehicles - 1)), "obstacle", *counted]
+    known = [*vehicle_components, *(f"pair_{k + 1}_{k + 2}" for k in range(vehicles - 1)), "obstacle", *counted]
     for name in vector:
         if name not in known:
             raise unknown_name("component of a reward", name, known)

@@ -79,13 +79,13 @@ def _check_measure(
             f"measure {name!r}: give one function, of(game, alert, last) or watch(game, alert), with a docstring that"
             " describes the measure"
         )
-    if name in (*DEFAULT_MEASURES, *TAKEN) or name in TERMS:
+    if name in (*DEFAULT_MEASURES, *RESERVED_NAMES) or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
     return Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
 
 
 DEFAULT_MEASURES = tuple(measure.name for measure in DEFAULT)
-TAKEN = ("agent", "knows", "kind", "world", "scenario", "recording", "hidden", "exploits", "results_sha256")
+RESERVED_NAMES = ("agent", "knows", "kind", "world", "scenario", "recording", "hidden", "exploits", "results_sha256")
 
 MEASURES: Registry[Measure] = Registry(
     "measure", "measures", register_measure, {measure.name: measure for measure in DEFAULT}

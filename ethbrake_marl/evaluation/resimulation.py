@@ -22,14 +22,14 @@ def advance_worlds(line: Floats, car: Floats, time: Floats, until: Floats, wante
     return failed
 
 
-def simulate_again(before: State, after: State, these: Bools) -> Iterator[tuple[int, Floats]]:
-    """Simulate ``these`` worlds [n] again from ``before`` to ``after``; yield each row and the physics' scratch memory.
+def simulate_again(before: State, after: State, rows: Bools) -> Iterator[tuple[int, Floats]]:
+    """Simulate ``rows`` worlds [n] again from ``before`` to ``after``; yield each row and the physics' scratch memory.
 
     There must be no decision between the states.
     """
     check_exact(before, "a quantity of single impacts")
     scratch = scratch_for(after.vehicles + 1)
-    for k in np.flatnonzero(these).tolist():
+    for k in np.flatnonzero(rows).tolist():
         line, car, wanted = (array[k].copy() for array in (before.line, before.car, after.wanted))
         move_line(line, car, wanted, scratch, before.time_s[k], after.time_s[k])
         yield k, scratch

@@ -24,9 +24,11 @@ class Face:
     begins_again = False  # whether the next episode starts by itself when one has ended
     renderer: Any = Renderer()  # until it is opened
 
-    def _open(self, opened: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None) -> None:
+    def _open(
+        self, scenario_and_game: tuple[Scenario, Game], render_mode: str | None, most_steps: int | None = None
+    ) -> None:
         """Set the game of this environment. An episode is truncated after ``most_steps``; None: only at the horizon."""
-        (self.scenario, self.game), self.render_mode = opened, render_mode
+        (self.scenario, self.game), self.render_mode = scenario_and_game, render_mode
         if most_steps is not None:
             check_whole_number("number of steps of an episode", most_steps, 1)
             self.game = self.game._replace(settings=self.game.settings._replace(most_steps=float(most_steps)))

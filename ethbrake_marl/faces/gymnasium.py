@@ -35,9 +35,11 @@ class OneLearner(Face):
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        given = {} if spec is None else spec.kwargs
-        listed = {name: plain([*value] if isinstance(value, Set) else value) for name, value in given.items()}
-        self._spec = spec and replace(spec, kwargs=listed, max_episode_steps=self._longest())
+        arguments = {} if spec is None else spec.kwargs
+        plain_arguments = {
+            name: plain([*value] if isinstance(value, Set) else value) for name, value in arguments.items()
+        }
+        self._spec = spec and replace(spec, kwargs=plain_arguments, max_episode_steps=self._longest())
 
     def _longest(self) -> int:
         """Largest number of steps of an episode in the scenario's worlds."""
@@ -59,8 +61,8 @@ class OneLearner(Face):
         return feature_box(self.game.views[self.bodies[0]].features), action_space(actions)
 
     def _observe(self, state: State) -> Observations:
-        seen: Observations = self.game.observe_alike(state, self.bodies)[:, 0]
-        return seen
+        observations: Observations = self.game.observe_alike(state, self.bodies)[:, 0]
+        return observations
 
 
 class EthBrakeEnv(OneLearner, gymnasium.Env[NDArray[Any], NDArray[Any]]):

@@ -157,8 +157,8 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
 
     def state(self) -> Observations:
         """Full state of the line, [S] float32."""
-        whole: Observations = full_state(self._begun("state"), *self._of_state)[0]
-        return whole
+        state_vector: Observations = full_state(self._begun("state"), *self._of_state)[0]
+        return state_vector
 
     def _columns(self, actions: Mapping[str, Any]) -> Floats:
         """Actions of the learners, [1, L]. With a shield an action may be missing: NaN."""
@@ -181,7 +181,7 @@ class EthBrakeParallelEnv(Face, ParallelEnv[str, Observations, Any]):  # type: i
     def _observations(self, state: State) -> dict[str, Observations]:
         if self._alike:
             return self._by_agent(self.game.observe_alike(state, self.bodies)[0])
-        return self._by_agent([seen[0] for seen in self.game.observe(state, self.bodies)])
+        return self._by_agent([observation[0] for observation in self.game.observe(state, self.bodies)])
 
     def _by_agent(self, values: Any) -> dict[str, Any]:
         return dict(zip(self.possible_agents, values, strict=True))

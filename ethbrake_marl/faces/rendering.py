@@ -35,7 +35,7 @@ MakeRenderer = Callable[[Any], Any]
 
 def register_renderer(mode: str, make: MakeRenderer) -> None:
     """Register a render mode: ``make(environment)`` returns its renderer. Entry points: ``ethbrake_marl.renderers``."""
-    RENDERERS.add(mode, make, lambda other: other is make)
+    RENDERERS.add(mode, make, lambda registered: registered is make)
 
 
 RENDERERS: Registry[MakeRenderer] = Registry("render mode", "renderers", register_renderer)
@@ -61,8 +61,8 @@ def render_metadata(many: bool = False) -> dict[str, Any]:
 class Metadata:
     """The attribute ``metadata`` of an environment's class. Packages that draw are imported when it is first read."""
 
-    def __init__(self, **other: Any) -> None:
-        self.other = other
+    def __init__(self, **entries: Any) -> None:
+        self.other = entries
 
     def __get__(self, environment: Any, owner: Any) -> dict[str, Any]:
         return {**self.other, **render_metadata()}
@@ -73,6 +73,6 @@ def make_renderer(environment: Any, mode: str | None) -> Any:
     if mode is None:
         return Renderer()
     if mode not in RENDERERS:
-        known = ", ".join(RENDERERS) or "none, because no installed package draws"
-        raise InvalidInput(f"render_mode = {mode!r}: must be None or one of: {known}")
+        known_modes = ", ".join(RENDERERS) or "none, because no installed package draws"
+        raise InvalidInput(f"render_mode = {mode!r}: must be None or one of: {known_modes}")
     return RENDERERS[mode](environment)

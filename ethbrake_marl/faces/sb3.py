@@ -63,9 +63,9 @@ def make_sb3_vec_env(
     (4, 27)
     """
     check_whole_number("n_envs", n_envs, 1)
-    opened = open_game(scenario, learners, reward, observation, report=report)
+    scenario_and_game = open_game(scenario, learners, reward, observation, report=report)
     return EthBrakeVecEnv(
-        *opened, int(n_envs), seed, horizon_is_end, appended, step_infos, render_mode, actions, max_cycles
+        *scenario_and_game, int(n_envs), seed, horizon_is_end, appended, step_infos, render_mode, actions, max_cycles
     )
 
 
@@ -117,14 +117,14 @@ class EthBrakeVecEnv(Face, VecEnv):
                 f"observation: the learners of {self.scenario.name!r} observe different features, but must observe the"
                 " same here; give one list of features for all vehicles, use a single learner, or use parallel_env"
             )
-        own: tuple[Feature, ...] = views.pop().features
+        features: tuple[Feature, ...] = views.pop().features
         if self.appended is None:
-            return own
+            return features
         if self.appended == "state":
-            return (*own, *state_features(self.scenario.vehicles, *self._of_state))
+            return (*features, *state_features(self.scenario.vehicles, *self._of_state))
         if self.appended == "number":
             last = float(max(len(self.bodies) - 1, 1))
-            return (*own, Feature("learner", "1", 1.0, 0.0, last, "number of the learner, from 0"))
+            return (*features, Feature("learner", "1", 1.0, 0.0, last, "number of the learner, from 0"))
         raise InvalidInput(f"appended = {self.appended!r}: must be 'number', 'state' or None")
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -138,13 +138,13 @@ class EthBrakeVecEnv(Face, VecEnv):
             self._reset_options()
             raise InvalidInput("set_options: all worlds are simulated together; give the same options to every row")
         stream, state = self.stream.reset(self.n, self._seeds[0], options[0])
-        seen = self._observe(state)
+        observations = self._observe(state)
         self._keep(stream, state, self.renderer.began)
         self._reset_options()
         self._reset_seeds()
         self._first = copy.deepcopy(state)
         self._return, self._steps = np.zeros(self.num_envs), np.zeros(self.num_envs, np.int64)
-        return seen
+        return observations
 
     def step_async(self, actions: Any) -> None:
         self._given = actions
@@ -153,7 +153,7 @@ class EthBrakeVecEnv(Face, VecEnv):
         """Advance every world by one time step; where an episode ends, the next one begins in the same rows."""
         actions = checked_actions(self._given, (self.num_envs, 1), "the learners", self.actions)
         state, step = self._advance(actions.reshape(self.n, -1))
-        stream, seen, ended = self.stream, self._observe(state), np.flatnonzero(state.ended)
+        stream, observations, ended = self.stream, self._observe(state), np.flatnonzero(state.ended)
         reward = self._rewards(step).reshape(-1)
         first, returns, steps = self._first, self._return + reward, self._steps + 1
         if self.step_infos:
@@ -165,17 +165,17 @@ class EthBrakeVecEnv(Face, VecEnv):
         if len(ended):
             rows = (ended[:, np.newaxis] * len(self.bodies) + np.arange(len(self.bodies))).reshape(-1)
             sums = returns[rows].tolist(), steps[rows].tolist()
-            last = zip(rows.tolist(), self._last_infos(state, step, ended), seen[rows], *sums, strict=True)
+            last = zip(rows.tolist(), self._last_infos(state, step, ended), observations[rows], *sums, strict=True)
             for row, info, observation, gained, length in last:
                 info["terminal_observation"], info["episode"] = observation, {"r": gained, "l": length, "t": 0.0}
                 infos[row] = info
             stream, new = stream.next_episodes(ended)
-            seen[rows], returns[rows], steps[rows] = self._observe(new), 0.0, 0
-            state, first = (put_rows(each, ended, new, donate=self.render_mode is None) for each in (state, first))
+            observations[rows], returns[rows], steps[rows] = self._observe(new), 0.0, 0
+            state, first = (put_rows(states, ended, new, donate=self.render_mode is None) for states in (state, first))
         self._keep(stream, state, self.renderer.stepped)
         self._first, self._return, self._steps = first, returns, steps
         over = (step.terminated | step.truncated).repeat(len(self.bodies))
-        return seen, reward.astype(np.float32), over, infos
+        return observations, reward.astype(np.float32), over, infos
 
     def _last_infos(self, state: State, step: Step, ended: Any) -> list[dict[str, Any]]:
         """Infos of each learner of the worlds ``ended`` (indices), whose last ``step`` led to ``state``."""

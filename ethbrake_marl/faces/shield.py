@@ -78,10 +78,10 @@ def shield(
 
 def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
     settings = AgentSettings(f"{team.name}+{mode}", None, scenario, harm_count, options)
-    other = wrap_team(team, str(mode), settings)
-    if other.shield is None:
+    guarded_team = wrap_team(team, str(mode), settings)
+    if guarded_team.shield is None:
         raise InvalidInput(f"shield: mode {mode!r}: is no shield; write it in the name of an agent, AGENT+{mode}")
-    return other
+    return guarded_team
 
 
 def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Team], Team], harm_count: str) -> Any:
@@ -114,7 +114,7 @@ def playing(env: Any, game: Game) -> Any:
     """Copy of an environment and its wrappers with another ``game``, without a running episode."""
     base = env.unwrapped
     instead = {id(base.game): game, id(base.scenario): base.scenario, id(base.episode): None, id(base.renderer): None}
-    other = copy.deepcopy(env, instead)
-    base = other.unwrapped
+    env_copy = copy.deepcopy(env, instead)
+    base = env_copy.unwrapped
     base.renderer = make_renderer(base, base.render_mode)
-    return other
+    return env_copy

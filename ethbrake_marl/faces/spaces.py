@@ -50,16 +50,16 @@ def checked_actions(actions: ArrayLike, shape: tuple[int, ...], whose: str, coun
     index, and for values that are not numbers. The range [-1, 1] is checked later, in ``Game.step``.
     """
     try:
-        given = np.asarray(actions)
+        numbers = np.asarray(actions)
     except ValueError:  # lists of different lengths
-        given = np.empty(0, object)
+        numbers = np.empty(0, object)
     right, kinds = ("a number in [-1, 1]", "fiu") if count is None else (f"an index from 0 to {count - 1}", "iu")
-    if given.dtype.kind not in kinds or (count is not None and not ((given >= 0) & (given < count)).all()):
+    if numbers.dtype.kind not in kinds or (count is not None and not ((numbers >= 0) & (numbers < count)).all()):
         raise InvalidInput(f"action of {whose}: {actions!r:.60}: must be {right}")
     if count is not None:
-        given = (2 * given.astype(np.int64) - (count - 1)) / (count - 1)
-    if given.shape != shape:
-        if [length for length in given.shape if length != 1] != [length for length in shape if length != 1]:
-            raise InvalidInput(f"action of {whose}: has shape {given.shape}; must have shape {shape}")
-        given = given.reshape(shape)
-    return given.astype(np.float64)
+        numbers = (2 * numbers.astype(np.int64) - (count - 1)) / (count - 1)
+    if numbers.shape != shape:
+        if [length for length in numbers.shape if length != 1] != [length for length in shape if length != 1]:
+            raise InvalidInput(f"action of {whose}: has shape {numbers.shape}; must have shape {shape}")
+        numbers = numbers.reshape(shape)
+    return numbers.astype(np.float64)

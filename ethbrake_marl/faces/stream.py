@@ -10,12 +10,12 @@ import numpy as np
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.infos import names_of_worlds
-from ethbrake_marl.episode.state import LISTED, NUMBER, State
+from ethbrake_marl.episode.state import FIRST_IN_LIST, NUMBER, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.worlds.describe import columns_of
 from ethbrake_marl.worlds.given import worlds_from_state
-from ethbrake_marl.worlds.sampling import DrawnWorlds, merged
+from ethbrake_marl.worlds.sampling import DrawnWorlds, merge_draws
 from ethbrake_marl.worlds.scenario import Scenario
 
 OPTIONS = ("initial_state", "listed_world")
@@ -48,12 +48,14 @@ class Stream(NamedTuple):
         if isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str):
             if len(seed) != n:
                 raise InvalidInput(f"reset: seed has {len(seed)} entries; must be one seed, or a list of {n} seeds")
-            chosen, first = [chosen_seed(each) for each in seed], np.zeros(n, np.int64)
+            chosen, first = [chosen_seed(row_seed) for row_seed in seed], np.zeros(n, np.int64)
         elif seed is not None or chosen is None:
             chosen, first = chosen_seed(seed), 0
-        given = self._asked_for(n, options)
-        worlds, after = self._draw(np.arange(n), chosen, first) if given is None else (given[0].worlds, first)
-        return self._replace(seed=chosen, next=after, given=given), self.game.reset(worlds)
+        option_worlds = self._asked_for(n, options)
+        worlds, after = (
+            self._draw(np.arange(n), chosen, first) if option_worlds is None else (option_worlds[0].worlds, first)
+        )
+        return self._replace(seed=chosen, next=after, given=option_worlds), self.game.reset(worlds)
 
     def next_episodes(self, rows: Ints) -> tuple[Stream, State]:
         """New episodes in the next world of each row. They share no memory with other episodes."""
@@ -64,8 +66,8 @@ class Stream(NamedTuple):
         """Next world of each row, and ``next`` after it."""
         if isinstance(seed, int):
             return self.game.draw(len(rows), seed, first), first + len(rows)
-        drawn = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), purpose="training") for k in rows]
-        return State.join(drawn), first + np.isin(np.arange(len(first)), rows)
+        row_worlds = [self.scenario.sample(1, int(seed[k]), first=int(first[k]), purpose="training") for k in rows]
+        return State.join(row_worlds), first + np.isin(np.arange(len(first)), rows)
 
     def seeds_of(self, state: State, rows: Any = slice(None)) -> Any:
         """Seed of each world of ``rows``, whose episodes are ``state``, or of all.
@@ -82,8 +84,8 @@ class Stream(NamedTuple):
         of_stream = np.flatnonzero(numbers >= 0)
         place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
         parts += [self.scenario.draw(1, int(seeds[k]), first=int(numbers[k]), purpose="training") for k in of_stream]
-        drawn = merged(parts, np.arange(sum(part.worlds.n for part in parts)))
-        columns = {name: column[place] for name, column in columns_of(drawn).items()}
+        drawn_worlds = merge_draws(parts, np.arange(sum(part.worlds.n for part in parts)))
+        columns = {name: column[place] for name, column in columns_of(drawn_worlds).items()}
         names = names_of_worlds(state, self.seeds_of(state))
         return {**columns, "world_seed": names["world_seed"], "world": names["world"]}
 
@@ -104,19 +106,19 @@ class Stream(NamedTuple):
         if all(name in options for name in OPTIONS):
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
-            one = worlds_from_state(self.scenario, options["initial_state"])
-            return DrawnWorlds.given(one.take(np.zeros(n, np.int64))), -1
+            initial_world = worlds_from_state(self.scenario, options["initial_state"])
+            return DrawnWorlds.given(initial_world.take(np.zeros(n, np.int64))), -1
         if "listed_world" not in options:
             return None
-        wanted = options["listed_world"]
-        if not isinstance(wanted, Mapping) or set(wanted) != {"seed", "number"}:
+        listed_world = options["listed_world"]
+        if not isinstance(listed_world, Mapping) or set(listed_world) != {"seed", "number"}:
             raise InvalidInput(
-                f"reset: listed_world = {wanted!r}: must be seed and number of a world in an evaluation list, for"
+                f"reset: listed_world = {listed_world!r}: must be seed and number of a world in an evaluation list, for"
                 " instance {'seed': 7, 'number': 3}"
             )
-        drawn = self.scenario.draw(n, wanted["seed"], first=wanted["number"])
-        drawn.worlds.clock[:, NUMBER] = LISTED - drawn.worlds.clock[:, NUMBER]
-        return drawn, int(wanted["seed"])
+        drawn_worlds = self.scenario.draw(n, listed_world["seed"], first=listed_world["number"])
+        drawn_worlds.worlds.clock[:, NUMBER] = FIRST_IN_LIST - drawn_worlds.worlds.clock[:, NUMBER]
+        return drawn_worlds, int(listed_world["seed"])
 
 
 def chosen_seed(seed: int | None) -> int:

@@ -91,22 +91,22 @@ class EthBrakeVectorEnv(OneLearner, VectorEnv[Observations, Any, Any]):
         numbers = checked_actions(actions, (self.num_envs, 1), "the learners", self.actions)
         numbers[renewed] = 0.0  # the action of a row that begins again is ignored
         state, step = self._advance(numbers)
-        stream, seen, columns = self.stream, self._observe(state), self._columns(self.stream, state, step)
+        stream, observations, columns = self.stream, self._observe(state), self._columns(self.stream, state, step)
         infos = masked(columns, np.ones(self.num_envs, np.bool_))
         if same and state.ended.any():
             renewed, final = state.ended, np.full(self.num_envs, None, dtype=object)
-            for row, last in zip(np.flatnonzero(renewed), seen[renewed], strict=True):
+            for row, last in zip(np.flatnonzero(renewed), observations[renewed], strict=True):
                 final[row] = last
             infos |= {"final_obs": final, "_final_obs": renewed}
             infos |= {"final_info": masked(columns, renewed), "_final_info": renewed.copy()}
         if renewed.any():
             stream, new = stream.next_episodes(np.flatnonzero(renewed))
-            seen[renewed] = self._observe(new)
+            observations[renewed] = self._observe(new)
             fresh = self._columns(stream, new, None, renewed)
             put_rows({name: infos[name] for name in fresh}, renewed, fresh, donate=True)
             state = state.put(renewed, new, donate=self.render_mode is None)
         self._keep(stream, state, self.renderer.stepped)
-        return seen, self._rewards(step)[:, 0], step.terminated, step.truncated, infos
+        return observations, self._rewards(step)[:, 0], step.terminated, step.truncated, infos
 
     def render(self) -> Any:
         pictures = super().render()

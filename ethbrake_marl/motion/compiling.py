@@ -113,15 +113,15 @@ def large(function: Function) -> Function:
 @cache
 def stamp_of(file: str) -> str:
     """Digest of all sources that decide the machine code of the kernels in ``file``, and of their names."""
-    folders, beside = [Path(file).parent], set()
+    folders, kernel_files = [Path(file).parent], set()
     for folder in folders:  # which grow
         for path in folder.glob("*.py"):
             if _MARK in _source(path):
-                beside.add(path)
+                kernel_files.add(path)
                 imported = [PACKAGE / "extensions" / name.decode() for name in _EXTENSION.findall(_source(path))]
-                folders += [other for other in dict.fromkeys(imported) if other not in folders]
+                folders += [extension for extension in dict.fromkeys(imported) if extension not in folders]
     core = {path for name in SOURCES for path in (PACKAGE / name).glob("*.py")}
-    sources = {Path(file)} | beside | core
+    sources = {Path(file)} | kernel_files | core
     digests = sorted(hashlib.sha256(path.name.encode() + _source(path)).digest() for path in sources)
     return hashlib.sha256(b"".join(digests)).hexdigest()
 

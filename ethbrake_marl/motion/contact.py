@@ -50,9 +50,9 @@ def contact_on_cubic(gap, closing, pressing, jerk, end):
     squared = pressing * pressing - 2.0 * jerk * closing
     if squared > 0.0:
         root = math.sqrt(squared)
-        both = -(pressing + root) if pressing >= 0.0 else root - pressing
-        one, other = both / jerk, 2.0 * closing / both
-        first, second = min(one, other), max(one, other)
+        numerator = -(pressing + root) if pressing >= 0.0 else root - pressing
+        far_root, near_root = numerator / jerk, 2.0 * closing / numerator
+        first, second = min(far_root, near_root), max(far_root, near_root)
     elif jerk < 0.0:
         return math.inf, 0.0
     for part in range(2):
@@ -96,8 +96,8 @@ def first_return(value, rate, jerk):
     if squared < 0.0:
         return math.inf
     root = math.sqrt(squared)
-    both = -(rate + root) if rate >= 0.0 else root - rate
-    early, late = both / jerk, 2.0 * value / both if both != 0.0 else both / jerk
+    numerator = -(rate + root) if rate >= 0.0 else root - rate
+    early, late = numerator / jerk, 2.0 * value / numerator if numerator != 0.0 else numerator / jerk
     if early <= 0.0 or 0.0 < late < early:
         early = late
     return early if early > 0.0 else math.inf

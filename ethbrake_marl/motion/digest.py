@@ -40,32 +40,32 @@ def physics_digest() -> str:
     """
     digest = hashlib.sha256()
     for vehicles in range(2, 7):
-        for line in played(vehicles):
+        for line in play_random_worlds(vehicles):
             digest.update(np.ascontiguousarray(line, "<f8").data)
     return digest.hexdigest()[:16]
 
 
-def played(vehicles: int) -> list[Floats]:
+def play_random_worlds(vehicles: int) -> list[Floats]:
     """Lines of random worlds after each interval, [WORLDS, LINE_ROWS, vehicles + 1] each."""
     numbers = np.random.PCG64(vehicles)  # its raw numbers are the same in every version of numpy
 
-    def drawn(least: float, most: float, columns: int = vehicles) -> Floats:
+    def draw(least: float, most: float, columns: int = vehicles) -> Floats:
         raw = numbers.random_raw(DIGEST_WORLDS * columns).reshape(DIGEST_WORLDS, columns) >> np.uint64(11)
         return least + (most - least) * (raw.astype(np.float64) / 2.0**53)
 
-    def chosen(*values: float, columns: int = 1) -> Floats:
-        return np.array(values)[drawn(0.0, len(values), columns).astype(np.int64)]
+    def choose(*values: float, columns: int = 1) -> Floats:
+        return np.array(values)[draw(0.0, len(values), columns).astype(np.int64)]
 
     line, car = np.zeros((DIGEST_WORLDS, LINE_ROWS, vehicles + 1)), np.zeros((DIGEST_WORLDS, CAR_ROWS, vehicles + 1))
-    line[:, SPEED, 1:], line[:, GAP, -1] = drawn(0.0, 25.0), math.inf
-    line[:, GAP, 1:-1] = drawn(0.0, 10.0, vehicles - 1) * chosen(0.0, 0.001, 1.0, 1.0, columns=vehicles - 1)
-    line[:, GAP, :1] = np.where(chosen(0.0, 1.0) == 0.0, drawn(0.0, 60.0, 1), FAR_M)
-    car[:, RESTITUTION] = chosen(0.0, 0.1, 0.5, 1.0)
-    car[:, MASS, 1:], car[:, LIMIT, 1:], car[:, LATENCY, 1:] = drawn(1.0, 40.0), drawn(10.0, 40.0), drawn(0.0, 1.0)
-    car[:, BRAKING, 1:], car[:, DRIVING, 1:] = drawn(2.0, 9.0), drawn(1.0, 7.0)
-    builds = chosen(1.0, 0.0)
+    line[:, SPEED, 1:], line[:, GAP, -1] = draw(0.0, 25.0), math.inf
+    line[:, GAP, 1:-1] = draw(0.0, 10.0, vehicles - 1) * choose(0.0, 0.001, 1.0, 1.0, columns=vehicles - 1)
+    line[:, GAP, :1] = np.where(choose(0.0, 1.0) == 0.0, draw(0.0, 60.0, 1), FAR_M)
+    car[:, RESTITUTION] = choose(0.0, 0.1, 0.5, 1.0)
+    car[:, MASS, 1:], car[:, LIMIT, 1:], car[:, LATENCY, 1:] = draw(1.0, 40.0), draw(10.0, 40.0), draw(0.0, 1.0)
+    car[:, BRAKING, 1:], car[:, DRIVING, 1:] = draw(2.0, 9.0), draw(1.0, 7.0)
+    builds = choose(1.0, 0.0)
     for row in (BRAKE_RATE, RELEASE_RATE):
-        car[:, row, 1:] = np.where(builds == 1.0, drawn(5.0, 50.0), math.inf)
+        car[:, row, 1:] = np.where(builds == 1.0, draw(5.0, 50.0), math.inf)
     car[:, [MASS, BRAKE_RATE, RELEASE_RATE], 0] = math.inf
     lines, time, wanted, scratch = (
         [],
@@ -74,7 +74,7 @@ def played(vehicles: int) -> list[Floats]:
         scratch_for(vehicles + 1),
     )
     for length_s in INTERVALS_S:
-        share = drawn(-1.5, 1.0)
+        share = draw(-1.5, 1.0)
         wanted[:, 1:] = np.where(
             share < 0.0, np.maximum(share, -1.0) * car[:, BRAKING, 1:], share * car[:, DRIVING, 1:]
         )

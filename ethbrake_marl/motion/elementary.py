@@ -105,8 +105,8 @@ def _log_parts(x: float) -> tuple[float, float]:
 @kernel
 def log(x: float) -> float:
     """``ln x`` within 1 ulp, for a finite x > 0."""
-    whole, rest = _log_parts(x)
-    return whole + rest
+    leading_part, rest = _log_parts(x)
+    return leading_part + rest
 
 
 @kernel
@@ -120,11 +120,11 @@ def normal_quantile(p: float) -> float:
     if abs(q) <= 0.25:
         w = q * q
         return q * (_SQRT_2PI + (w * _polynomial(_CENTRE, w) + _SQRT_2PI_LOW))
-    whole, rest = _log_parts(max(p if q < 0.0 else 1.0 - p, _LEAST_PROBABILITY))
-    square = -2.0 * (whole + rest)
+    leading_part, rest = _log_parts(max(p if q < 0.0 else 1.0 - p, _LEAST_PROBABILITY))
+    square = -2.0 * (leading_part + rest)
     root = math.sqrt(square)
     head = np.float64(np.float32(root))
-    tail = ((-2.0 * whole - head * head) - 2.0 * rest) / (head + root)
+    tail = ((-2.0 * leading_part - head * head) - 2.0 * rest) / (head + root)
     r = head + tail
     if r <= _FAR:
         t = r - _NEAR
@@ -161,30 +161,36 @@ def normal_probability(x: float) -> float:
 
 
 @large
-def _each(values, which, out):
+def _write_results(values, function_number, out):
     for i in range(len(out)):
-        out[i] = exp(values[i]) if which == 0 else log(values[i]) if which == 1 else normal_quantile(values[i])
+        out[i] = (
+            exp(values[i])
+            if function_number == 0
+            else log(values[i])
+            if function_number == 1
+            else normal_quantile(values[i])
+        )
 
 
-def _of_each(values: Floats, which: int) -> Floats:
+def _results_of(values: Floats, function_number: int) -> Floats:
     out = np.empty(values.size)
-    _each(np.array(values).ravel(), which, out)
+    _write_results(np.array(values).ravel(), function_number, out)
     return out.reshape(values.shape)
 
 
 def exp_each(values: Floats) -> Floats:
     """``exp`` of each entry."""
-    return _of_each(values, 0)
+    return _results_of(values, 0)
 
 
 def log_each(values: Floats) -> Floats:
     """``log`` of each entry."""
-    return _of_each(values, 1)
+    return _results_of(values, 1)
 
 
 def normal_quantile_each(values: Floats) -> Floats:
     """``normal_quantile`` of each entry."""
-    return _of_each(values, 2)
+    return _results_of(values, 2)
 
 
 def logistic(values: Floats) -> Floats:

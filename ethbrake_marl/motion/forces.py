@@ -36,28 +36,28 @@ def acts(latency, time):
 
 
 @kernel
-def force_now(force, wanted, brake_rate, release_rate):
-    """Force (m/s2) just after the command ``wanted`` (m/s2) has taken effect.
+def force_now(force, command, brake_rate, release_rate):
+    """Force (m/s2) just after the ``command`` (m/s2) has taken effect.
 
     The command itself if the rate (m/s3) towards it is infinite, otherwise the present ``force``.
     """
-    return wanted if math.isinf(brake_rate if wanted < force else release_rate) else force
+    return command if math.isinf(brake_rate if command < force else release_rate) else force
 
 
 @large
-def driving(force, wanted, brake_rate, release_rate, duration):
+def driving(force, command, brake_rate, release_rate, duration):
     """Speed (m/s) that the engine alone gives in ``duration`` (s), and the force (m/s2) then.
 
-    It is the integral of the force where it is positive: the force goes from ``force`` to the command ``wanted`` (m/s2)
-    at the rate (m/s3) towards it, then stays there.
+    It is the integral of the force where it is positive: the force goes from ``force`` to the ``command``
+    (m/s2) at the rate (m/s3) towards it, then stays there.
     """
     if duration <= 0.0:
         return 0.0, force
-    rate = -brake_rate if wanted < force else release_rate
-    ramp, after = (wanted - force) / rate, wanted
+    rate = -brake_rate if command < force else release_rate
+    ramp, after = (command - force) / rate, command
     if ramp > duration:
         ramp, after = duration, force + rate * duration
-    high, low, speed = max(force, after), min(force, after), max(wanted, 0.0) * (duration - ramp)
+    high, low, speed = max(force, after), min(force, after), max(command, 0.0) * (duration - ramp)
     if high > 0.0 and ramp > 0.0:
         speed += 0.5 * (high + low) * ramp if low >= 0.0 else 0.5 * high * high / abs(rate)
     return speed, after
@@ -80,12 +80,12 @@ def plan_force(line, car, scratch, i, builds):
 
     The goal is the command, or 0 if the force changes its sign on the way: there the body may start to move.
     """
-    wanted = scratch[COMMAND, i] * scratch[ACTIVE, i]
-    force = force_now(line[FORCE, i], wanted, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else wanted
+    command = scratch[COMMAND, i] * scratch[ACTIVE, i]
+    force = force_now(line[FORCE, i], command, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else command
     line[FORCE, i], scratch[FORCE_RATE, i], scratch[FORCE_TIME, i] = force, 0.0, math.inf
-    if builds and wanted != force:
-        rate = -car[BRAKE_RATE, i] if wanted < force else car[RELEASE_RATE, i]
-        goal = 0.0 if force < 0.0 < wanted or wanted < 0.0 < force else wanted
+    if builds and command != force:
+        rate = -car[BRAKE_RATE, i] if command < force else car[RELEASE_RATE, i]
+        goal = 0.0 if force < 0.0 < command or command < 0.0 < force else command
         scratch[FORCE_RATE, i], scratch[FORCE_TIME, i], scratch[FORCE_GOAL, i] = rate, (goal - force) / rate, goal
 
 

@@ -83,19 +83,19 @@ def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk
             top -= 1
             for row in (BLOCK_MASS, BLOCK_LOW, BLOCK_HIGH, BLOCK_LOW_JERK, BLOCK_HIGH_JERK):
                 scratch[row, count] += scratch[row, count + 1]
-            whole = scratch[BLOCK_MASS, count]
+            block_mass = scratch[BLOCK_MASS, count]
             value[top], jerk[top] = settle(
-                scratch[BLOCK_LOW, count] / whole,
-                scratch[BLOCK_HIGH, count] / whole,
-                scratch[BLOCK_LOW_JERK, count] / whole,
-                scratch[BLOCK_HIGH_JERK, count] / whole,
+                scratch[BLOCK_LOW, count] / block_mass,
+                scratch[BLOCK_HIGH, count] / block_mass,
+                scratch[BLOCK_LOW_JERK, count] / block_mass,
+                scratch[BLOCK_HIGH_JERK, count] / block_mass,
             )
         count += 1
     member = last
     for block in range(count - 1, -1, -1):
-        here, rate = value[block + first], jerk[block + first]
+        block_value, rate = value[block + first], jerk[block + first]
         while member >= scratch[BLOCK_HEAD, block]:
-            value[member], jerk[member] = here, rate
+            value[member], jerk[member] = block_value, rate
             member -= 1
     return count
 

@@ -58,8 +58,8 @@ from ethbrake_marl.motion.layout import (
 from ethbrake_marl.motion.push import add_push
 
 # what `move_line` returns
-APART = 0  # no two bodies could touch
-MET = 1  # went from event to event; if nothing touched, what contacts changed is 0
+NO_CONTACT = 0  # no two bodies could touch
+EVENT_BY_EVENT = 1  # went from event to event; if nothing touched, what contacts changed is 0
 FAILED = 2  # a check of the physics failed: never the user's fault
 
 MISSED_M = 1e-9  # a gap below minus this means that a contact was missed
@@ -289,7 +289,7 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
 
     ``builds`` must be a constant.
     """
-    bodies, duration, met, now = line.shape[1], until - start, APART, 0.0
+    bodies, duration, outcome, now = line.shape[1], until - start, NO_CONTACT, 0.0
     for i in range(ahead, bodies):
         scratch[ONSET, i] = car[LATENCY, i] - start
         scratch[ACTIVE, i] = 1.0 if scratch[ONSET, i] <= 0.0 else 0.0
@@ -304,32 +304,32 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
             scratch[CONTACT_SPEED, i] = scratch[NEW_FIRST, i] = scratch[NEW_TOTAL, i] = scratch[NEW_IMPACTS, i] = 0.0
             scratch[NEXT_TIME, i], scratch[NEXT_CLOSING, i], scratch[LAST_TIME, i] = math.inf, 0.0, math.inf
             scratch[FRONT_CHANGE, i] = scratch[REAR_CHANGE, i] = 0.0
-        met = FAILED
+        outcome = FAILED
         for _ in range(MOST_EVENTS):
             if resolve_impacts(line, car, scratch, now, ahead):
                 continue
             if now >= duration:
-                met = MET
+                outcome = EVENT_BY_EVENT
                 break
             parting = accelerate(line, car, scratch, ahead, builds)
-            passed = next_event(line, car, scratch, now, duration, parting, ahead, builds)
-            add_push(line, car, scratch, passed, ahead, builds)
-            if not move(line, scratch, passed, ahead, builds):
+            time_to_event = next_event(line, car, scratch, now, duration, parting, ahead, builds)
+            add_push(line, car, scratch, time_to_event, ahead, builds)
+            if not move(line, scratch, time_to_event, ahead, builds):
                 break
             for i in range(ahead, bodies):
-                if scratch[ONSET, i] - now <= passed:
+                if scratch[ONSET, i] - now <= time_to_event:
                     scratch[ACTIVE, i] = 1.0
-            now = duration if passed >= duration - now else now + passed
+            now = duration if time_to_event >= duration - now else now + time_to_event
         for p in range(ahead, bodies - 1):
             line[FIRST, p] += scratch[NEW_FIRST, p]
             line[TOTAL, p] += scratch[NEW_TOTAL, p]
             line[IMPACTS, p] += scratch[NEW_IMPACTS, p]
     for i in range(ahead, bodies):
-        wanted = scratch[COMMAND, i] if acts(car[LATENCY, i], until) else 0.0
+        command = scratch[COMMAND, i] if acts(car[LATENCY, i], until) else 0.0
         line[FORCE, i] = (
-            force_now(line[FORCE, i], wanted, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else wanted
+            force_now(line[FORCE, i], command, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else command
         )
-    return met
+    return outcome
 
 
 @large
@@ -356,9 +356,9 @@ def note_driving(line, car, wanted, start, until):
 def move_line(line, car, wanted, scratch, start, until):
     """Move one line from ``start`` to ``until`` (s after the alert) under the commands ``wanted`` [N + 1] (m/s2).
 
-    A command has no effect before the body's latency has elapsed. Changes ``line``; returns ``APART``, ``MET`` or
-    ``FAILED``. If it is not ``APART``, the rows NEW of ``scratch`` hold the harm of this interval, the rows NEXT
-    and CHANGE its first impacts and largest changes of speed.
+    A command has no effect before the body's latency has elapsed. Changes ``line``; returns ``NO_CONTACT``,
+    ``EVENT_BY_EVENT`` or ``FAILED``. If it is not ``NO_CONTACT``, the rows NEW of ``scratch`` hold the harm of this
+    interval, the rows NEXT and CHANGE its first impacts and largest changes of speed.
     """
     ahead, builds = 0 if line[GAP, 0] < FAR_M else 1, False
     for i in range(line.shape[1]):

@@ -101,11 +101,11 @@ def add_push(line, car, scratch, duration, ahead, builds):
         forward = value > 0.0 or (value == 0.0 and jerk > 0.0)
         behind, front = LOW if held or forward else HIGH, LOW if forward else HIGH
         if builds:
-            taken = gain(car, scratch, p + 1, tail, 1, behind, behind + LOW_JERK - LOW, held, duration)
-            taken -= gain(car, scratch, p, head, -1, front, front + LOW_JERK - LOW, held, duration)
+            push = gain(car, scratch, p + 1, tail, 1, behind, behind + LOW_JERK - LOW, held, duration)
+            push -= gain(car, scratch, p, head, -1, front, front + LOW_JERK - LOW, held, duration)
         else:
-            taken = group_acceleration(car, scratch, p + 1, tail, 1, behind, held)
-            taken -= group_acceleration(car, scratch, p, head, -1, front, held)
-            taken *= duration
-        if taken > SAME_MPS2 * duration:  # less is rounding
-            line[PUSHED, p] += taken
+            push = group_acceleration(car, scratch, p + 1, tail, 1, behind, held)
+            push -= group_acceleration(car, scratch, p, head, -1, front, held)
+            push *= duration
+        if push > SAME_MPS2 * duration:  # less is rounding
+            line[PUSHED, p] += push

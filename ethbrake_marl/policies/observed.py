@@ -12,8 +12,8 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from ethbrake_marl.episode.features import FEATURES, Of, Own, side_of
-from ethbrake_marl.episode.observe import View, own_feature
+from ethbrake_marl.episode.features import FEATURES, ComputedFeature, Of, side_of
+from ethbrake_marl.episode.observe import View, observe_computed
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.model import FileModel
@@ -55,7 +55,7 @@ class FeatureDefinition(FiniteModel):
     tried: Annotated[tuple[float, ...], Field(max_length=64)]  # what is observed in a few worlds
 
     @classmethod
-    def of_own(cls, name: str, entry: Own) -> Self:
+    def of_own(cls, name: str, entry: ComputedFeature) -> Self:
         feature = entry.feature
         return cls(
             name=name, of=entry.of, unit=feature.unit, scale=feature.scale, low=feature.low, high=feature.high,
@@ -120,18 +120,18 @@ class ObservationSchema(FiniteModel):
             )
 
 
-def _is_ours(entry: Own) -> bool:
+def _is_ours(entry: ComputedFeature) -> bool:
     return str(getattr(entry.function, "__module__", "")).startswith("ethbrake_marl.")
 
 
-def _trial_values(entry: Own) -> tuple[float, ...]:
+def _trial_values(entry: ComputedFeature) -> tuple[float, ...]:
     """A feature's values in the trial worlds: in one world if this package defines it, else in three."""
     state = _trial_worlds()
     if _is_ours(entry):
         state = state.take(slice(1))
     all_known = np.ones(state.n, np.bool_)
     places = [(1, 0), (2, 0), (3, 0)] if entry.of == "own" else [(2, -1), (2, 1), (3, -2)]
-    values = [own_feature(entry, state, body, offset, all_known) for body, offset in places]
+    values = [observe_computed(entry, state, body, offset, all_known) for body, offset in places]
     return tuple(np.concatenate(values).tolist())
 
 

@@ -70,12 +70,12 @@ class EpisodeShield:
         check_drivers(game, self.drivers)
         ((body, agent),) = self.drivers.items()
         remembered = begin_script(game.agents({body: agent})[body], alert, body)
-        known = alert._replace(wanted=state.wanted)
-        choice = coupled(known, body, self.count, state.clock[:, END]) if self.coupled else pairwise(known, body)
+        worlds = alert._replace(wanted=state.wanted)
+        choice = coupled(worlds, body, self.count, state.clock[:, END]) if self.coupled else pairwise(worlds, body)
         backup = actions_of(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
         held_back = held(game, backup)
-        own = state._replace(memories={**state.memories, body: remembered})
-        policy_harm = price(game, state, rollout(game, self.drivers, own, held_back, self.count), self.count)
+        policy_state = state._replace(memories={**state.memories, body: remembered})
+        policy_harm = price(game, state, rollout(game, self.drivers, policy_state, held_back, self.count), self.count)
         bound_harm = price(game, state, held_back, self.count) if self.coupled else choice.harm
         nothing = np.zeros((state.n, 1))
         return EpisodeShieldMemory(
@@ -88,9 +88,9 @@ class EpisodeShield:
     ) -> tuple[Floats, EpisodeShieldMemory]:
         memory: EpisodeShieldMemory = state.memories["shield"]
         (body,) = self.drivers
-        own, after = propose(game.agents(self.drivers), state, {body: memory.agent})
-        proposed = own if proposed is None else np.where(np.isnan(proposed), own, proposed)
-        applied = np.where(memory.chosen[:, np.newaxis], own, memory.backup)
+        policy_actions, after = propose(game.agents(self.drivers), state, {body: memory.agent})
+        proposed = policy_actions if proposed is None else np.where(np.isnan(proposed), policy_actions, proposed)
+        applied = np.where(memory.chosen[:, np.newaxis], policy_actions, memory.backup)
         differ = (np.abs(applied - proposed) > ACTION_ROUNDING) & ~state.ended[:, np.newaxis]
         return applied, memory._replace(
             agent=after[body], proposed=proposed, applied=applied, intervened=spread(game, state, differ, False)

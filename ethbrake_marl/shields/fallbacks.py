@@ -40,8 +40,8 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
         action[:, column] = actions_of(alert, body, -coupled(full, body, count, until_s).deceleration_mps2)
         actions.append(action)
     if len(learners) > 1:
-        wanted, _ = descend(state, learners.tolist(), BRAKE_SHARES, FALLBACK_ROUNDS, until_s, count)
-        actions += [actions_of(alert, learners, wanted[:, learners]), np.full((n, len(learners)), -1.0)]
+        commands, _ = descend(state, learners.tolist(), BRAKE_SHARES, FALLBACK_ROUNDS, until_s, count)
+        actions += [actions_of(alert, learners, commands[:, learners]), np.full((n, len(learners)), -1.0)]
     return [held(game, action) for action in actions]
 
 
@@ -58,17 +58,17 @@ def best_constant(game: Game, states: State, plans: Floats, count: str) -> tuple
     several learners, one learner's other actions while the rest follow the plan. ``states`` may have several possible
     states of each world, one after the other: then the largest harm counts.
     """
-    learners, rows, each = game.settings.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
-    planned = plans[rows, np.minimum(states.steps[::each], plans.shape[1] - 1)]
+    learners, rows, states_per_world = game.settings.learners, np.arange(len(plans)), states.n // max(len(plans), 1)
+    planned = plans[rows, np.minimum(states.steps[::states_per_world], plans.shape[1] - 1)]
     actions = np.minimum(np.maximum(planned[:, np.newaxis] + CHANGES[:, np.newaxis], -1.0), 0.0)
     if len(learners) > 1:
         alone = np.repeat(planned[:, np.newaxis], len(learners) * len(SINGLE_ACTIONS), axis=1)
         for column in range(len(learners)):
             alone[:, column * len(SINGLE_ACTIONS) : (column + 1) * len(SINGLE_ACTIONS), column] = SINGLE_ACTIONS
         actions = np.concatenate([actions, alone], axis=1)
-    commands = actions.repeat(each, axis=0) * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
+    commands = actions.repeat(states_per_world, axis=0) * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
     harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], count)[0]
-    harm = harm.reshape(len(plans), each, -1).max(axis=1)
+    harm = harm.reshape(len(plans), states_per_world, -1).max(axis=1)
     best = harm.argmin(axis=1)
     return actions[rows, best, np.newaxis], harm[rows, best]
 

@@ -56,18 +56,18 @@ class NamedShield(NamedTuple):
         """
         if team.shield is not None:
             raise InvalidInput(f"shield: team {team.name!r} already has a shield")
-        wanted, options = signature(self.shield), {**settings.options, "harm_count": settings.harm_count}
-        if "scenario" in wanted.parameters:
+        shield_signature, options = signature(self.shield), {**settings.options, "harm_count": settings.harm_count}
+        if "scenario" in shield_signature.parameters:
             options["scenario"] = settings.needed_scenario()
         if text is not None:
             if self.argument is None or self.argument in options:
                 raise InvalidInput(f"shield {settings.spec!r}: {text!r} cannot follow the colon; leave it out")
             options[self.argument] = text
         try:
-            wanted.bind(team.drivers, **options)
+            shield_signature.bind(team.drivers, **options)
         except TypeError as error:
-            known = ", ".join([*wanted.parameters][1:])
-            raise InvalidInput(f"shield {settings.spec!r}: {error}; its options: {known}") from None
+            option_names = ", ".join([*shield_signature.parameters][1:])
+            raise InvalidInput(f"shield {settings.spec!r}: {error}; its options: {option_names}") from None
         return team._replace(shield=self.shield(team.drivers, **options))
 
 
@@ -79,17 +79,17 @@ def checked_drivers(drivers: Mapping[int, Agent] | None) -> dict[int, Agent]:
 
 def check_drivers(game: Game, drivers: Mapping[int, Agent]) -> None:
     if list(drivers) != game.settings.learners.tolist():
-        theirs, right = (", ".join(f"vehicle_{i}" for i in each) for each in (drivers, game.settings.learners))
-        raise InvalidInput(f"shield: has agents for {theirs}; must have one for each learner, {right or 'none'}")
+        names, right = (", ".join(f"vehicle_{i}" for i in bodies) for bodies in (drivers, game.settings.learners))
+        raise InvalidInput(f"shield: has agents for {names}; must have one for each learner, {right or 'none'}")
 
 
 def check_harm_count(count: str) -> None:
     check_count("shield: harm_count", count)
 
 
-def spread(game: Game, state: State, columns: Any, other: Any = 0) -> Any:
-    """Values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``other`` for scripts."""
-    wide = np.full((state.n, state.vehicles), other, columns.dtype)
+def spread(game: Game, state: State, columns: Any, script_value: Any = 0) -> Any:
+    """Values of all vehicles, [n, N]: those of learners from ``columns`` [n, L], and ``script_value`` for scripts."""
+    wide = np.full((state.n, state.vehicles), script_value, columns.dtype)
     wide[:, game.settings.learners - 1] = columns
     return wide
 

@@ -39,7 +39,7 @@ import numpy as np
 
 from ethbrake_marl.agents.drive import MODEL, Agent, propose
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import played
+from ethbrake_marl.episode.play import follow_plans
 from ethbrake_marl.episode.script_calls import begin_script
 from ethbrake_marl.episode.state import State, take
 from ethbrake_marl.errors import InvalidInput
@@ -131,7 +131,7 @@ class StepShield:
         A simulation stops where its harm is above ``most``. The harm is infinite if a vehicle would bear more than its
         cap (``caps`` [n, N] m2/s2).
         """
-        last, harm = played(game, states, plans, self.count, most)
+        last, harm = follow_plans(game, states, plans, self.count, most)
         if caps is not None:
             harm[(last.borne_harm(self.count) > caps).any(axis=1)] = np.inf
         return harm
@@ -165,14 +165,14 @@ class StepShield:
         ``states`` are the possible states (``seen``), ``agents`` body -> memory at the alert.
         """
         plan, harm = self.cheapest(game, states, self.plans(game, alert, state, states))
-        caps = played(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
+        caps = follow_plans(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
         if agents:
             check_drivers(game, agents)
-            own = self.rolled_out(game, state._replace(memories={**state.memories, **agents}), plan)
-            value = self.price(game, states, own, caps=caps)
+            agent_plan = self.rolled_out(game, state._replace(memories={**state.memories, **agents}), plan)
+            value = self.price(game, states, agent_plan, caps=caps)
             better = value <= harm
-            plan[better], harm[better] = own[better], value[better]
-        last, _ = played(game, state, plan, self.count)
+            plan[better], harm[better] = agent_plan[better], value[better]
+        last, _ = follow_plans(game, state, plan, self.count)
         settles: Bools = (last.line[:, SPEED] == 0.0).all(axis=1) & (last.line[:, FORCE] <= 0.0).all(axis=1)
         nothing = np.zeros((state.n, len(game.settings.learners)))
         return StepShieldMemory(
@@ -188,30 +188,30 @@ class StepShield:
         proposed, state = self.asked(game, state, proposed)
         if not donate:
             memory = memory._replace(plan=memory.plan.copy(), price=memory.price.copy())
-        each, now = np.arange(state.n), np.minimum(state.steps, memory.plan.shape[1] - 1)
-        planned, silent, bound = memory.plan[each, now], np.isnan(proposed), self.bound(memory)
-        tried, running = np.where(silent, planned, proposed), ~state.ended[:, np.newaxis]
-        deviates = (tried != planned) & running
+        worlds, now = np.arange(state.n), np.minimum(state.steps, memory.plan.shape[1] - 1)
+        planned, silent, bound = memory.plan[worlds, now], np.isnan(proposed), self.bound(memory)
+        candidates, running = np.where(silent, planned, proposed), ~state.ended[:, np.newaxis]
+        deviates = (candidates != planned) & running
         reason = np.where(deviates, NO_CERTIFICATE, np.where(silent, NOT_A_NUMBER, SAME_AS_PLAN))
         margin = np.repeat((bound - memory.price)[:, np.newaxis], proposed.shape[1], axis=1)
         rejected = deviates.any(axis=1).nonzero()[0]
         for columns in trials(proposed.shape[1]):
             if not len(rejected):
                 break
-            mine, wanted, together = deviates[rejected] & columns, tried[rejected], columns.all()
-            actions = np.where(mine, wanted, memory.plan[rejected, now[rejected]])
-            new = mine.any(axis=1)
+            trial_mask, rejected_actions, together = deviates[rejected] & columns, candidates[rejected], columns.all()
+            actions = np.where(trial_mask, rejected_actions, memory.plan[rejected, now[rejected]])
+            new = trial_mask.any(axis=1)
             if not together:
-                new &= (actions != wanted).any(axis=1)  # what was rejected together is not tried again
-            rows, mine = rejected[new], mine[new]
+                new &= (actions != rejected_actions).any(axis=1)  # what was rejected together is not tried again
+            rows, trial_mask = rejected[new], trial_mask[new]
             if len(rows):
                 rests = self.rests if together else self.rests[:1]  # what the agents propose, they propose together
                 why, least = self.accept(game, state, memory, rows, actions[new], now[rows], rests)
-                reason[rows] = np.where(mine, why[:, np.newaxis], reason[rows])
-                margin[rows] = np.where(mine, (bound[rows] - least)[:, np.newaxis], margin[rows])
+                reason[rows] = np.where(trial_mask, why[:, np.newaxis], reason[rows])
+                margin[rows] = np.where(trial_mask, (bound[rows] - least)[:, np.newaxis], margin[rows])
                 if together:
                     rejected = rows[why == NO_CERTIFICATE]
-        applied = memory.plan[each, now]
+        applied = memory.plan[worlds, now]
         differ = (applied != proposed) & running
         return applied, memory._replace(
             agents=tuple(state.memories[body] for body in self.drivers), proposed=proposed, applied=applied,
@@ -225,16 +225,18 @@ class StepShield:
         The agents propose where nobody else does. An agent with a memory is asked at every decision, so it stays up to
         date.
         """
-        memories = {who: kept for who, kept in state.memories.items() if who != "shield"}
-        own = dict(zip(self.drivers, state.memories["shield"].agents, strict=True))
+        memories = {who: memory for who, memory in state.memories.items() if who != "shield"}
+        agent_memories = dict(zip(self.drivers, state.memories["shield"].agents, strict=True))
         if proposed is None:
-            if not own:
+            if not agent_memories:
                 raise InvalidInput("step: actions = None: this shield has no agents that could propose any")
-            proposed = np.full((state.n, len(own)), np.nan)
-        if own and (np.isnan(proposed).any() or any(each is not None for each in own.values())):
-            theirs, own = propose(game.agents(self.drivers), state, own)
-            proposed = np.where(np.isnan(proposed), theirs, proposed)
-        return proposed, state._replace(memories={**memories, **own})
+            proposed = np.full((state.n, len(agent_memories)), np.nan)
+        if agent_memories and (
+            np.isnan(proposed).any() or any(memory is not None for memory in agent_memories.values())
+        ):
+            agent_actions, agent_memories = propose(game.agents(self.drivers), state, agent_memories)
+            proposed = np.where(np.isnan(proposed), agent_actions, proposed)
+        return proposed, state._replace(memories={**memories, **agent_memories})
 
     def accept(
         self,
@@ -254,31 +256,31 @@ class StepShield:
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
-        seen = self.seen(state, memory)
-        M = seen.n // state.n
-        before = take_worlds(seen, rows, M)
+        possible_states = self.seen(state, memory)
+        M = possible_states.n // state.n
+        before = take_worlds(possible_states, rows, M)
         # First the actions with the rest of the present plan, then, where this is rejected, with each fallback.
         least = self.price(game, before, plans, most, take(memory.caps, rows))
         reason = np.where(least <= most, PLAN_REMAINS, NO_CERTIFICATE)
         for code, rest in rests:
-            left = (reason == NO_CERTIFICATE).nonzero()[0]
-            if not len(left):
+            open_rows = (reason == NO_CERTIFICATE).nonzero()[0]
+            if not len(open_rows):
                 break
-            here = take_worlds(before, left, M)
-            after, _ = game.follow(here, actions[left].repeat(M, axis=0))
-            later, value = rest(self, game, after, plans[left], most[left])
+            here = take_worlds(before, open_rows, M)
+            after, _ = game.follow(here, actions[open_rows].repeat(M, axis=0))
+            later, value = rest(self, game, after, plans[open_rows], most[open_rows])
             # Only plans that the estimate does not rule out are priced.
-            hopeful = (value <= most[left] + NEARLY).nonzero()[0]
+            hopeful = (value <= most[open_rows] + NEARLY).nonzero()[0]
             if len(hopeful):
-                at = left[hopeful]
-                tried = np.empty((len(at), *plans.shape[1:]))
-                tried[:] = later[hopeful]
-                tried[np.arange(len(at)), now[at]] = actions[at]
+                at = open_rows[hopeful]
+                trial_plans = np.empty((len(at), *plans.shape[1:]))
+                trial_plans[:] = later[hopeful]
+                trial_plans[np.arange(len(at)), now[at]] = actions[at]
                 states, caps = take_worlds(here, hopeful, M), take(memory.caps, rows[at])
-                value[hopeful] = self.price(game, states, tried, most[at], caps)
+                value[hopeful] = self.price(game, states, trial_plans, most[at], caps)
                 good = value[hopeful] <= most[at]
-                plans[at[good]], reason[at[good]] = tried[good], code
-            least[left] = np.minimum(least[left], value)
+                plans[at[good]], reason[at[good]] = trial_plans[good], code
+            least[open_rows] = np.minimum(least[open_rows], value)
         good = (reason != NO_CERTIFICATE).nonzero()[0]
         if len(good):
             memory.plan[rows[good]], memory.price[rows[good]] = plans[good], least[good]
@@ -288,7 +290,7 @@ class StepShield:
         memory: StepShieldMemory = state.memories["shield"]
         borne = {}
         if memory.caps is not None:
-            last, _ = played(game, state, memory.plan, self.count)
+            last, _ = follow_plans(game, state, memory.plan, self.count)
             borne = {"own_harm": last.borne_harm(self.count), "baseline_own_harm": memory.caps}
         return {
             **borne,

@@ -53,7 +53,9 @@ def register_scenarios(folder: str | os.PathLike[str]) -> None:
     files = sorted(path.glob("*.yaml"))
     if not files:
         raise InvalidInput(f"folder of scenarios {os.fspath(folder)!r}: has no file that ends in .yaml")
-    known = {name: other for name, other in _known_paths().items() if other.parent != path}
+    known = {
+        name: registered_path for name, registered_path in _known_paths().items() if registered_path.parent != path
+    }
     for file in files:
         if file.stem in known:
             raise AlreadyExists(
@@ -71,14 +73,14 @@ def load_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> Scenar
     if isinstance(scenario, Scenario):
         return scenario
     if isinstance(scenario, Mapping):
-        return _built(Document("scenario", plain(scenario), {}), Path(), ())
+        return _build_scenario(Document("scenario", plain(scenario), {}), Path(), ())
     return _load(scenario_path(scenario), ())
 
 
 def _load(path: Path, above: tuple[Path, ...]) -> Scenario:
     """``above``: the files that are based on this one, each on the next."""
     document = read_yaml(path)
-    loaded = _built(document, path.parent, (*above, path))
+    loaded = _build_scenario(document, path.parent, (*above, path))
     if loaded.name != path.stem:
         raise InvalidInput(
             f"{document.where(('name',))}: name = {loaded.name}: must be the file's name without ending, {path.stem};"
@@ -128,24 +130,29 @@ def _known_paths() -> dict[str, Path]:
     return {path.stem: path for path in (*registered, *shipped_folder().rglob("*.yaml"))}
 
 
-def _built(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenario:
+def _build_scenario(document: Document, folder: Path, above: tuple[Path, ...]) -> Scenario:
     content, base = document.content, None
     if isinstance(content, dict) and "based_on" in content:
         base = _base(document, content["based_on"], folder, above)
-        own = {key: value for key, value in content.items() if key != "based_on"}
-        unknown = {key: value for key, value in own.items() if key not in Scenario.model_fields}
+        changes = {key: value for key, value in content.items() if key != "based_on"}
+        unknown = {key: value for key, value in changes.items() if key not in Scenario.model_fields}
         inherited = {key: value for key, value in base.declared().items() if key not in ("name", *DESCRIPTIVE_KEYS)}
-        content = {**changed_content(inherited, own), **unknown}
+        content = {**changed_content(inherited, changes), **unknown}
     content = _with_rows(document, (), content, folder)
-    listed = content.get("mixture") if isinstance(content, dict) else None
-    if isinstance(listed, list | tuple):
-        content = {**content, "mixture": [_member(document, i, entry, folder, above) for i, entry in enumerate(listed)]}
+    entries = content.get("mixture") if isinstance(content, dict) else None
+    if isinstance(entries, list | tuple):
+        content = {
+            **content,
+            "mixture": [_member(document, i, entry, folder, above) for i, entry in enumerate(entries)],
+        }
     scenario = Scenario.from_document(Document(document.file, content, document.lines))
     if base is not None:
         for key in document.content.keys() - {"name", *DESCRIPTIVE_KEYS, "based_on"}:
             with document.refusing_at((key,)):
-                here, there = ([getattr(each, key) for each in one.members or (one,)] for one in (scenario, base))
-                if here == there and key != "mixture":
+                new_values, base_values = (
+                    [getattr(member, key) for member in version.members or (version,)] for version in (scenario, base)
+                )
+                if new_values == base_values and key != "mixture":
                     raise InvalidInput(f"{key}: has the same value in {base.name}; leave it out")
     return scenario
 
@@ -160,9 +167,9 @@ def _base(document: Document, name: Any, folder: Path, above: tuple[Path, ...]) 
 
 def _load_below(what: str, path: Path, above: tuple[Path, ...]) -> Scenario:
     """Load a scenario that the last file of ``above`` needs. Raises ``InvalidInput`` if it is one of these files."""
-    places = [each.resolve() for each in above]
+    places = [file.resolve() for file in above]
     if path.resolve() in places:
-        circle = " -> ".join(each.stem for each in (*above[places.index(path.resolve()) :], path))
+        circle = " -> ".join(file.stem for file in (*above[places.index(path.resolve()) :], path))
         raise InvalidInput(f"{what}: {circle} is a circle; base one of them on another scenario")
     return _load(path, above)
 

@@ -45,7 +45,7 @@ from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.registry import Registry
 from ethbrake_marl.worlds.counters import Numbers
-from ethbrake_marl.worlds.quantity import ScenarioPart, ordered
+from ethbrake_marl.worlds.quantity import ScenarioPart, check_order
 
 if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
@@ -127,7 +127,7 @@ def register_v2x_extension(key: str, extension: Extension) -> None:
     """Register the extension for a key of ``v2x``. Entry points: ``ethbrake_marl.v2x_extensions``."""
     if extension.name in ("physics", "shaping", "shield"):  # memories that a game has itself
         raise InvalidInput(f"key {key!r} of v2x: the name of its memory, {extension.name!r}, is in use; choose another")
-    EXTENSIONS.add(key, extension, lambda other: other is extension)
+    EXTENSIONS.add(key, extension, lambda registered: registered is extension)
 
 
 EXTENSIONS: Registry[Extension] = Registry("key of v2x", "v2x_extensions", register_v2x_extension)
@@ -175,7 +175,7 @@ class V2X(ScenarioPart):
     radio_s: Seconds = Field(default=0.02, description="L_radio, time to transmit a message")
     processing_s: Seconds = Field(default=0.1, description="t_proc, time until the receiver has processed a message")
     actuation_s: Seconds = Field(default=0.2, description="t_act, time until the receiver's brakes respond")
-    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False), AfterValidator(ordered)] = Field(
+    sensing_s: Annotated[tuple[Seconds, Seconds], Field(strict=False), AfterValidator(check_order)] = Field(
         default=(0.8, 1.1), description="[low, high]: range of the uniform delay after which a neighbour is seen"
     )
 
@@ -195,8 +195,11 @@ class V2X(ScenarioPart):
         for key in written:
             close = suggestion(str(key), known) or f"known: {', '.join(known)}"
             require(key in known, (key,), UNSHOWN, f"unknown key; {close}")
-        read = {key: EXTENSIONS[key].read(key, each) if key in EXTENSIONS else each for key, each in written.items()}
-        v2x = build({**PRESETS[name], **read, "preset": name})
+        settings = {
+            key: EXTENSIONS[key].read(key, setting) if key in EXTENSIONS else setting
+            for key, setting in written.items()
+        }
+        v2x = build({**PRESETS[name], **settings, "preset": name})
         v2x._keys = frozenset({"preset", *written})
         v2x._check()
         return v2x
@@ -204,9 +207,11 @@ class V2X(ScenarioPart):
     @model_serializer(mode="wrap")
     def _as_written(self, dump: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
         """Keys of the file; keys that the preset sets are null or left out."""
-        whole = not (info.exclude_unset or info.exclude_none)
+        with_defaults = not (info.exclude_unset or info.exclude_none)
         return {
-            key: each if key in self._keys else None for key, each in dump(self).items() if whole or key in self._keys
+            key: setting if key in self._keys else None
+            for key, setting in dump(self).items()
+            if with_defaults or key in self._keys
         }
 
     def _check(self) -> None:
@@ -215,14 +220,14 @@ class V2X(ScenarioPart):
         right = "belong to different extensions, whose memories have the same name; leave one out"
         names = {extension.name for extension in extended}
         require(len(names) == len(extended), (), UNSHOWN, f"{' and '.join(extended.values())} {right}")
-        used = [key for extension in self.extensions for key in extension.uses(self)]
-        unused = [key for key in OF_MESSAGES if key not in used]
+        used_keys = [key for extension in self.extensions for key in extension.uses(self)]
+        unused_keys = [key for key in OF_MESSAGES if key not in used_keys]
         unheard = ("link_latency_s", "lost", *OF_MESSAGES)
         for useless, keys, why in (
             (self.senses == "none", ["sensing_s"], "senses: none means that no vehicle is in sight"),
             (self.hears == "none", unheard, "hears: none means that no vehicle gets messages"),
             (self.timing == "latency", OF_MESSAGES, f"preset {self.preset} generates no messages"),
-            (self.timing == "fixed", unused, "link_latency_s fixes the delay of messages"),
+            (self.timing == "fixed", unused_keys, "link_latency_s fixes the delay of messages"),
         ):
             for key in keys if useless else ():
                 right = f"has no effect, because {why}; leave it out"
@@ -235,11 +240,11 @@ class V2X(ScenarioPart):
     @classmethod
     def __get_pydantic_json_schema__(cls, core: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
         mapping = handler(core)
-        added = {key: extension.schemas[key] for key, extension in EXTENSIONS.usable().items()}
+        extension_properties = {key: extension.schemas[key] for key, extension in EXTENSIONS.usable().items()}
         by_preset = {
-            key: {k: v for k, v in each.items() if k != "default"} for key, each in mapping["properties"].items()
+            key: {k: v for k, v in schema.items() if k != "default"} for key, schema in mapping["properties"].items()
         }
-        mapping = {**mapping, "properties": {**by_preset, **added}, "additionalProperties": False}
+        mapping = {**mapping, "properties": {**by_preset, **extension_properties}, "additionalProperties": False}
         return {"anyOf": [{"enum": list(PRESETS), "type": "string"}, mapping]}
 
     @property
@@ -263,10 +268,10 @@ class V2X(ScenarioPart):
     @property
     def drawn(self) -> bool:
         """Whether random numbers decide what vehicles know, or when."""
-        heard = self.hears != "none" and (self.timing == "messages" or 0.0 < self.lost < 1.0)
-        seen = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
-        own = any(extension.is_random(self) for extension in self.extensions)
-        return own or (self.by_link and (heard or seen))
+        random_messages = self.hears != "none" and (self.timing == "messages" or 0.0 < self.lost < 1.0)
+        random_sensing = self.senses != "none" and self.sensing_s[0] != self.sensing_s[1]
+        random_extensions = any(extension.is_random(self) for extension in self.extensions)
+        return random_extensions or (self.by_link and (random_messages or random_sensing))
 
     def first_message_s(self, u: Floats) -> Floats:
         """Delay tau of each link's first message (s), for uniform numbers ``u`` [..., PER_LINK]; infinite: none."""
@@ -287,11 +292,11 @@ class V2X(ScenarioPart):
         N = unheard.shape[1]
         links, (receiver, sender) = u.reshape(len(u), N, N, PER_LINK), np.indices((N, N))
         deaf = {"all": sender < 0, "front": sender >= receiver, "none": sender >= 0}[self.hears]
-        heard = np.where(deaf | unheard, np.inf, self.first_message_s(links))
+        message_time = np.where(deaf | unheard, np.inf, self.first_message_s(links))
         ahead = sender == receiver - 1
         in_sight = {"both": ahead | (sender == receiver + 1), "front": ahead, "none": sender < 0}[self.senses]
         low, high = self.sensing_s
-        return heard, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
+        return message_time, np.where(in_sight, low + (high - low) * links[..., 3], np.inf)
 
     def news(self, own_latency: Floats, u: Floats, unheard: Bools) -> tuple[Floats, Floats]:
         """Times from which each vehicle can react, [n, N] s, and from which i reacts to j, [n, N, N] s.
@@ -299,14 +304,14 @@ class V2X(ScenarioPart):
         ``own_latency`` [n, N] (s): latencies without the wait for messages. ``u``, ``unheard``: as in
         ``heard_and_seen``.
         """
-        N, (heard, seen) = own_latency.shape[1], self.heard_and_seen(u, unheard)
+        N, (message_time, sensing_delay) = own_latency.shape[1], self.heard_and_seen(u, unheard)
         latency = own_latency.copy()
         for i in range(1, N if self.timing != "latency" else 0):
-            first = np.minimum(heard[:, i, 0], latency[:, i - 1] + seen[:, i, i - 1])
+            first = np.minimum(message_time[:, i, 0], latency[:, i - 1] + sensing_delay[:, i, i - 1])
             latency[:, i] = np.maximum(latency[:, i], first)
-        known = np.maximum(latency[:, :, np.newaxis], np.minimum(heard, seen))
-        known[:, np.arange(N), np.arange(N)] = latency
-        return latency, known
+        reaction_time = np.maximum(latency[:, :, np.newaxis], np.minimum(message_time, sensing_delay))
+        reaction_time[:, np.arange(N), np.arange(N)] = latency
+        return latency, reaction_time
 
     def latest_reaction_s(self, own_latency: Floats, unheard: Bools) -> Floats:
         """Upper bounds of the times from which vehicles can react, [n, N] s; arguments as in ``news``."""

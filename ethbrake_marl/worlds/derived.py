@@ -39,7 +39,7 @@ def world_values(
         values["latency_s"] = values["latency_s"] + declared("alert_s")
     if scenario.line_speed_mps is not None:
         values["speeds_mps"] = declared("line_speed_mps") + declared("speed_deviations_mps")
-    values = {key: settle(key, drawn) for key, drawn in values.items()}
+    values = {key: settle(key, quantity_values) for key, quantity_values in values.items()}
     if scenario.time_gaps_s is not None:
         values["gaps_m"] = settle("gaps_m", declared("time_gaps_s") * values["speeds_mps"][:, 1:])
     if "friction" in values:

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from ethbrake_marl.worlds.scenario import Scenario
 
 
-def columns_of(drawn: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
+def columns_of(drawn_worlds: DrawnWorlds) -> dict[str, NDArray[np.generic]]:
     """All columns of drawn worlds, [n] each: ``world`` (its number), ``kinds_of`` and ``quantities_of``."""
-    numbers = drawn.worlds.clock[:, NUMBER].astype(np.int64)
-    return {"world": numbers, **kinds_of(drawn), **quantities_of(drawn.worlds, drawn.friction)}
+    numbers = drawn_worlds.worlds.clock[:, NUMBER].astype(np.int64)
+    return {"world": numbers, **kinds_of(drawn_worlds), **quantities_of(drawn_worlds.worlds, drawn_worlds.friction)}
 
 
 def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str, Floats]:
@@ -34,12 +34,17 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
     gap = worlds.obstacle_gap_m[:, np.newaxis]
     values["obstacle_gap_m"] = np.where(np.isfinite(gap), gap, np.nan)
     values["friction"] = np.broadcast_to(friction, worlds.n)[:, np.newaxis]
-    there = {key: np.isfinite(values[key]).any() for key in ("obstacle_gap_m", "brake_rate_mps3", "release_rate_mps3")}
-    there |= {"harm_weight": (values["harm_weight"] != 1.0).any(), "friction": np.isfinite(values["friction"]).all()}
+    is_present = {
+        key: np.isfinite(values[key]).any() for key in ("obstacle_gap_m", "brake_rate_mps3", "release_rate_mps3")
+    }
+    is_present |= {
+        "harm_weight": (values["harm_weight"] != 1.0).any(),
+        "friction": np.isfinite(values["friction"]).all(),
+    }
     return {
         QUANTITIES[key].column_of(i): np.minimum(column, QUANTITIES[key].high)
         for key in QUANTITIES
-        if key in USUAL or there.get(key)
+        if key in USUAL or is_present.get(key)
         for i, column in enumerate(values[key].T[: QUANTITIES[key].count(worlds.vehicles)])
     }
 
@@ -47,14 +52,14 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
 def fixed_columns(scenario: Scenario) -> set[str]:
     """Columns of ``quantities_of`` that are equal in all worlds, apart from gaps and speeds."""
     keys = [key for key in CAR_ROWS if key in USUAL or key in scenario.sources]
-    ends = {QUANTITIES[key].column_of(i): each for key in keys for i, each in enumerate(scenario.bounds(key))}
+    ends = {QUANTITIES[key].column_of(i): bounds for key in keys for i, bounds in enumerate(scenario.bounds(key))}
     return {name for name, (low, high) in ends.items() if low == high}
 
 
-def kinds_of(drawn: DrawnWorlds) -> dict[str, Texts]:
+def kinds_of(drawn_worlds: DrawnWorlds) -> dict[str, Texts]:
     """Columns of texts: ``scenario`` (in a mixture), ``recording``, ``vehicle_1_type`` and so on."""
-    columns = {"scenario": drawn.scenarios, RECORDING: drawn.recordings}
-    types = drawn.types.T if (drawn.types != "").any() else ()
+    columns = {"scenario": drawn_worlds.scenarios, RECORDING: drawn_worlds.recordings}
+    types = drawn_worlds.types.T if (drawn_worlds.types != "").any() else ()
     columns = {name: column for name, column in columns.items() if (column != "").any()}
     return columns | {f"vehicle_{i + 1}_type": column for i, column in enumerate(types)}
 

@@ -28,20 +28,22 @@ class Key(NamedTuple):
 
 
 def listed_keys() -> list[Key]:
-    keys, others = [], {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}
+    keys, alternatives = [], {**ALTERNATIVES, **{new: usual for usual, new in ALTERNATIVES.items()}}
     for name, field in Scenario.model_fields.items():
         about, rule = str(field.description), QUANTITIES.get(name)
         example = _EXAMPLES.get(name) or flow_text(field.default) if rule is None else rule.example
-        either = [f"give either this key or {others[name]}"] if name in others else []
-        keys.append(Key(name, example, about, "; ".join([about, *([rule.interval] if rule else []), *either])))
+        hint = [f"give either this key or {alternatives[name]}"] if name in alternatives else []
+        keys.append(Key(name, example, about, "; ".join([about, *([rule.interval] if rule else []), *hint])))
     return keys
 
 
 def sentences(scenario: Scenario) -> Iterator[str]:
     """Sentences about the line, the roles, and every key of the file."""
     yield f"{scenario.name}: {scenario.title or 'no title'}. {scenario.description}".rstrip()
-    there = {each.has_obstacle for each in scenario.members or (scenario,)}
-    obstacle = f"{'an' if any(there) else 'no'} obstacle ahead{'' if len(there) == 1 else ' in some worlds'}"
+    has_obstacle = {member.has_obstacle for member in scenario.members or (scenario,)}
+    obstacle = (
+        f"{'an' if any(has_obstacle) else 'no'} obstacle ahead{'' if len(has_obstacle) == 1 else ' in some worlds'}"
+    )
     learners = ", ".join(name for name, role in scenario.roles.items() if role == LEARNER) or "nobody"
     yield f"{scenario.vehicles} vehicles in line, vehicle_1 in front, {obstacle}. Learners: {learners}."
     for script in dict.fromkeys(role for role in scenario.roles.values() if role != LEARNER):
@@ -49,11 +51,15 @@ def sentences(scenario: Scenario) -> Iterator[str]:
     for key in listed_keys():
         value = getattr(scenario, key.name)
         if key.name == "mixture" and value is not None:
-            value = {each.name: entry.weight for each, entry in zip(scenario.members, value, strict=True)}
+            value = {member.name: entry.weight for member, entry in zip(scenario.members, value, strict=True)}
         if key.name == "table" and value is not None:
             value = f"{len(value.rows):,} rows with the columns {', '.join(value.columns)}"
-        own = key.name in QUANTITIES and scenario.members  # a mixture itself has no quantities
-        if key.name not in ("name", "title", "description", "vehicles", "roles") and value is not None and not own:
+        only_in_members = key.name in QUANTITIES and scenario.members  # a mixture itself has no quantities
+        if (
+            key.name not in ("name", "title", "description", "vehicles", "roles")
+            and value is not None
+            and not only_in_members
+        ):
             yield f"{key.name}: {flow_text(value)} ({key.about})."
 
 
@@ -126,8 +132,8 @@ def scenario_json_schema() -> dict[str, Any]:
     for properties in (schema["properties"], schema["$defs"]["VehicleType"]["properties"]):
         for key in properties.keys() & QUANTITIES.keys():
             properties[key]["allOf"] = [{"$ref": f"#/$defs/range_{key}"}]
-    for key, described in schema["properties"].items():
+    for key, property_schema in schema["properties"].items():
         if key not in ("name", *DESCRIPTIVE_KEYS, "based_on"):  # null takes the key of another scenario away
-            schema["properties"][key] = {"anyOf": [described, {"type": "null"}]}
+            schema["properties"][key] = {"anyOf": [property_schema, {"type": "null"}]}
     ranges = {f"range_{key}": rule.schema for key, rule in QUANTITIES.items()}
     return FileSchema.publish({**schema, "$defs": {**schema["$defs"], **ranges}})

@@ -55,9 +55,11 @@ def game_of(
     those of ``EthBrakeParallelEnv``. Warns (``FreeImpacts``) if an impact costs nothing under a learner's objective.
     """
     if observation is not None:
-        now = {name: view.names for name, view in zip(scenario.vehicle_names, views_of(scenario), strict=True)}
+        current_features = {
+            name: view.names for name, view in zip(scenario.vehicle_names, views_of(scenario), strict=True)
+        }
         scenario = scenario.replace(
-            observation={**now, **observation} if isinstance(observation, Mapping) else observation
+            observation={**current_features, **observation} if isinstance(observation, Mapping) else observation
         )
     bodies = np.array(scenario.learners, np.int64)
     rewarding, settings = Rewarding.of(
@@ -105,7 +107,7 @@ def views_of(scenario: Scenario) -> tuple[View, ...]:
     and the obstacle.
     """
     usual = View(["own", "front_1", "rear_1", *(["role", "obstacle"] if scenario.has_obstacle else [])])
-    listed = scenario.observation
-    if not isinstance(listed, dict):
-        return (usual if listed is None else View(listed),) * scenario.vehicles
-    return tuple(View(listed[name]) if name in listed else usual for name in scenario.vehicle_names)
+    observation = scenario.observation
+    if not isinstance(observation, dict):
+        return (usual if observation is None else View(observation),) * scenario.vehicles
+    return tuple(View(observation[name]) if name in observation else usual for name in scenario.vehicle_names)

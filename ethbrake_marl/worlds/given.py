@@ -64,7 +64,7 @@ def worlds_from_table(scenario: AnyScenario, columns: Any) -> State:
             " polars frame, a pyarrow table, or a structured array of numpy"
         )
     series = [columns[name] for name in names if hasattr(columns[name], "iloc")]
-    if not all(one.index.equals(series[0].index) for one in series):
+    if not all(column.index.equals(series[0].index) for column in series):
         raise InvalidInput(
             f"{where}: columns have different pandas indexes; give them the same index, or pair them by position with"
             " .to_numpy()"
@@ -93,8 +93,8 @@ def read_worlds(scenario: AnyScenario, path: str | Path) -> State:
 
 def given_keys(scenario: Scenario) -> tuple[str, ...]:
     """Keys of the quantities that worlds of this scenario have, such as ``gaps_m``."""
-    there = {"obstacle_gap_m": scenario.has_obstacle}
-    return USUAL + tuple(key for key in OPTIONAL if there.get(key, key in scenario.sources))
+    special_cases = {"obstacle_gap_m": scenario.has_obstacle}
+    return USUAL + tuple(key for key in OPTIONAL if special_cases.get(key, key in scenario.sources))
 
 
 def given_columns(scenario: Scenario) -> dict[str, QuantityEntry]:
@@ -108,18 +108,21 @@ def _check_known(what: str, name: str, known: Sequence[str]) -> None:
 
 
 def _entries(header: Sequence[str], scenario: Scenario, where: str) -> list[QuantityEntry]:
-    known = given_columns(scenario)
+    possible_columns = given_columns(scenario)
     for name in header:
         if header.count(name) > 1:
             raise InvalidInput(f"{where}: column {name!r} occurs twice")
-        _check_known(f"{where}: unknown column {name!r}", name, [*known])
-    return [known[name] for name in header]
+        _check_known(f"{where}: unknown column {name!r}", name, [*possible_columns])
+    return [possible_columns[name] for name in header]
 
 
 def _worlds(
-    scenario: Scenario, given: Mapping[QuantityEntry, Floats], where: str, row_text: Callable[[int], str] | None = None
+    scenario: Scenario,
+    columns: Mapping[QuantityEntry, Floats],
+    where: str,
+    row_text: Callable[[int], str] | None = None,
 ) -> State:
-    """Checked worlds from the columns ``given``, (key, index) -> [n], and the scenario's fixed values.
+    """Checked worlds from ``columns``, (key, index) -> [n], and the scenario's fixed values.
 
     Messages begin with ``where``. ``row_text`` names a row in them; None: there is one world, whose values are named by
     their keys.
@@ -129,34 +132,34 @@ def _worlds(
             f"{where}: scenario {scenario.name!r} is a mixture, so it is unknown to which of its scenarios a"
             f" world belongs; use one of these scenarios: {', '.join(member.name for member in scenario.members)}"
         )
-    n = len(next(iter(given.values()))) if given else 1
+    n = len(next(iter(columns.values()))) if columns else 1
 
     def refuse(key: str, i: int, row: int, right: str) -> NoReturn:
         by_key = key if QUANTITIES[key].per == "world" else f"{key}[{i}]"
         place = f": {by_key}" if row_text is None else f"{row_text(row)}, column {QUANTITIES[key].column_of(i)}"
         raise InvalidInput(f"{where}{place}{right}")
 
-    def fixed(key: str) -> Floats:
+    def fixed_values(key: str) -> Floats:
         low, high = scenario.ends(key)
         return np.where(low == high, low, np.nan)[np.newaxis]
 
-    def settle(key: str, known: Floats) -> Floats:
-        rule, whole = QUANTITIES[key], np.empty((n, known.shape[1]))
-        for i in range(whole.shape[1]):
-            column = whole[:, i] = given.get((key, i), known[:, i])
-            if (key, i) not in given and np.isnan(column).any():
+    def settle(key: str, defaults: Floats) -> Floats:
+        rule, values = QUANTITIES[key], np.empty((n, defaults.shape[1]))
+        for i in range(values.shape[1]):
+            column = values[:, i] = columns.get((key, i), defaults[:, i])
+            if (key, i) not in columns and np.isnan(column).any():
                 refuse(key, i, 0, f" is missing; scenario {scenario.name!r} has no fixed value for it")
             good = (column > 0.0 if rule.positive else column >= 0.0) & (column <= rule.high)
             for row in np.flatnonzero(~good).tolist():
                 refuse(key, i, row, f" = {column[row]:.12g}: must be {rule.interval}")
-        return whole
+        return values
 
-    whole = world_values(scenario, fixed, settle)
+    values = world_values(scenario, fixed_values, settle)
     if scenario.has_obstacle:
-        whole["obstacle_gap_m"] = settle("obstacle_gap_m", obstacle_gap(scenario, whole, fixed))
-    for mistake, i, row, right in mistakes(scenario, whole, whole):
+        values["obstacle_gap_m"] = settle("obstacle_gap_m", obstacle_gap(scenario, values, fixed_values))
+    for mistake, i, row, right in mistakes(scenario, values, values):
         key = "latency_s" if mistake == "v2x" else mistake
-        refuse(key, i, row, f" = {whole[key][row, i]:.12g}: {right}")
+        refuse(key, i, row, f" = {values[key][row, i]:.12g}: {right}")
     line = scenario.types_of_line
     equipment_drawn = line is not None and any(kind.v2x is not None for kind in line.kinds)
     if scenario.v2x.drawn or equipment_drawn:
@@ -169,10 +172,10 @@ def _worlds(
     def no_chance(width: int, stream: tuple[int, ...]) -> Floats:
         return np.zeros((n, width))
 
-    return state_of(scenario, whole, no_chance, scenario.unheard(), np.full(n, -1))
+    return state_of(scenario, values, no_chance, scenario.unheard(), np.full(n, -1))
 
 
-def _shown(value: Any) -> str:
+def _short_text(value: Any) -> str:
     """Value for a message; of an array or a column only its type."""
     kind = getattr(value, "dtype", getattr(value, "type", None))
     return f"{value!r:.60}" if kind is None else f"{type(value).__name__} of {kind}"
@@ -186,10 +189,10 @@ def _numbers(what: str, value: Any) -> Floats:
             cells = np.array([_number(cell) for cell in cells.flat], np.float64).reshape(cells.shape)
         kinds = {type(cell) for cell in np.asarray(value, object).flat} if isinstance(value, list | tuple) else set()
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:  # ragged lists, tensors on a GPU, texts
-        raise InvalidInput(f"{what} = {_shown(value)}: must be a number or a list of numbers: {error}") from None
+        raise InvalidInput(f"{what} = {_short_text(value)}: must be a number or a list of numbers: {error}") from None
     if cells.dtype.kind not in "fiu" or isinstance(value, np.ma.MaskedArray) or kinds & {bool, np.bool_}:
         raise InvalidInput(
-            f"{what} = {_shown(value)}: must be a number or a list of numbers; no booleans, texts or masks"
+            f"{what} = {_short_text(value)}: must be a number or a list of numbers; no booleans, texts or masks"
         )
     return cells.astype(np.float64)
 

@@ -8,7 +8,7 @@ from ethbrake_marl.registry import Registry
 
 def register_physics(name: str, physics: Physics) -> None:
     """Register a physics. Entry points: ``ethbrake_marl.physics``."""
-    PHYSICS.add(name, physics, lambda other: other is physics)
+    PHYSICS.add(name, physics, lambda registered: registered is physics)
 
 
 PHYSICS: Registry[Physics] = Registry("physics", "physics", register_physics)

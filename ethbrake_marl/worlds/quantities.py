@@ -134,7 +134,7 @@ _USUAL = (
 
 # Other ways to declare speeds, gaps and an obstacle, drawn by the numbers of what they replace. The speed of the line
 # has slot 7 of vehicle_2: restitution needs only that of vehicle_1.
-_OTHERWISE = (
+_SUBSTITUTES = (
     Rule(
         "time_gaps_s", "s", "pair", 60.0, True, 0,
         "gap of each pair divided by the speed of its rear vehicle, front to rear", "[1, 1]",
@@ -186,12 +186,12 @@ _OPTIONAL = (
     ),
 )  # fmt: skip
 
-QUANTITIES = {rule.key: rule for rule in (*_USUAL, *_OTHERWISE, *_OPTIONAL)}
+QUANTITIES = {rule.key: rule for rule in (*_USUAL, *_SUBSTITUTES, *_OPTIONAL)}
 USUAL = tuple(rule.key for rule in _USUAL)  # quantities that every world has
 OPTIONAL = tuple(rule.key for rule in _OPTIONAL)  # quantities that a world may lack
 ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstacle_gap_m": "obstacle_margin_m"}
-NEEDED = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s")  # have no default
-OF_A_TYPE = (*NEEDED, "speed_limit_mps", "brake_rate_mps3", "release_rate_mps3")  # keys of a vehicle type
+WITHOUT_DEFAULT = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s")  # have no default
+OF_A_TYPE = (*WITHOUT_DEFAULT, "speed_limit_mps", "brake_rate_mps3", "release_rate_mps3")  # keys of a vehicle type
 
 CAR_ROWS = {
     "mass_t": MASS,

@@ -19,7 +19,7 @@ from ethbrake_marl.motion.layout import Floats, Ints
 LEAST_MASS = 1e-6  # least probability of [low, high] before truncation; below it the quantile loses precision
 
 
-def ordered(ends: tuple[float, float]) -> tuple[float, float]:
+def check_order(ends: tuple[float, float]) -> tuple[float, float]:
     """Refuse, in a pydantic model, [low, high] with low above high."""
     require(ends[0] <= ends[1], (), ends, "low must not be above high")
     return ends
@@ -29,8 +29,8 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 PositiveNumber = Annotated[Number, Field(gt=0.0)]
 Weight = Annotated[float, Field(gt=0.0, le=1e9, allow_inf_nan=False)]
 Pair = Annotated[tuple[Number, Number], Field(strict=False)]
-Ends = Annotated[Pair, AfterValidator(ordered)]
-PositiveEnds = Annotated[tuple[PositiveNumber, PositiveNumber], Field(strict=False), AfterValidator(ordered)]
+Ends = Annotated[Pair, AfterValidator(check_order)]
+PositiveEnds = Annotated[tuple[PositiveNumber, PositiveNumber], Field(strict=False), AfterValidator(check_order)]
 
 
 def pick(weights: Sequence[float] | Floats, u: Floats) -> Ints:

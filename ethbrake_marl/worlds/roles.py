@@ -15,7 +15,7 @@ from ethbrake_marl.files.yaml import YamlPath, parse_numeral
 from ethbrake_marl.motion.layout import Floats
 
 LEARNER = "learner"
-HELD = ("full_brake", "coast", "constant")  # scripts that hold one command
+HOLDING_SCRIPTS = ("full_brake", "coast", "constant")  # scripts that hold one command
 
 _FORM = re.compile(r"(?P<name>[a-z][a-z0-9_@.-]*)(:(?P<argument>\S+))?")
 
@@ -84,6 +84,6 @@ class Roles(dict[str, str]):
         return Roles, (dict(self),)
 
     @classmethod
-    def complete(cls, given: Mapping[str, str], vehicles: int) -> Roles:
-        """Roles of all vehicles; a vehicle that is not in ``given`` brakes fully."""
-        return cls({name: given.get(name, "full_brake") for name in names_of(vehicles)})
+    def complete(cls, roles: Mapping[str, str], vehicles: int) -> Roles:
+        """Roles of all vehicles; a vehicle that is not in ``roles`` brakes fully."""
+        return cls({name: roles.get(name, "full_brake") for name in names_of(vehicles)})

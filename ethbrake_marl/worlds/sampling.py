@@ -66,12 +66,12 @@ def draw_worlds(scenario: Scenario, n: int, seed: int, first: int, purpose: Purp
     """
     index = world_numbers(n, seed, first, purpose)
     if not scenario.members:
-        return _accepted(scenario, seed, purpose, index)
-    chosen, parts = member_numbers(scenario, index, seed, purpose), []
-    for k in np.unique(chosen):
-        part = _accepted(scenario.members[k], seed, purpose, index[chosen == k])
+        return _draw_accepted(scenario, seed, purpose, index)
+    member_index, parts = member_numbers(scenario, index, seed, purpose), []
+    for k in np.unique(member_index):
+        part = _draw_accepted(scenario.members[k], seed, purpose, index[member_index == k])
         parts.append(part._replace(scenarios=np.full(part.worlds.n, scenario.members[k].name)))
-    return merged(parts, np.argsort(chosen, kind="stable"))
+    return merge_draws(parts, np.argsort(member_index, kind="stable"))
 
 
 def member_numbers(scenario: Scenario, index: Ints, seed: int, purpose: Purpose = "list") -> Ints:
@@ -87,12 +87,12 @@ def draw_once(scenario: Scenario, numbers: Numbers, index: Ints) -> DrawnWorlds:
     if line is not None:
         kind, load = line.draw(numbers(PER_TYPE * N, TYPES).reshape(n, N, PER_TYPE))
     declared = _declared_values(scenario, numbers, n, kind, load)
-    whole = world_values(scenario, declared)
+    quantities = world_values(scenario, declared)
     if scenario.has_obstacle:
-        whole["obstacle_gap_m"] = obstacle_gap(scenario, whole, declared)
+        quantities["obstacle_gap_m"] = obstacle_gap(scenario, quantities, declared)
     return DrawnWorlds(
-        state_of(scenario, whole, numbers, scenario.unheard(kind), index),
-        whole["friction"][:, 0] if "friction" in whole else np.full(n, np.nan),
+        state_of(scenario, quantities, numbers, scenario.unheard(kind), index),
+        quantities["friction"][:, 0] if "friction" in quantities else np.full(n, np.nan),
         np.full((n, N), "") if line is None else np.array(line.names)[kind],
         np.full(n, ""),
         np.full(n, "") if column is None else column.value(numbers(OF_WORLD, ROW[0])[:, ROW[1]]),
@@ -104,70 +104,72 @@ def _declared_values(scenario: Scenario, numbers: Numbers, n: int, kind: Ints, l
 
     def declared(key: str) -> Floats:
         entries = scenario.sources[key]
-        drawn = np.empty((n, len(entries)))
+        values = np.empty((n, len(entries)))
         for i, possible in enumerate(entries):
             for k, quantity in possible.items():  # each vehicle type that is possible here
                 rows: Any = slice(None) if len(possible) == 1 else kind[:, i] == k
                 if isinstance(quantity, float):
-                    drawn[rows, i] = quantity
+                    values[rows, i] = quantity
                     continue
                 # All columns of a table take their number from one place, so a world takes them from the same row.
                 stream, column = ROW if isinstance(quantity, TableColumn) else QUANTITIES[key].place(i)
                 u = numbers(stream_width(stream, scenario.vehicles), stream)[rows, column]
-                of = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)
-                drawn[rows, i] = quantity.value(*of)
-        return drawn
+                arguments = (load[rows, i], u) if isinstance(quantity, WithLoad) else (u,)
+                values[rows, i] = quantity.value(*arguments)
+        return values
 
     return declared
 
 
-def state_of(scenario: Scenario, whole: QuantityValues, numbers: Numbers, unheard: Bools, index: Ints) -> State:
-    """State at the alert of the worlds ``index`` [n], from ``whole``: all their quantities.
+def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, unheard: Bools, index: Ints) -> State:
+    """State at the alert of the worlds ``index`` [n], from ``quantities``: all their quantities.
 
     ``numbers`` draws the delays of V2X links (``counters.uniform_numbers``); links in ``unheard``
     (``Scenario.unheard``) never deliver.
     """
-    n, N = whole["speeds_mps"].shape
+    n, N = quantities["speeds_mps"].shape
     line, car = np.zeros((n, layout.LINE_ROWS, N + 1)), np.zeros((n, layout.CAR_ROWS, N + 1))
     know, wanted = np.zeros((n, N + 1, N + 1)), np.zeros((n, N + 1))
-    latency, known = whole["latency_s"], whole["latency_s"][:, :, np.newaxis]
+    latency, reaction_time = quantities["latency_s"], quantities["latency_s"][:, :, np.newaxis]
     if scenario.v2x.by_link:
-        latency, known = scenario.v2x.news(latency, numbers(PER_LINK * N * N, NEWS), unheard)
-    obstacle = whole.get("obstacle_gap_m", np.full((n, 1), FAR_M))
-    of_car = [(row, whole[key]) for key, row in CAR_ROWS.items() if key in whole and row != LATENCY]
-    of_car += [(LATENCY, latency), (layout.OWN_LATENCY, whole["latency_s"])]
+        latency, reaction_time = scenario.v2x.news(latency, numbers(PER_LINK * N * N, NEWS), unheard)
+    obstacle = quantities.get("obstacle_gap_m", np.full((n, 1), FAR_M))
+    of_car = [(row, quantities[key]) for key, row in CAR_ROWS.items() if key in quantities and row != LATENCY]
+    of_car += [(LATENCY, latency), (layout.OWN_LATENCY, quantities["latency_s"])]
     for first in range(0, n, IN_CACHE):
         rows = slice(first, first + IN_CACHE)
-        line[rows, layout.SPEED, 1:], line[rows, GAP, 0] = whole["speeds_mps"][rows], obstacle[rows, 0]
-        line[rows, GAP, 1:N], line[rows, GAP, N] = whole["gaps_m"][rows], np.inf
+        line[rows, layout.SPEED, 1:], line[rows, GAP, 0] = quantities["speeds_mps"][rows], obstacle[rows, 0]
+        line[rows, GAP, 1:N], line[rows, GAP, N] = quantities["gaps_m"][rows], np.inf
         car[rows, layout.MASS, 0] = car[rows, BRAKE_RATE] = car[rows, layout.RELEASE_RATE] = np.inf
-        car[rows, layout.RESTITUTION, 0], car[rows, layout.WEIGHT, 1:] = whole["restitution"][rows, 0], 1.0
-        for row, each in of_car:
-            car[rows, row, 1:] = each[rows]
-        know[rows, 1:, 1:] = known[rows]
+        car[rows, layout.RESTITUTION, 0], car[rows, layout.WEIGHT, 1:] = quantities["restitution"][rows, 0], 1.0
+        for row, values in of_car:
+            car[rows, row, 1:] = values[rows]
+        know[rows, 1:, 1:] = reaction_time[rows]
     for i, name in enumerate(scenario.vehicle_names):
-        wanted[:, i + 1] = first_command(scenario.roles[name], whole["braking_capacity_mps2"][:, i])
-    memories = {each.name: each.at_alert(scenario, numbers, unheard, n) for each in scenario.v2x.extensions}
+        wanted[:, i + 1] = first_command(scenario.roles[name], quantities["braking_capacity_mps2"][:, i])
+    memories = {
+        extension.name: extension.at_alert(scenario, numbers, unheard, n) for extension in scenario.v2x.extensions
+    }
     if scenario.physics is not None:
         memories[PHYSICS] = None  # a mark
     return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 
-def _accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> DrawnWorlds:
+def _draw_accepted(scenario: Scenario, seed: int, purpose: str, index: Ints) -> DrawnWorlds:
     """Worlds ``index``; worlds with an early impact are drawn again if the scenario rejects them."""
-    drawn = draw_once(scenario, uniform_numbers(seed, purpose, 0, index), index)
+    drawn_worlds = draw_once(scenario, uniform_numbers(seed, purpose, 0, index), index)
     if scenario.early_impacts == "keep" or not scenario.learners:
-        return drawn
-    pending, rejected, attempt = np.flatnonzero(has_early_impact(scenario, drawn.worlds)), 0, 0
+        return drawn_worlds
+    pending, rejected, attempt = np.flatnonzero(has_early_impact(scenario, drawn_worlds.worlds)), 0, 0
     while len(pending) and attempt < MOST_ATTEMPTS - 1:
         rejected, attempt = rejected + len(pending), attempt + 1
-        again = draw_once(scenario, uniform_numbers(seed, purpose, attempt, index[pending]), index[pending])
-        drawn.worlds.put(pending, again.worlds, donate=True)
-        for whole, part in zip(drawn[1:5], again[1:5], strict=True):
-            whole[pending] = part
-        pending = pending[has_early_impact(scenario, again.worlds)]
+        redrawn_worlds = draw_once(scenario, uniform_numbers(seed, purpose, attempt, index[pending]), index[pending])
+        drawn_worlds.worlds.put(pending, redrawn_worlds.worlds, donate=True)
+        for column, redrawn_column in zip(drawn_worlds[1:5], redrawn_worlds[1:5], strict=True):
+            column[pending] = redrawn_column
+        pending = pending[has_early_impact(scenario, redrawn_worlds.worlds)]
     if not len(pending):
-        return drawn._replace(rejected=rejected)
+        return drawn_worlds._replace(rejected=rejected)
     learners = ", ".join(scenario.vehicle_names[i - 1] for i in scenario.learners)
     gaps = "time_gaps_s" if scenario.gaps_m is None else "gaps_m"
     raise InvalidInput(
@@ -184,7 +186,7 @@ def has_early_impact(scenario: Scenario, alert: State) -> Bools:
     return np.asarray(state.line[:, IMPACTS].any(axis=1))
 
 
-def merged(parts: Sequence[DrawnWorlds], place: Ints) -> DrawnWorlds:
+def merge_draws(parts: Sequence[DrawnWorlds], place: Ints) -> DrawnWorlds:
     """Worlds of all parts together: row i of the joined parts goes to row ``place[i]``."""
     order = np.argsort(place)
 

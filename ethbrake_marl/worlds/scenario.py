@@ -32,7 +32,7 @@ from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, explain
 from ethbrake_marl.files.yaml import Document
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import V2X
-from ethbrake_marl.worlds.checks import ScenarioWording, check_whole
+from ethbrake_marl.worlds.checks import ScenarioWording, check_scenario
 from ethbrake_marl.worlds.counters import Purpose
 from ethbrake_marl.worlds.derived import world_values
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content, with_members
@@ -202,9 +202,9 @@ class Scenario(ScenarioPart):
         rule = QUANTITIES[str(info.field_name)]
         if "vehicles" in info.data:
             check_count(value, rule.count(info.data["vehicles"]), rule.per)
-        listed = isinstance(value, tuple)
-        for index, entry in enumerate(value if listed else (value,)):
-            rule.check(entry, (index,) if listed else ())
+        is_list = isinstance(value, tuple)
+        for index, entry in enumerate(value if is_list else (value,)):
+            rule.check(entry, (index,) if is_list else ())
         return value
 
     @field_validator("roles", "objective", "observation")
@@ -220,7 +220,7 @@ class Scenario(ScenarioPart):
     @model_validator(mode="after")
     def _whole(self) -> Self:
         if self.mixture is None:  # otherwise its members have been checked
-            check_whole(self)
+            check_scenario(self)
         return self
 
     def __repr__(self) -> str:
@@ -264,8 +264,8 @@ class Scenario(ScenarioPart):
     @property
     def has_obstacle(self) -> bool:
         """Whether some worlds have an obstacle ahead of Vehicle 1."""
-        own = not {"obstacle_gap_m", "obstacle_margin_m"}.isdisjoint(self.sources)
-        return own or any(member.has_obstacle for member in self.members)
+        declares_obstacle = not {"obstacle_gap_m", "obstacle_margin_m"}.isdisjoint(self.sources)
+        return declares_obstacle or any(member.has_obstacle for member in self.members)
 
     def unheard(self, types: Ints | None = None) -> Bools:
         """Whether i cannot get messages of j because of the equipment of their vehicle types, [n, N, N].
@@ -297,15 +297,17 @@ class Scenario(ScenarioPart):
         """
         sources = {}
         for key, rule in QUANTITIES.items():
-            own, line, entries = getattr(self, key), self.types_of_line if key in OF_A_TYPE else None, []
-            for i, outside in enumerate(own if isinstance(own, tuple) else (own,) * rule.count(self.vehicles)):
+            declaration, line, entries = getattr(self, key), self.types_of_line if key in OF_A_TYPE else None, []
+            for i, outside in enumerate(
+                declaration if isinstance(declaration, tuple) else (declaration,) * rule.count(self.vehicles)
+            ):
                 column = self.columns.get(rule.column_of(i))
-                here = {0: outside if column is None else column}
+                by_type = {0: outside if column is None else column}
                 if line is not None and column is None:
                     kinds = {kind: getattr(line.kinds[kind], key) for kind in np.flatnonzero(line.possible[i]).tolist()}
-                    here = {kind: outside if inside is None else inside for kind, inside in kinds.items()}
-                entries.append(here)
-            if all(quantity is not None for here in entries for quantity in here.values()):
+                    by_type = {kind: outside if inside is None else inside for kind, inside in kinds.items()}
+                entries.append(by_type)
+            if all(quantity is not None for by_type in entries for quantity in by_type.values()):
                 sources[key] = entries
         return sources
 
@@ -315,8 +317,8 @@ class Scenario(ScenarioPart):
         Capacities include the road's friction. An undeclared rate is the largest valid one.
         """
         at_once = np.full((2, self.vehicles), QUANTITIES[key].high)
-        each = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
-        lows, highs = np.min(each, axis=0)[0], np.max(each, axis=0)[1]
+        member_bounds = [world_values(member, member.ends).get(key, at_once) for member in self.members or (self,)]
+        lows, highs = np.min(member_bounds, axis=0)[0], np.max(member_bounds, axis=0)[1]
         return tuple(zip(lows.tolist(), highs.tolist(), strict=True))
 
     def ends(self, key: str) -> Floats:
@@ -350,8 +352,8 @@ class Scenario(ScenarioPart):
         """
         if isinstance(learners, str) or not isinstance(learners, Iterable):
             raise InvalidInput(f"learners = {learners!r}: must be a list of vehicles, for instance ['vehicle_2']")
-        stay = {name: "full_brake" if role == LEARNER else role for name, role in self.roles.items()}
-        return self.replace(roles={**stay, **dict.fromkeys(learners, LEARNER)})
+        other_roles = {name: "full_brake" if role == LEARNER else role for name, role in self.roles.items()}
+        return self.replace(roles={**other_roles, **dict.fromkeys(learners, LEARNER)})
 
 
 def plain(value: Any) -> Any:

@@ -138,11 +138,11 @@ class CsvFile(NamedTuple):
 def read_rows(path: Path, columns: object) -> list[list[float | str]]:
     """Unchecked cells in ``columns``, the list from the key ``table`` of a scenario."""
     file = CsvFile.read(path)
-    known = f"the columns of this file are {', '.join(file.header)}"
+    hint = f"the columns of this file are {', '.join(file.header)}"
     if not isinstance(columns, list | tuple):
-        raise InvalidInput(f"{path}: columns = {columns!r:.60}: must be a list; {known}")
+        raise InvalidInput(f"{path}: columns = {columns!r:.60}: must be a list; {hint}")
     for name in columns:
         if file.header.count(name) != 1:
-            missing = f"is missing; {suggestion(str(name), file.header) or known}"
+            missing = f"is missing; {suggestion(str(name), file.header) or hint}"
             raise InvalidInput(f"{path}: column {name!r:.60} {'occurs twice' if name in file.header else missing}")
     return file.cells(columns)

@@ -48,8 +48,8 @@ class WithLoad(ScenarioPart):
     def value(self, load: Floats, u: Floats) -> Floats:
         """Quantity, [n], for each ``load`` (0 empty, 1 full); ``u``, uniform in [0, 1), draws the spread."""
         empty, full = self.with_load
-        moved = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
-        return moved if self.spread == 0.0 else moved + values(self.spread, u)
+        value_for_load = np.clip(empty + (full - empty) * load, min(self.with_load), max(self.with_load))
+        return value_for_load if self.spread == 0.0 else value_for_load + values(self.spread, u)
 
 
 def _tag(value: object) -> str:
@@ -59,7 +59,7 @@ def _tag(value: object) -> str:
 TypeQuantity = Annotated[Annotated[Quantity, Tag("#one")] | Annotated[WithLoad, Tag("#with_load")], Discriminator(_tag)]
 
 
-def _own(key: str) -> Any:
+def _type_quantity(key: str) -> Any:
     return Field(default=None, exclude_if=None if key in USUAL else not_, description=QUANTITIES[key].meaning)
 
 
@@ -73,13 +73,13 @@ class VehicleType(ScenarioPart):
     load: Quantity = Field(
         default_factory=lambda: Uniform(uniform=(0.0, 1.0)), description="load, as a fraction of the full load, 0 to 1"
     )
-    braking_capacity_mps2: TypeQuantity | None = _own("braking_capacity_mps2")
-    driving_capacity_mps2: TypeQuantity | None = _own("driving_capacity_mps2")
-    mass_t: TypeQuantity | None = _own("mass_t")
-    latency_s: TypeQuantity | None = _own("latency_s")
-    speed_limit_mps: TypeQuantity | None = _own("speed_limit_mps")
-    brake_rate_mps3: TypeQuantity | None = _own("brake_rate_mps3")
-    release_rate_mps3: TypeQuantity | None = _own("release_rate_mps3")
+    braking_capacity_mps2: TypeQuantity | None = _type_quantity("braking_capacity_mps2")
+    driving_capacity_mps2: TypeQuantity | None = _type_quantity("driving_capacity_mps2")
+    mass_t: TypeQuantity | None = _type_quantity("mass_t")
+    latency_s: TypeQuantity | None = _type_quantity("latency_s")
+    speed_limit_mps: TypeQuantity | None = _type_quantity("speed_limit_mps")
+    brake_rate_mps3: TypeQuantity | None = _type_quantity("brake_rate_mps3")
+    release_rate_mps3: TypeQuantity | None = _type_quantity("release_rate_mps3")
     v2x: Equipage | None = Field(
         default=None, exclude_if=not_, description="V2X equipment of this type; by default sending and receiving"
     )
@@ -122,12 +122,12 @@ def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: i
     right = "can be used only with the key vehicle_types, which declares the types"
     require(kinds is not None, ("types",), types, right)
     check_count(types, vehicles, "vehicle", ("types",))
-    known, listed = [*(kinds or {}), ANY_TYPE], isinstance(types, tuple)
-    for index, entry in enumerate(types if listed else (types,)):
+    known, is_list = [*(kinds or {}), ANY_TYPE], isinstance(types, tuple)
+    for index, entry in enumerate(types if is_list else (types,)):
         for name in [entry] if isinstance(entry, str) else entry:
             hint = suggestion(name, known) or f"known: {', '.join(known)}"
             good = name in known and (name != ANY_TYPE or isinstance(entry, str))
-            require(good, ("types", index) if listed else ("types",), entry, f"unknown vehicle type {name}; {hint}")
+            require(good, ("types", index) if is_list else ("types",), entry, f"unknown vehicle type {name}; {hint}")
 
 
 class TypesOfLine:
@@ -137,8 +137,10 @@ class TypesOfLine:
         self.names, self.kinds = tuple(kinds), tuple(kinds.values())
         every = {name: kind.weight for name, kind in kinds.items()}
         places = types if isinstance(types, tuple) else (types or ANY_TYPE,) * vehicles
-        each = [every if here == ANY_TYPE else {here: 1.0} if isinstance(here, str) else here for here in places]
-        self.weights = np.array([[here.get(name, 0.0) for name in kinds] for here in each])  # [N, types]
+        weights_by_place = [
+            every if here == ANY_TYPE else {here: 1.0} if isinstance(here, str) else here for here in places
+        ]
+        self.weights = np.array([[here.get(name, 0.0) for name in kinds] for here in weights_by_place])  # [N, types]
         self.possible: Bools = self.weights > 0.0  # [N, types]
 
     def draw(self, u: Floats) -> tuple[Ints, Floats]:
@@ -152,11 +154,11 @@ class TypesOfLine:
         return types, load
 
     def unheard(self, types: Ints | None) -> Bools:
-        each = [kind.v2x or Equipage() for kind in self.kinds]
-        silent = np.array([not one.sends for one in each])
-        hears = np.array([("all", "front", "none").index(one.hears) for one in each])
+        equipment = [kind.v2x or Equipage() for kind in self.kinds]
+        silent = np.array([not equipage.sends for equipage in equipment])
+        hears = np.array([("all", "front", "none").index(equipage.hears) for equipage in equipment])
         if types is None:  # of the types that are possible at each place the one with the least equipment
-            silent, hears = (np.max(one * self.possible, axis=1)[np.newaxis] for one in (silent, hears))
+            silent, hears = (np.max(levels * self.possible, axis=1)[np.newaxis] for levels in (silent, hears))
         else:
             silent, hears = silent[types], hears[types]
         receiver, sender = np.indices((len(self.weights),) * 2)

@@ -54,7 +54,7 @@ def test_digest__is_that_of_outcomes(
 
 
 def test_worlds_of_the_digest__are_all_kinds() -> None:
-    lines = [np.concatenate([line[:, :, :2] for line in digest.played(n)]) for n in range(2, 7)]
+    lines = [np.concatenate([line[:, :, :2] for line in digest.play_random_worlds(n)]) for n in range(2, 7)]
     every = np.concatenate(lines)
     assert np.isfinite(every[:, :, 1:]).all()
     for row in (IMPACTS, FIRST, TOTAL, PUSHED, PASSED, DROVE, THROWN):

@@ -8,7 +8,7 @@ import pytest
 
 from ethbrake_marl.motion import layout as at
 from ethbrake_marl.motion.forces import stopping_distances
-from ethbrake_marl.motion.interval import FAILED, MET
+from ethbrake_marl.motion.interval import EVENT_BY_EVENT, FAILED
 from ethbrake_marl.motion.layout import Floats
 from tests.motion.lines import driven, lines
 
@@ -206,7 +206,7 @@ def run(line: Floats, car: Floats, command: Any, ends: list[float]) -> tuple[Flo
     for end in ends:
         line, met, scratch = driven(line, car, command, start, end)
         assert met[0] != FAILED
-        if met[0] == MET:
+        if met[0] == EVENT_BY_EVENT:
             times, closing = scratch[0, at.NEXT_TIME], scratch[0, at.NEXT_CLOSING]
             ahead = 0 if line[0, at.GAP, 0] < at.FAR_M else 1
             pairs = [p for p in range(ahead, line.shape[2] - 1) if times[p] < math.inf]
@@ -251,7 +251,7 @@ def test_block__takes_the_limit_of_any_of_its_members_to_the_last_bit(limit: flo
 def test_overlap__at_an_event_is_rounding_up_to_1e_9_m(gap: float, sound: bool) -> None:
     # vehicle 1 leaves vehicle 2 with 1e-9 m/s; vehicle 3 meets them after 1 s, when 1e-9 m of the overlap are gone
     after, met, _ = driven(*lines([gap, 8.0], [1e-9, 0.0, 8.0]), 0.0, 0.0, 1.0)
-    assert (met[0] == MET) == sound and (met[0] == FAILED) != sound
+    assert (met[0] == EVENT_BY_EVENT) == sound and (met[0] == FAILED) != sound
     assert not sound or (after[0, at.IMPACTS, 1:3].tolist() == [0.0, 1.0] and (after[0, at.GAP, 1:3] == 0.0).all())
 
 

@@ -372,7 +372,7 @@ BUGS = {
         "pooled + bounce * (pooled + line[SPEED, i])", two,
     ),
     "blocks pooled without their masses": Bug(
-        impact, "pool", "scratch[BLOCK_LOW, count] / whole", "scratch[BLOCK_LOW, count] / 2.0", energy
+        impact, "pool", "scratch[BLOCK_LOW, count] / block_mass", "scratch[BLOCK_LOW, count] / 2.0", energy
     ),
     "a plastic impact is not put in order": Bug(
         impact, "restitution", "car[RESTITUTION, 0] if closing >= PLASTIC_MPS else 0.0", "car[RESTITUTION, 0]", plastic

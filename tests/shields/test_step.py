@@ -11,7 +11,7 @@ from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.play import played, price
+from ethbrake_marl.episode.play import follow_plans, price
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import BRAKING
@@ -286,8 +286,8 @@ def test_a_script_that_reacts_is_asked_in_every_play() -> None:
     game, state = opened("follower", 40)
     state = game._replace(shield=None).reset(LINES["follower"]().sample(40, 7))
     plan = np.full((40, 90, 1), -1.0)
-    deaf, _ = played(game._replace(scripts={}), state, plan, "first")
-    heard, harm = played(game, state, plan, "first")
+    deaf, _ = follow_plans(game._replace(scripts={}), state, plan, "first")
+    heard, harm = follow_plans(game, state, plan, "first")
     assert (heard.harm() == harm).all() and (deaf.harm() != harm).any()
 
 

@@ -58,12 +58,12 @@ from ethbrake_marl.motion.layout import (
     Floats,
 )
 from ethbrake_marl.worlds.channel import PER_LINK
-from ethbrake_marl.worlds.roles import HELD, LEARNER, first_command
+from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER, first_command
 from ethbrake_marl.worlds.sampling import draw_once
 from ethbrake_marl.worlds.scenario import Scenario
 
 SURPRISE = 1e-6  # by which a quantity (SI units, t) may differ from its prediction: messages are moved on with rounding
-TOLD = {  # rows of `State.car` -> the piece of a message that tells them
+PIECE_OF_CAR_ROW = {  # rows of `State.car` -> the piece of a message that tells them
     BRAKING: P_BRAKING,
     DRIVING: P_BRAKING,
     BRAKE_RATE: P_BRAKING,
@@ -136,9 +136,9 @@ class MedianLine(NamedTuple):
         ``car``: as in ``State``.
         """
         wanted = wanted.copy()
-        for other, role in enumerate(self.roles, 1):
-            if other != self.body:
-                wanted[:, other] = first_command("full_brake" if role == LEARNER else role, car[:, BRAKING, other])
+        for vehicle, role in enumerate(self.roles, 1):
+            if vehicle != self.body:
+                wanted[:, vehicle] = first_command("full_brake" if role == LEARNER else role, car[:, BRAKING, vehicle])
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
@@ -152,9 +152,9 @@ class MedianLine(NamedTuple):
         known[:, 0] = known[:, 1]
         acts = known & (news.sample[:, SAMPLE_FORCE] != 0.0)
         acts[:, self.body] = True
-        line, car = (np.where(known[:, np.newaxis], *each) for each in zip(alert[:2], self.alert[:2], strict=True))
-        both = known[:, :-1] & known[:, 1:]
-        line[:, GAP, :-1] = np.where(both, alert.line[:, GAP, :-1], self.alert.line[:, GAP, :-1])
+        line, car = (np.where(known[:, np.newaxis], *arrays) for arrays in zip(alert[:2], self.alert[:2], strict=True))
+        pair_known = known[:, :-1] & known[:, 1:]
+        line[:, GAP, :-1] = np.where(pair_known, alert.line[:, GAP, :-1], self.alert.line[:, GAP, :-1])
         car[:, RESTITUTION] = alert.car[:, RESTITUTION]
         car[:, LATENCY] = np.where(acts, alert.car[:, LATENCY], np.maximum(car[:, OWN_LATENCY], self.news_s))
         return alert._replace(line=line, car=car, wanted=self.commands(car, alert.wanted))
@@ -201,8 +201,8 @@ class MedianLine(NamedTuple):
         """
         car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
         car[:, :, 0] = 0.0
-        own = sample[:, PLACE, self.body, np.newaxis]
-        motion = np.stack([sample[:, PLACE] - own, sample[:, SAMPLE_SPEED], sample[:, SAMPLE_FORCE]], axis=1)
+        ego_place = sample[:, PLACE, self.body, np.newaxis]
+        motion = np.stack([sample[:, PLACE] - ego_place, sample[:, SAMPLE_SPEED], sample[:, SAMPLE_FORCE]], axis=1)
         return np.concatenate([motion, car], axis=1).transpose(0, 2, 1)
 
     def overwritten(self, state: State, median: State) -> State:
@@ -214,7 +214,7 @@ class MedianLine(NamedTuple):
         """
         body, news = self.body, self.received(state)
         line, car = median.line.copy(), median.car.copy()
-        for row, piece in TOLD.items():
+        for row, piece in PIECE_OF_CAR_ROW.items():
             car[:, row, 1:] = np.where(news.pieces[:, 1:, piece], state.car[:, row, 1:], car[:, row, 1:])
         onset = self.onsets(news, car)
         car[:, LATENCY], car[:, LATENCY, body] = onset, state.car[:, LATENCY, body]
@@ -278,8 +278,8 @@ def check_predictable(scenario: Scenario, body: int) -> None:
     false = [extension.name for extension in scenario.v2x.extensions if extension.name != MESSAGES_KEY]
     if false:
         raise InvalidInput(f"{where} messages without errors; leave {', '.join(false)} out of v2x, or use shield step")
-    for other, (name, role) in enumerate(scenario.roles.items(), 1):
-        if other != body and role.partition(":")[0] not in (LEARNER, *HELD):
+    for vehicle, (name, role) in enumerate(scenario.roles.items(), 1):
+        if vehicle != body and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
             raise InvalidInput(f"{where} vehicles whose commands are known, but {name} is driven by {role!r}")
 
 

@@ -16,7 +16,7 @@ from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
-from ethbrake_marl.episode.step import advanced
+from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.estimated import SURPRISE, MedianLine, without_channel
 from ethbrake_marl.extensions.certified.robust import reset_without_shield
@@ -76,8 +76,8 @@ class EstimatedShield(StepShield):
     def seen(self, state: State, memory: StepShieldMemory) -> State:
         """Median lines, with the present memories of the agents in ``state``."""
         median: State = memory.members.median
-        own = {body: state.memories[body] for body in self.drivers if body in state.memories}
-        return median._replace(memories={**median.memories, **own})
+        agent_memories = {body: state.memories[body] for body in self.drivers if body in state.memories}
+        return median._replace(memories={**median.memories, **agent_memories})
 
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
         return super().rolled_out(*without_channel(game, state), plans, most)
@@ -146,7 +146,7 @@ class EstimatedEV2XBM:
     def act(self, state: State, memory: ChoiceMemory, body: int) -> tuple[Floats, ChoiceMemory]:
         wanted = memory.median.wanted.copy()
         wanted[:, body] = state.wanted[:, body]
-        foretold = advanced(memory.median._replace(wanted=wanted), state.time_s)
+        foretold = hold_commands(memory.median._replace(wanted=wanted), state.time_s)
         median, command = self.lines[body].overwritten(state, foretold), memory.command.copy()
         rows = (differ(foretold, median) | np.isnan(command)).nonzero()[0]
         if len(rows):
@@ -157,17 +157,17 @@ class EstimatedEV2XBM:
         return command, ChoiceMemory(median, command)
 
 
-def differ(one: State, other: State) -> Bools:
+def differ(first_line: State, second_line: State) -> Bools:
     """Whether two lines differ in speeds, gaps or parameters of vehicles, [n].
 
     Latencies that are over are ignored.
     """
     parts = []
-    for line in (one, other):
+    for line in (first_line, second_line):
         car = line.car[:, :, 1:].copy()
         car[:, LATENCY] = np.maximum(car[:, LATENCY], line.time_s[:, np.newaxis])
         parts.append((line.line[:, SPEED, 1:], line.line[:, GAP, :-1], car.reshape(line.n, -1)))
-    near = [np.isclose(mine, theirs, 0.0, SURPRISE).all(axis=1) for mine, theirs in zip(*parts, strict=True)]
+    near = [np.isclose(first, second, 0.0, SURPRISE).all(axis=1) for first, second in zip(*parts, strict=True)]
     return np.asarray(~np.all(near, axis=0))
 
 

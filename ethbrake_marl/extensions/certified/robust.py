@@ -16,7 +16,7 @@ import numpy as np
 from ethbrake_marl.agents.drive import MODEL, Agent
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
-from ethbrake_marl.episode.state import END, State, mapped, take
+from ethbrake_marl.episode.state import END, State, map_arrays, take
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.motion.layout import BRAKING, GAP, IMPACTS, SPEED, Bools, Floats
@@ -79,8 +79,8 @@ class RobustShield(StepShield):
         """Stored members, M rows for each world, with the present memories of the agents in ``state``."""
         states = join_members(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)
-        own = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
-        return states._replace(memories={**states.memories, **own})
+        agent_memories = {body: take(state.memories[body], rows) for body in self.drivers if body in state.memories}
+        return states._replace(memories={**states.memories, **agent_memories})
 
     def price(self, game: Game, states: State, plans: Floats, most: Any = np.inf, caps: Floats | None = None) -> Floats:
         """Harm of plans in the worst of the M ``states`` of each world, [n] m2/s2; or more than ``most``.
@@ -88,8 +88,8 @@ class RobustShield(StepShield):
         ``plans``: one for each world. ``caps`` is unused.
         """
         M = states.n // len(plans)
-        each = np.broadcast_to(most, len(plans)).repeat(M)
-        return np.asarray(super().price(game, states, plans.repeat(M, axis=0), each).reshape(-1, M).max(axis=1))
+        limits = np.broadcast_to(most, len(plans)).repeat(M)
+        return np.asarray(super().price(game, states, plans.repeat(M, axis=0), limits).reshape(-1, M).max(axis=1))
 
     def plans(self, game: Game, alert: State, state: State, states: State) -> list[Floats]:
         """Plans of the step shield, and the constant plan that is best in the worst member.
@@ -124,12 +124,12 @@ def reset_without_shield(game: Game, alerts: State) -> State:
 
 def split_members(states: State, n: int) -> State:
     """Reshape arrays of states from M rows for each of n worlds, [n M, ...], to [n, M, ...]."""
-    return mapped(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
+    return map_arrays(lambda array: array.reshape(n, len(array) // n, *array.shape[1:]), states)  # type: ignore[no-any-return]
 
 
 def join_members(states: State) -> State:
     """Reshape arrays of states from [n, M, ...] to M rows for each world, [n M, ...]."""
-    return mapped(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
+    return map_arrays(lambda array: array.reshape(array.shape[0] * array.shape[1], *array.shape[2:]), states)  # type: ignore[no-any-return]
 
 
 def may_be_in(state: State, members: State) -> Bools:

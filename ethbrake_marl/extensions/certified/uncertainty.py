@@ -68,9 +68,9 @@ class Uncertainty(NamedTuple):
                 f" {EXAMPLE}"
             )
         corners = product((0.0, 1.0), repeat=len(sides)) if sides else ()
-        shares = [np.tile(each[::-1], (alert.n, 1)) for each in corners]
-        whole = State.join([alert, *(placed(alert, sides, share) for share in shares)])
-        return whole.take(np.arange(whole.n).reshape(-1, alert.n).T.ravel())
+        shares = [np.tile(corner[::-1], (alert.n, 1)) for corner in corners]
+        members = State.join([alert, *(worlds_at(alert, sides, share) for share in shares)])
+        return members.take(np.arange(members.n).reshape(-1, alert.n).T.ravel())
 
     def draw(self, alert: State, rng: np.random.Generator, *, corners: bool = False) -> State:
         """One random world from each world's box: uniform in the whole box, or one of its ``corners``.
@@ -79,7 +79,7 @@ class Uncertainty(NamedTuple):
         """
         sides = self.sides(alert)
         shares = rng.random((alert.n, len(sides)))
-        return placed(alert, sides, np.round(shares) if corners else shares)
+        return worlds_at(alert, sides, np.round(shares) if corners else shares)
 
     def sides(self, alert: State) -> list[Side]:
         """Uncertain numbers of the worlds, one for each vehicle or pair; an interval of width 0 makes none.
@@ -121,7 +121,7 @@ def values_of(alert: State, key: str) -> Floats:
     return alert.line[:, OF_LINE[key]] if key in OF_LINE else alert.car[:, OF_CAR[key]]
 
 
-def placed(alert: State, sides: list[Side], shares: Floats) -> State:
+def worlds_at(alert: State, sides: list[Side], shares: Floats) -> State:
     """Worlds whose uncertain numbers ``sides`` are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
 
     A vehicle that brakes fully does so with the new capacity. Without a V2X channel, a vehicle that reacts later also
@@ -155,7 +155,7 @@ def parse_uncertainty(text: object) -> Uncertainty:
     if not isinstance(text, str):
         raise InvalidInput(f"uncertainty = {text!r:.60}: must be a text, for instance {EXAMPLE!r}")
     intervals: list[Interval] = []
-    for entry in (each.strip() for each in re.split("[,:]", text)):
+    for entry in (part.strip() for part in re.split("[,:]", text)):
         match = ENTRY.fullmatch(entry)
         if match is None or DECIMAL_PATTERN.fullmatch(match["width"]) is None:
             raise InvalidInput(f"uncertainty: {entry!r}: {form}")
@@ -169,9 +169,9 @@ def parse_uncertainty(text: object) -> Uncertainty:
             raise InvalidInput(f"uncertainty: {entry!r}: must be a finite number, or a share below 100 %")
         number = None if match["number"] is None else int(match["number"])
         new = Interval(entry, name, width / 100.0 if share else width, share, number)
-        for other in intervals:
-            if other.quantity == name and (None in (number, other.number) or number == other.number):
-                both = f"{other.text} and {entry}"
-                raise InvalidInput(f"uncertainty: {both} are intervals of the same quantity; give only one")
+        for interval in intervals:
+            if interval.quantity == name and (None in (number, interval.number) or number == interval.number):
+                entries = f"{interval.text} and {entry}"
+                raise InvalidInput(f"uncertainty: {entries} are intervals of the same quantity; give only one")
         intervals.append(new)
     return Uncertainty(tuple(intervals))

@@ -207,9 +207,9 @@ def check_runs(game: Game) -> None:
             " there, such as full_brake and coast (--set roles.NAME=full_brake)"
         )
     if game.layers or game.physics is not None:
-        other = [type(part).__name__ for part in (*game.layers, game.physics) if part is not None]
+        part_names = [type(part).__name__ for part in (*game.layers, game.physics) if part is not None]
         raise InvalidInput(
-            f"{what}: has {', '.join(other)}; messages with content and another physics run on a processor only"
+            f"{what}: has {', '.join(part_names)}; messages with content and another physics run on a processor only"
         )
     if game.shield is not None:
         raise InvalidInput(f"{what}: has a shield, which runs on a processor only; train without it, then shield")

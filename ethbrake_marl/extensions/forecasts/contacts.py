@@ -19,7 +19,7 @@ from ethbrake_marl.episode.state import TIME, State, check_exact
 from ethbrake_marl.errors import PhysicsError
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import capacity
-from ethbrake_marl.motion.interval import FAILED, MET, move_line
+from ethbrake_marl.motion.interval import EVENT_BY_EVENT, FAILED, move_line
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
     BRAKING,
@@ -136,7 +136,7 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
                 if outcome == FAILED:
                     failed = k
                 value = out[k, o, c * PER_COMMAND : (c + 1) * PER_COMMAND]
-                write_features(scratch, outcome == MET, i, first, last, time_step_s, value)
+                write_features(scratch, outcome == EVENT_BY_EVENT, i, first, last, time_step_s, value)
                 far = near + c * FAR_PER_COMMAND
                 out[k, o, far], out[k, o, far + 1] = value[IMPACT_TIME], value[PER_SIDE + IMPACT_TIME]
                 out[k, o, far + 2] = math.sqrt(value[FIRST_HARM])

@@ -32,14 +32,14 @@ class Branches(NamedTuple):
     steps: Ints  # for which the choice is held
 
     @classmethod
-    def of(cls, tried: Ints, steps: Ints, choices: int) -> tuple[Branches, Ints]:
-        """One branch for each different choice of a decision, and the branches of ``tried``, [B, C].
+    def of(cls, candidates: Ints, steps: Ints, choices: int) -> tuple[Branches, Ints]:
+        """One branch for each different choice of a decision, and the branches of ``candidates``, [B, C].
 
-        ``tried`` [B, C] are numbers below ``choices``; those of a decision are held for ``steps`` [B].
+        ``candidates`` [B, C] are numbers below ``choices``; those of a decision are held for ``steps`` [B].
         """
-        pairs, back = np.unique(np.arange(len(tried))[:, np.newaxis] * choices + tried, return_inverse=True)
+        pairs, back = np.unique(np.arange(len(candidates))[:, np.newaxis] * choices + candidates, return_inverse=True)
         decision, choice = np.divmod(pairs, choices)
-        return cls(decision, choice, steps[decision]), back.reshape(tried.shape)
+        return cls(decision, choice, steps[decision]), back.reshape(candidates.shape)
 
     def with_full_braking(self, decisions: int) -> Branches:
         """These branches, and then one for each of the decisions that brakes fully to the end."""

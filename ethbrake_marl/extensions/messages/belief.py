@@ -98,8 +98,11 @@ def believed_whole(state: State, observer: int) -> State:
     It can predict a vehicle of which it knows all quantities but the intent. For the others ``know`` is infinite.
     """
     known = known_pieces(state, observer)
-    line, whole = estimated(state, observer, known, newest_samples(state, observer)), known[:, :, :P_INTENT].all(axis=2)
-    return state._replace(line=line, know=_known_if(state, observer, np.asarray(whole)))
+    line, predictable = (
+        estimated(state, observer, known, newest_samples(state, observer)),
+        known[:, :, :P_INTENT].all(axis=2),
+    )
+    return state._replace(line=line, know=_known_if(state, observer, np.asarray(predictable)))
 
 
 def _known_if(state: State, observer: int, holds: Bools) -> Floats:

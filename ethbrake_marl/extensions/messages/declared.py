@@ -59,14 +59,14 @@ class Messages(Extension):
         by_name = isinstance(value, Mapping)
         require(isinstance(value, list | tuple) or (by_name and len(value) > 0), (key,), value, right)
         read = {}
-        for name, listed in value.items() if by_name else [("", value)]:
+        for name, pieces in value.items() if by_name else [("", value)]:
             at = (key, name) if by_name else (key,)
-            require(isinstance(name, str) and isinstance(listed, list | tuple), at, listed, right)
-            for k, piece in enumerate(listed):
+            require(isinstance(name, str) and isinstance(pieces, list | tuple), at, pieces, right)
+            for k, piece in enumerate(pieces):
                 hint = suggestion(piece, PIECES) if isinstance(piece, str) else ""
                 require(piece in PIECES, (*at, k), piece, f"{hint}; known: {', '.join(PIECES)}".removeprefix("; "))
-            require(len(set(listed)) == len(listed), at, listed, "must not list an item twice")
-            read[name] = [piece for piece in PIECES if piece in listed]
+            require(len(set(pieces)) == len(pieces), at, pieces, "must not list an item twice")
+            read[name] = [piece for piece in PIECES if piece in pieces]
         return read if by_name else read[""]
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
@@ -88,22 +88,22 @@ class Messages(Extension):
         for name in tells if isinstance(tells, Mapping) else ():
             right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
             require(name in scenario.vehicle_names, ("v2x", "tells", name), UNSHOWN, right)
-        kept = _kept(scenario)
+        count = _sample_count(scenario)
         right = (
-            f"a message takes {kept - 3} time steps; at most {MOST_SAMPLES - 3} are possible, so shorten the delay of"
+            f"a message takes {count - 3} time steps; at most {MOST_SAMPLES - 3} are possible, so shorten the delay of"
             " messages or lengthen time_step_s"
         )
-        require(kept <= MOST_SAMPLES, ("v2x",), v2x, right)
+        require(count <= MOST_SAMPLES, ("v2x",), v2x, right)
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> MessageMemory:
         N, v2x = scenario.vehicles, scenario.v2x
-        heard, seen = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
+        heard_s, seen_s = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
         channel: Floats = np.zeros((n, CHANNEL_COLUMNS))
         if _is_periodic(v2x):
             channel[:, PERIOD], channel[:, DELAY] = v2x.message_period_s, _delay_s(v2x)
             channel[:, LOSS_BEGINS], channel[:, LOSS_ENDS] = v2x.loss_begins, v2x.loss_ends
             channel[:, KEY] = numbers(OF_WORLD, LATER_LOSSES)[:, 0] * 2.0**53
-        return memory_at_alert(_contents(scenario), heard, seen, channel, _kept(scenario))
+        return memory_at_alert(_contents(scenario), heard_s, seen_s, channel, _sample_count(scenario))
 
     def layer(self, v2x: V2X) -> Layer:
         return MESSAGES_LAYER
@@ -122,18 +122,20 @@ def _delay_s(v2x: V2X) -> float:
     return on_the_way if v2x.link_latency_s is None else v2x.link_latency_s
 
 
-def _kept(scenario: Scenario) -> int:
+def _sample_count(scenario: Scenario) -> int:
     return samples_kept(_delay_s(scenario.v2x), scenario.time_step_s) if _is_periodic(scenario.v2x) else 0
 
 
 def _contents(scenario: Scenario) -> Bools:
     tells = _value(scenario.v2x, "tells")
-    each = (
+    contents = (
         tells
         if isinstance(tells, Mapping)
         else dict.fromkeys(scenario.vehicle_names, DEFAULT_CONTENT if tells is None else tells)
     )
-    return np.array([[piece in each.get(name, DEFAULT_CONTENT) for piece in PIECES] for name in scenario.vehicle_names])
+    return np.array(
+        [[piece in contents.get(name, DEFAULT_CONTENT) for piece in PIECES] for name in scenario.vehicle_names]
+    )
 
 
 DEFAULT_MESSAGES = Messages()

@@ -14,27 +14,27 @@ from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part
 
 
-def age(state: State, body: int, other: int) -> Floats:
+def age(state: State, body: int, neighbour: int) -> Floats:
     """Age of the newest sample received from the neighbour; 0 if its present state, or nothing, is known."""
     if MESSAGES_KEY not in state.memories:
         return np.zeros(state.n)
-    ages = ages_s(state)[:, body, other]
+    ages = ages_s(state)[:, body, neighbour]
     return np.where(np.isfinite(ages), ages, 0.0)
 
 
-def intent(state: State, body: int, other: int) -> Floats:
+def intent(state: State, body: int, neighbour: int) -> Floats:
     """Command that the neighbour chose at its last decision, if its messages contain it; else 0."""
-    return state.wanted[:, other] if MESSAGES_KEY in state.memories else np.zeros(state.n)
+    return state.wanted[:, neighbour] if MESSAGES_KEY in state.memories else np.zeros(state.n)
 
 
-def _known(piece: str) -> Part:
-    def known(state: State, body: int, other: int) -> Floats:
+def _known_feature(piece: str) -> Part:
+    def is_known(state: State, body: int, neighbour: int) -> Floats:
         if MESSAGES_KEY not in state.memories:
             return np.full(state.n, float(piece != "intent"))
-        return known_pieces(state, body)[:, other, PIECES.index(piece)].astype(np.float64)
+        return known_pieces(state, body)[:, neighbour, PIECES.index(piece)].astype(np.float64)
 
-    known.__doc__ = f"1 if the neighbour's {piece.replace('_', ' ')} is known, from a message or from sensors."
-    return _of_neighbour(known, "1", 1.0, 0.0, 1.0)
+    is_known.__doc__ = f"1 if the neighbour's {piece.replace('_', ' ')} is known, from a message or from sensors."
+    return _of_neighbour(is_known, "1", 1.0, 0.0, 1.0)
 
 
 def _of_neighbour(function: Callable[..., Floats], unit: str, scale: float, low: float, high: float) -> Part:
@@ -43,4 +43,4 @@ def _of_neighbour(function: Callable[..., Floats], unit: str, scale: float, low:
 
 AGE = _of_neighbour(age, "s", 1.0, 0.0, 8.0)
 INTENT_FEATURE = _of_neighbour(intent, "m/s2", 10.0, -2.0, 2.0)
-KNOWN = SimpleNamespace(**{piece: _known(piece) for piece in PIECES})
+KNOWN = SimpleNamespace(**{piece: _known_feature(piece) for piece in PIECES})

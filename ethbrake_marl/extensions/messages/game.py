@@ -119,15 +119,15 @@ class BelievedView(LayeredView):
         ]
 
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
-        seen = np.empty((state.n, len(observers), len(self.names)), np.float32)
+        observations = np.empty((state.n, len(observers), len(self.names)), np.float32)
         for o, body in enumerate(observers.tolist()):
             known = known_pieces(state, body)
             for view, columns, belief in self.parts:
-                seen[:, o, columns] = view.observe(belief(state, body), np.array([body]), time_step_s)[:, 0]
+                observations[:, o, columns] = view.observe(belief(state, body), np.array([body]), time_step_s)[:, 0]
             for column, offset, pieces in self.needs:
                 if 0 < body + offset < known.shape[1]:
-                    seen[~known[:, body + offset, pieces].all(axis=1), o, column] = 0.0
-        return seen
+                    observations[~known[:, body + offset, pieces].all(axis=1), o, column] = 0.0
+        return observations
 
 
 class Believer(LayeredScript):

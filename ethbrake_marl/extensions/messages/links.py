@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import advanced
+from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.forces import ROUNDING_S
 from ethbrake_marl.motion.interval import solo
@@ -88,23 +88,25 @@ def samples_kept(delay_s: float, time_step_s: float) -> int:
     return math.ceil(delay_s / time_step_s - SAME_MOMENT_S) + 3
 
 
-def memory_at_alert(contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, kept: int) -> MessageMemory:
+def memory_at_alert(
+    contents: Bools, heard_s: Floats, seen_s: Floats, channel: Floats, sample_count: int
+) -> MessageMemory:
     """Memory at the alert, before any message.
 
     ``contents`` [N, PIECES]: what messages of each vehicle contain. ``heard_s`` and ``seen_s`` [n, N, N]: when vehicle
     i can use the first message of j, and when it begins to measure j (s). ``channel``: as in ``MessageMemory``.
-    ``kept``: number of samples to store.
+    ``sample_count``: number of samples to store.
     """
     n, N = heard_s.shape[:2]
-    whole = np.ones((n, N + 1, len(PIECES)), np.bool_)
-    whole[:, 1:] = contents
-    heard, seen = np.full((2, n, N + 1, N + 1), np.inf)
-    others = ~np.eye(N, dtype=np.bool_)
-    heard[:, 1:, 1:], seen[:, 1:, 1:] = np.where(others, heard_s, np.inf), np.where(others, seen_s, np.inf)
+    all_contents = np.ones((n, N + 1, len(PIECES)), np.bool_)
+    all_contents[:, 1:] = contents
+    heard_at, seen_at = np.full((2, n, N + 1, N + 1), np.inf)
+    pairs = ~np.eye(N, dtype=np.bool_)
+    heard_at[:, 1:, 1:], seen_at[:, 1:, 1:] = np.where(pairs, heard_s, np.inf), np.where(pairs, seen_s, np.inf)
     links, news = np.zeros((n, LINK_ROWS, N + 1, N + 1)), np.zeros((n, SAMPLE_ROWS, N + 1, N + 1))
-    samples = np.zeros((n, kept, SAMPLE_ROWS, N + 1))
-    links[:, SENT], news[:, AT], samples[:, :, AT] = heard - channel[:, DELAY, np.newaxis, np.newaxis], -1.0, np.inf
-    return MessageMemory(whole, heard, seen, channel, links, news, samples)
+    samples = np.zeros((n, sample_count, SAMPLE_ROWS, N + 1))
+    links[:, SENT], news[:, AT], samples[:, :, AT] = heard_at - channel[:, DELAY, np.newaxis, np.newaxis], -1.0, np.inf
+    return MessageMemory(all_contents, heard_at, seen_at, channel, links, news, samples)
 
 
 def present(state: State) -> Floats:
@@ -126,7 +128,7 @@ def begin_messages(alert: State, start_s: Floats, time_step_s: float, sent: Call
 
     Until then vehicles execute ``alert.wanted``. ``sent``: the state that vehicles send and measure, from the true one.
     """
-    memory, line = _own(alert.memories[MESSAGES_KEY]), alert.line.copy()
+    memory, line = _writable_copy(alert.memories[MESSAGES_KEY]), alert.line.copy()
     force = np.where(alert.car[:, LATENCY] <= 0.0, alert.wanted, 0.0)
     rate = np.where(force < line[:, FORCE], alert.car[:, BRAKE_RATE], alert.car[:, RELEASE_RATE])
     line[:, FORCE] = np.where(np.isinf(rate), force, line[:, FORCE])
@@ -134,22 +136,22 @@ def begin_messages(alert: State, start_s: Floats, time_step_s: float, sent: Call
     state = alert._replace(line=line)
     _sample(memory, sent(state), np.zeros(alert.n), np.ones(alert.n, np.bool_))
     steps = np.ceil(start_s / time_step_s - 1e-6)
-    for left in range(int(steps.max()) - 1, -1, -1):
-        rows = steps > left
-        state, way = _advanced(state, np.where(rows, start_s - left * time_step_s, state.time_s))
+    for steps_left in range(int(steps.max()) - 1, -1, -1):
+        rows = steps > steps_left
+        state, way = _advanced(state, np.where(rows, start_s - steps_left * time_step_s, state.time_s))
         _sample(memory, sent(state), way, rows)
     return memory
 
 
 def after_step(before: State, after: State, sent: Callable[[State], State]) -> MessageMemory:
     """Return the memory after a step, with what has been received in it; ``sent``: as for ``begin_messages``."""
-    memory = _own(before.memories[MESSAGES_KEY])
+    memory = _writable_copy(before.memories[MESSAGES_KEY])
     _, way = _advanced(before._replace(wanted=after.wanted), after.time_s)
     _sample(memory, sent(after), way, after.time_s > before.time_s)
     return memory
 
 
-def _own(memory: MessageMemory) -> MessageMemory:
+def _writable_copy(memory: MessageMemory) -> MessageMemory:
     return memory._replace(links=memory.links.copy(), news=memory.news.copy(), samples=memory.samples.copy())
 
 
@@ -157,7 +159,7 @@ def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
     """State at ``until_s`` [n], and the way of Vehicle 1, [n] m: how much nearer a fixed post is."""
     line = state.line.copy()
     line[line[:, GAP, 0] >= FAR_M, GAP, 0] = FRONT_POST_M
-    after = advanced(state._replace(line=line), until_s)
+    after = hold_commands(state._replace(line=line), until_s)
     return after, line[:, GAP, 0] - after.line[:, GAP, 0]
 
 
@@ -192,7 +194,7 @@ def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats
 
 
 @large
-def receive_worlds(rows, time, channel, seen, samples, links, news):
+def receive_worlds(rows, time, channel, seen_s, samples, links, news):
     """Receive all messages that can be used by ``time`` [n] (s), and measure vehicles in sight, in the worlds ``rows``.
 
     ``rows`` is a mask [n]; the other arguments are arrays of ``MessageMemory``, of which ``links`` and ``news`` are
@@ -212,7 +214,7 @@ def receive_worlds(rows, time, channel, seen, samples, links, news):
                 links[k, BAD, i, j] = 1.0 if bad else 0.0
                 links[k, MESSAGE_NUMBER, i, j] += 1.0
                 links[k, SENT, i, j] += channel[k, PERIOD]
-            if seen[k, i, j] <= time[k]:
+            if seen_s[k, i, j] <= time[k]:
                 take_sample(samples[k], news[k], i, j, time[k], INTENT)
 
 

@@ -12,5 +12,9 @@ PARTS = {
         "mass_known": "features:KNOWN.mass",
         "intent_known": "features:KNOWN.intent",
     },
-    "v2x_extensions": {"persistence": "declared:DEFAULT_MESSAGES", "tells": "declared:DEFAULT_MESSAGES", "reports": "reports:REPORTS"},
+    "v2x_extensions": {
+        "persistence": "declared:DEFAULT_MESSAGES",
+        "tells": "declared:DEFAULT_MESSAGES",
+        "reports": "reports:REPORTS",
+    },
 }

@@ -14,7 +14,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.episode.step import advanced
+from ethbrake_marl.episode.step import hold_commands
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.proofs.avoidability import FRONT, avoidability, largest_behind, spare_gap
 from ethbrake_marl.extensions.proofs.branch_and_bound import CELL_COLUMNS, CELLS, least_contact_harm
@@ -314,7 +314,7 @@ def lower_bound(
     _check_asked(state, start, count, horizon_s, time_step_s)
     count = "total" if count == "honest" else count
     full = np.pad(-state.braking_capacity_mps2, ((0, 0), (1, 0)))
-    now = advanced(state._replace(wanted=full), start)  # until then all brake fully
+    now = hold_commands(state._replace(wanted=full), start)  # until then all brake fully
     counts = (now.speeds_mps[:, 1:] >= 0.0) & (now.speeds_mps[:, :-1] >= 0.0) & ((count == "total") | ~now.pair_hit)
     none = np.zeros(state.n, np.bool_)
     has_front = counts[:, body - 2] if body > 1 else none

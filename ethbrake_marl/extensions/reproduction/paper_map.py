@@ -179,11 +179,11 @@ class PaperMap:
 def decided(game: Game, state: State, actions: Floats | None) -> State:
     """State with the commands of scripts and learners, as at the beginning of a step of a game."""
     learners = game.settings.learners
-    given = proposal_array(learners, actions, state.n)
-    if np.isnan(given).any():
-        check_actions(learners, given[np.isnan(given).any(axis=1).argmax()])
+    proposals = proposal_array(learners, actions, state.n)
+    if np.isnan(proposals).any():
+        check_actions(learners, proposals[np.isnan(proposals).any(axis=1).argmax()])
     state = ask_scripts(game.scripts, state)
-    commands = commands_of(state, learners, given)
+    commands = commands_of(state, learners, proposals)
     state.wanted[:, learners] = np.where(state.ended[:, np.newaxis], state.wanted[:, learners], commands)
     return state
 

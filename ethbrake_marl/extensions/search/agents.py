@@ -20,7 +20,7 @@ from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.names import AgentSettings, make_agent
 from ethbrake_marl.registry import Part
 from ethbrake_marl.worlds.game import game_of
-from ethbrake_marl.worlds.roles import HELD, LEARNER
+from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER
 from ethbrake_marl.worlds.scenario import Scenario
 
 SEARCH_CANDIDATES = 500  # plans that +search simulates
@@ -139,7 +139,7 @@ def single_learner_game(scenario: Scenario, alert: State, body: int) -> tuple[Ga
     Raises ``InvalidInput`` if an agent drives another vehicle, because its commands are not known at the alert.
     """
     for vehicle, role in enumerate(scenario.roles.values(), 1):
-        if vehicle != body and role.partition(":")[0] not in (LEARNER, *HELD):
+        if vehicle != body and role.partition(":")[0] not in (LEARNER, *HOLDING_SCRIPTS):
             raise InvalidInput(
                 f"scenario {scenario.name!r}: vehicle_{vehicle} is driven by {role!r}, whose commands are not known at"
                 " the alert; a search needs scripts that hold one command"

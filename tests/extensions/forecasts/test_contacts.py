@@ -12,7 +12,7 @@ from ethbrake_marl.episode.observe import View
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.forecasts.contacts import FORECAST_S
 from ethbrake_marl.motion import layout as at
-from ethbrake_marl.motion.interval import MET
+from ethbrake_marl.motion.interval import EVENT_BY_EVENT
 from ethbrake_marl.worlds.catalogue import load_scenario
 from tests.episode.lines import later, state_of
 from tests.motion.lines import driven
@@ -35,7 +35,7 @@ def happens(state: State, body: int, own: Any, others: Any, step_s: float) -> di
     line, met, rows = driven(before, state.car, commands, state.time_s, state.time_s + FORECAST_S)
     told = {"first_impact_harm": line[:, at.FIRST].sum(axis=1), "total_harm": line[:, at.TOTAL].sum(axis=1)}
     for side, pair in (("front", body - 1), ("rear", body)):
-        time = np.where(met == MET, rows[:, at.NEXT_TIME, pair], math.inf)
+        time = np.where(met == EVENT_BY_EVENT, rows[:, at.NEXT_TIME, pair], math.inf)
         hit = time < math.inf
         time = np.where(hit, time, FORECAST_S)
         steps = np.maximum(np.ceil(time / step_s) - 1, 0)
