@@ -32,7 +32,7 @@ from ethbrake_marl.worlds.game import AnyScenario, game_of
 from ethbrake_marl.worlds.roles import HOLDING_SCRIPTS, LEARNER, check_role
 from ethbrake_marl.worlds.scenario import Scenario
 
-NAME_PATTERN = re.compile(r"[a-z][a-z0-9_-]*(\.[a-z0-9_-]+)*")
+AGENT_NAME_PATTERN = re.compile(r"[a-z][a-z0-9_-]*(\.[a-z0-9_-]+)*")
 IN_FILE = re.compile(r"(?P<file>.+?\.py):(?P<name>[A-Za-z_]\w*)(:(?P<argument>[^@]+))?(@(?P<policy>.+))?")
 PLAIN = re.compile(r"(?P<name>[^:@+]*)(:(?P<argument>[^@]*))?(@(?P<policy>.*))?")
 
@@ -116,7 +116,7 @@ def register_shield(
 
 
 def _add(table: Registry[AgentEntry], name: str, make: Any, about: str, knows: str, form: str | None) -> None:
-    if not isinstance(name, str) or NAME_PATTERN.fullmatch(name) is None:
+    if not isinstance(name, str) or AGENT_NAME_PATTERN.fullmatch(name) is None:
         raise InvalidInput(
             f"{table.kind} {name!r:.80}: the name must have the characters a-z, 0-9, _ and -, beginning with a letter"
         )

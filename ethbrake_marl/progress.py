@@ -45,7 +45,7 @@ class Progress:
         return ", ".join(parts[:1])
 
     @staticmethod
-    def listener(on_progress: Told) -> OnProgress | None:
+    def listener(on_progress: ProgressOption) -> OnProgress | None:
         """Function to call with each ``Progress``, or None.
 
         ``on_progress`` is a function; or ``"show"``: print progress on stderr (if there is one); or None.
@@ -57,7 +57,7 @@ class Progress:
 
 OnProgress = Callable[[Progress], None]
 
-Told = OnProgress | Literal["show"] | None
+ProgressOption = OnProgress | Literal["show"] | None
 """Receiver of progress reports: a function, ``"show"`` for text on stderr, or None for no reports."""
 
 

@@ -57,7 +57,7 @@ def with_price(problem: Problem, price: float) -> Problem:
     """Return the problem that minimises total harm and the costs of a price."""
     passed, _, *others = COUNTS["honest"][2:] if price else np.zeros(4)
     COUNTS[f"a price of {price:g}"] = np.array([0.0, 1.0, passed, price, *others])
-    return problem.counting(f"a price of {price:g}")
+    return problem.with_count(f"a price of {price:g}")
 
 
 def costs_of(test: str) -> list[Cost]:

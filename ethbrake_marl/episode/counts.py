@@ -22,7 +22,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.compiling import kernel, large
 from ethbrake_marl.motion.layout import DROVE, FIRST, MOVING, PASSED, PUSHED, TOTAL, Floats
 
-ROWS = [FIRST, TOTAL, PASSED, PUSHED, DROVE, MOVING]  # rows of a line that can count
+COUNTED_ROWS = [FIRST, TOTAL, PASSED, PUSHED, DROVE, MOVING]  # rows of a line that can count
 OF_FIRST, OF_TOTAL, OF_PASSED, OF_PUSHED, OF_DROVE, OF_MOVING = range(6)  # places of their weights
 
 COUNTS = {  # name -> weights of these rows

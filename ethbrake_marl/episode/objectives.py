@@ -137,7 +137,7 @@ def _kind(name: str) -> Kind:
 @lru_cache(maxsize=256)
 def parse_objective(text: str) -> Objective:
     """Objective for a text such as ``own``, ``social:45`` or ``weighted:1,4,1``. Raises ``InvalidInput``."""
-    name, (_, colon, argument) = name_of(text), text.partition(":")
+    name, (_, colon, argument) = objective_name(text), text.partition(":")
     kind = OBJECTIVES[name]
     if name == "vehicle_K":
         if text == name:
@@ -169,7 +169,7 @@ def parse_objective(text: str) -> Objective:
 
 def _first_and_then(text: str, argument: str) -> tuple[Objective, ...]:
     texts = argument.split(",then:")
-    if len(texts) != 2 or not all(texts) or any(name_of(part) == "first" for part in texts):
+    if len(texts) != 2 or not all(texts) or any(objective_name(part) == "first" for part in texts):
         raise InvalidInput(
             f"objective {text!r}: first needs one objective, and then another one, as in first:vehicle_3,then:total;"
             " neither may contain first"
@@ -177,7 +177,7 @@ def _first_and_then(text: str, argument: str) -> tuple[Objective, ...]:
     return tuple(parse_objective(part) for part in texts)
 
 
-def name_of(text: str) -> str:
+def objective_name(text: str) -> str:
     """Name of the kind of objective: ``social`` for ``social:45``, ``vehicle_K`` for ``vehicle_3``."""
     return re.sub("vehicle_[1-9][0-9]?", "vehicle_K", text) if ":" not in text else text.partition(":")[0]
 

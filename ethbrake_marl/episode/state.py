@@ -39,7 +39,7 @@ END = 6  # time at which the last step ends (s): the horizon, or earlier after `
 FIRST_IN_LIST = -2  # NUMBER of world 0 of an evaluation list that a reset asked for; the next ones are -3, -4, ...
 CLOCK_COLUMNS = 7
 
-PHYSICS = "physics"  # a memory of this name marks worlds whose impacts are not exact (`State.is_exact`)
+PHYSICS_MARK = "physics"  # a memory of this name marks worlds whose impacts are not exact (`State.is_exact`)
 
 
 class State(NamedTuple):
@@ -210,7 +210,7 @@ class State(NamedTuple):
     @property
     def is_exact(self) -> bool:
         """Whether these worlds have exact impacts, and not another physics (key ``physics`` of a scenario)."""
-        return PHYSICS not in self.memories
+        return PHYSICS_MARK not in self.memories
 
     def _check_count(self, count: Count) -> None:
         if self.is_exact:

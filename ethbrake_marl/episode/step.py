@@ -30,7 +30,7 @@ from ethbrake_marl.motion.layout import (
 )
 
 # rows of `out`
-HARM = 0  # first-impact harm of the step (m2/s2)
+FIRST_HARM = 0  # first-impact harm of the step (m2/s2)
 TOTAL_HARM = 1  # harm of all impacts of the step (m2/s2)
 TERMINATED = 2  # 1 if all vehicles have come to rest
 TRUNCATED = 3  # 1 if the end of the last step has come first
@@ -75,7 +75,7 @@ class Step(NamedTuple):
     @property
     def first_impact_harm(self) -> Floats:
         """First-impact harm of the line in this step, [n] m2/s2."""
-        return self.out[HARM]
+        return self.out[FIRST_HARM]
 
     @property
     def total_harm(self) -> Floats:
@@ -160,13 +160,13 @@ def step_worlds(
         for p in range(bodies - 1):
             impacts += line[k, IMPACTS, p]
             if outcome == EVENT_BY_EVENT:
-                out[HARM, k] += scratch[NEW_FIRST, p]
+                out[FIRST_HARM, k] += scratch[NEW_FIRST, p]
                 out[TOTAL_HARM, k] += scratch[NEW_TOTAL, p]
         over = clock[k, ENDED] == 1.0
         out[TERMINATED, k] = 1.0 if at_rest else 0.0
         out[TRUNCATED, k] = 1.0 if over and not at_rest else 0.0
         out[SAFE_END, k] = 1.0 if over and impacts == 0.0 else 0.0
-        impact_harm = weights[OF_FIRST] * out[HARM, k] + weights[OF_TOTAL] * out[TOTAL_HARM, k]
+        impact_harm = weights[OF_FIRST] * out[FIRST_HARM, k] + weights[OF_TOTAL] * out[TOTAL_HARM, k]
         cost = impact_harm + (beside_harm(line[k], weights) - before)
         shared = (terminal if out[SAFE_END, k] == 1.0 else 0.0) - harm * cost
         out[COST, k] = cost

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.episode.counts import ROWS, pair_amounts
+from ethbrake_marl.episode.counts import COUNTED_ROWS, pair_amounts
 from ethbrake_marl.episode.functions import call_function, check_finite_values, description_of
 from ethbrake_marl.episode.hold import descend
 from ethbrake_marl.episode.objectives import Harm, Objective, amounts
@@ -166,7 +166,7 @@ def potential(settings: StepSettings, state: State) -> Floats:
     learners = settings.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
     line = state.line.copy()
-    line[:, ROWS] = 0.0
+    line[:, COUNTED_ROWS] = 0.0
     state = state._replace(line=line)
     _, least = descend(state, learners, BRAKING_SHARES, rounds, state.clock[:, END], settings.weights)
     least[state.ended] = 0.0

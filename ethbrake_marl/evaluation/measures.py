@@ -46,7 +46,7 @@ from ethbrake_marl.errors import EthBrakeError, InvalidInput, describe_error
 from ethbrake_marl.motion.layout import FIRST, IMPACTS
 
 MeasureValues = NDArray[Any]
-Given = MeasureValues | Mapping[str, MeasureValues] | None
+MeasureValue = MeasureValues | Mapping[str, MeasureValues] | None
 
 AT_REST, HORIZON = "at_rest", "horizon"  # how an episode ended
 
@@ -57,7 +57,7 @@ class Watch(Protocol):
     def see(self, before: State, step: Step | None, after: State) -> None:
         """Process one step. ``step`` is None from the alert to the first decision."""
 
-    def result(self, last: State) -> Given:
+    def result(self, last: State) -> MeasureValue:
         """Value, in the form that a measure returns."""
 
 
@@ -77,14 +77,14 @@ class Statistic(NamedTuple):
 
 class Measure(NamedTuple):
     name: str
-    of: Callable[[Game, State, State], Given] | None = None
+    of: Callable[[Game, State, State], MeasureValue] | None = None
     meaning: str = ""
     unit: str = "1"
     shown: tuple[Statistic, ...] = ()  # statistics of its columns; any other column has a mean or rate of its name
     watch: Callable[[Game, State], Watch | None] | None = None  # begins with (game, alert)
 
 
-def measure_columns(measure: Measure, measurement: Given, last: State) -> dict[str, MeasureValues]:
+def measure_columns(measure: Measure, measurement: MeasureValue, last: State) -> dict[str, MeasureValues]:
     """Columns of a measure, name -> [n], from its value ``measurement``.
 
     Raises ``InvalidInput`` for a wrong shape or type.
@@ -114,12 +114,12 @@ def measure_columns(measure: Measure, measurement: Given, last: State) -> dict[s
 # ---- built-in measures
 
 
-def collided(game: Game, alert: State, last: State) -> Given:
+def collided(game: Game, alert: State, last: State) -> MeasureValue:
     """Whether each world had an impact. The interval of the rate is Wilson's."""
     return last.collided
 
 
-def harm(count: str, game: Game, alert: State, last: State) -> Given:
+def harm(count: str, game: Game, alert: State, last: State) -> MeasureValue:
     """Harm of the line (ending ``""``) and of each vehicle (``1`` to ``N``), [n] each, in a count of harm.
 
     None for the honest cost if impacts are not exact.
@@ -130,34 +130,34 @@ def harm(count: str, game: Game, alert: State, last: State) -> Given:
     return {"": last.harm(count), **borne}
 
 
-def impacts(game: Game, alert: State, last: State) -> Given:
+def impacts(game: Game, alert: State, last: State) -> MeasureValue:
     """Number of impacts in each world, those with an obstacle included."""
     return np.asarray(last.line[:, IMPACTS].sum(axis=1), np.int64)
 
 
-def hardest_impact_mps(game: Game, alert: State, last: State) -> Given:
+def hardest_impact_mps(game: Game, alert: State, last: State) -> MeasureValue:
     """Largest closing speed of a pair's first impact in each world."""
     return np.asarray(np.sqrt(last.line[:, FIRST].max(axis=1)))
 
 
-def end_s(game: Game, alert: State, last: State) -> Given:
+def end_s(game: Game, alert: State, last: State) -> MeasureValue:
     """Time from the alert to the end of each episode."""
     return last.time_s
 
 
-def ended(game: Game, alert: State, last: State) -> Given:
+def ended(game: Game, alert: State, last: State) -> MeasureValue:
     """How each episode ended. at_rest: all vehicles stand; horizon: a vehicle still moves at the horizon."""
     return np.where(last.moving, HORIZON, AT_REST)
 
 
-def predicted_harm(game: Game, alert: State, last: State) -> Given:
+def predicted_harm(game: Game, alert: State, last: State) -> MeasureValue:
     """Harm that the only predicting agent or shield predicted at the alert, in the count that it minimises."""
     memories: list[Any] = [last.memories.get(who) for who in ("shield", *game.settings.learners.tolist())]
     predictions = [memory.predicted_harm for memory in memories if hasattr(memory, "predicted_harm")]
     return predictions[0] if len(predictions) == 1 and np.isfinite(predictions[0]).all() else None
 
 
-def replaced(game: Game, alert: State, last: State) -> Given:
+def replaced(game: Game, alert: State, last: State) -> MeasureValue:
     """actions: number the shield replaced; none: whether it replaced none, or let the policy drive (Algorithm 1)."""
     memory: Any = last.memories.get("shield")
     if hasattr(memory, "chosen"):
@@ -167,7 +167,7 @@ def replaced(game: Game, alert: State, last: State) -> Given:
     return None
 
 
-def _built_in(of: Callable[[Game, State, State], Given], unit: str, *statistics: Statistic) -> Measure:
+def _built_in(of: Callable[[Game, State, State], MeasureValue], unit: str, *statistics: Statistic) -> Measure:
     return Measure(of.__name__, of, of.__doc__ or "", unit, statistics)
 
 

@@ -16,13 +16,13 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
-from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, name_of, objectives_of
+from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objective_name, objectives_of
 from ethbrake_marl.episode.reward import RewardParams
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision, drove, jerk, push, risk
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
-from ethbrake_marl.evaluation.measures import DEFAULT, Given, Measure, Statistic, Watch
+from ethbrake_marl.evaluation.measures import DEFAULT, MeasureValue, Measure, Statistic, Watch
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part, Registry
@@ -30,7 +30,7 @@ from ethbrake_marl.registry import Part, Registry
 
 def register_measure(
     name: str,
-    of: Callable[[Game, State, State], Given] | None = None,
+    of: Callable[[Game, State, State], MeasureValue] | None = None,
     *,
     unit: str = "1",
     shown: Iterable[Statistic] = (),
@@ -62,7 +62,7 @@ def register_measure(
 
 def _check_measure(
     name: str,
-    of: Callable[[Game, State, State], Given] | None = None,
+    of: Callable[[Game, State, State], MeasureValue] | None = None,
     unit: str = "1",
     shown: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
@@ -153,7 +153,7 @@ def _measures_named(name: str) -> list[Measure]:
     file, _, measure_name = str(name).rpartition(":")
     if file.endswith(".py"):
         return [_of_file(file, measure_name)]
-    kind = name_of(str(name))
+    kind = objective_name(str(name))
     if kind in OBJECTIVES:
         meaning = f"What the vehicle would minimise: {OBJECTIVES[kind].about}."
         return [Measure(name, partial(_objective, name), meaning, "m2/s2")]
@@ -185,7 +185,7 @@ def _intervention(before: State, step: Step, after: State) -> Floats:
     return TERMS["intervention"].value(before, step, after)
 
 
-def _objective(name: str, game: Game, alert: State, last: State) -> Given:
+def _objective(name: str, game: Game, alert: State, last: State) -> MeasureValue:
     objectives = objectives_of(name, last.vehicles)
     counts = [count for count in COUNTS if count != "honest" or last.is_exact]
     values = {count: amounts(objectives, None, last, count) for count in counts}
@@ -205,5 +205,5 @@ class SummedTerm:
             ended = before.ended if value.ndim == 1 else before.ended[:, np.newaxis]
             self.sum = np.where(ended, 0.0, value) + (self.sum if self.sum.shape == value.shape else 0.0)
 
-    def result(self, last: State) -> Given:
+    def result(self, last: State) -> MeasureValue:
         return self.sum

@@ -7,7 +7,7 @@ import numpy as np
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import Step
-from ethbrake_marl.evaluation.measures import Given, Statistic
+from ethbrake_marl.evaluation.measures import MeasureValue, Statistic
 from ethbrake_marl.evaluation.resimulation import advance_worlds, simulate_again
 from ethbrake_marl.evaluation.summary_row import PUSHED_FAR_M
 from ethbrake_marl.motion.layout import FAR_M, GAP, IMPACTS, LATENCY, NEXT_TIME, PUSHED, Floats, scratch_for
@@ -55,7 +55,7 @@ class PushedAway:
         advance_worlds(line, before.car, *times, after.wanted, scratch_for(line.shape[2]))
         self.way_m += from_m - line[:, GAP, 0]
 
-    def result(self, last: State) -> Given:
+    def result(self, last: State) -> MeasureValue:
         """Distance of each vehicle (m), and whether that of Vehicle 1 is above ``PUSHED_FAR_M``."""
         wider_m = np.cumsum(last.gaps_m - self.gaps_m, axis=1)
         metres = {
@@ -73,7 +73,7 @@ def pushed_m(game: Game, alert: State) -> PushedAway | None:
     return PushedAway(bodies, game, alert) if bodies else None
 
 
-def pushed_mps(game: Game, alert: State, last: State) -> Given:
+def pushed_mps(game: Game, alert: State, last: State) -> MeasureValue:
     """Push: closing speed that vehicles build up and contacts take up, as long as a contact lasts and in the impacts
     after a pair's first. Of the whole line; with the number of a vehicle: by the vehicle behind it; obstacle: by
     Vehicle 1 against the obstacle.
@@ -117,7 +117,7 @@ class DroveTowards:
         self.driving_s += driving
         self.hard |= hard[:, self.learners - 1].any(axis=1)
 
-    def result(self, last: State) -> Given:
+    def result(self, last: State) -> MeasureValue:
         share = self.driving_s / np.where(self.time_s > 0.0, self.time_s, 1.0)[:, np.newaxis]
         shares = {f"{i + 1}": column for i, column in enumerate(share.T)}
         return {"": share[:, self.learners - 1].max(axis=1, initial=0.0), **shares, "hard": self.hard}
@@ -131,7 +131,7 @@ def drove_towards(game: Game, alert: State) -> DroveTowards:
     return DroveTowards(game, alert)
 
 
-def still_moving(game: Game, alert: State, last: State) -> Given:
+def still_moving(game: Game, alert: State, last: State) -> MeasureValue:
     """Whether a vehicle of each world still moves at the end, which is then at the horizon."""
     return last.moving
 

@@ -67,7 +67,7 @@ def shield(
     worlds: Any = getattr(base, "scenario", None) if scenario is None else load_scenario(scenario)
     if harm_count is None:
         harm_count = base.game.rewarding.params.harm_count if isinstance(base, Face) else "first"
-    around = partial(guarded, mode=mode, scenario=worlds, harm_count=harm_count, options=options)
+    around = partial(guard_team, mode=mode, scenario=worlds, harm_count=harm_count, options=options)
     if not is_agent and not isinstance(env, Team):
         return shielded_environment(env, base, policy, around, harm_count)
     team = team_of(env, worlds) if is_agent else env
@@ -76,7 +76,7 @@ def shield(
     return around(team)
 
 
-def guarded(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
+def guard_team(team: Team, mode: str, scenario: Scenario | None, harm_count: str, options: Mapping[str, Any]) -> Team:
     settings = AgentSettings(f"{team.name}+{mode}", None, scenario, harm_count, options)
     guarded_team = wrap_team(team, str(mode), settings)
     if guarded_team.shield is None:
@@ -102,15 +102,15 @@ def shielded_environment(env: Any, base: Any, policy: Any, around: Callable[[Tea
         raise InvalidInput("shield: this environment already has a shield")
     base._need_learner()
     if policy is None:
-        return playing(env, game._replace(shield=around(NO_TEAM).shield))
+        return with_game(env, game._replace(shield=around(NO_TEAM).shield))
     policy = LearnedAgent(policy) if isinstance(policy, Policy) else policy
     team = teams_of({"policy": policy}, base.scenario, harm_count=harm_count)["policy"]
     if team.shield is not None:
         raise InvalidInput(f"shield: policy {policy!r:.60} has a shield of its own; pass it without one")
-    return playing(env, around(team).game(game))
+    return with_game(env, around(team).game(game))
 
 
-def playing(env: Any, game: Game) -> Any:
+def with_game(env: Any, game: Game) -> Any:
     """Copy of an environment and its wrappers with another ``game``, without a running episode."""
     base = env.unwrapped
     instead = {id(base.game): game, id(base.scenario): base.scenario, id(base.episode): None, id(base.renderer): None}

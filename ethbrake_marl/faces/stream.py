@@ -51,7 +51,7 @@ class Stream(NamedTuple):
             chosen, first = [chosen_seed(row_seed) for row_seed in seed], np.zeros(n, np.int64)
         elif seed is not None or chosen is None:
             chosen, first = chosen_seed(seed), 0
-        option_worlds = self._asked_for(n, options)
+        option_worlds = self._worlds_of_options(n, options)
         worlds, after = (
             self._draw(np.arange(n), chosen, first) if option_worlds is None else (option_worlds[0].worlds, first)
         )
@@ -89,7 +89,7 @@ class Stream(NamedTuple):
         names = names_of_worlds(state, self.seeds_of(state))
         return {**columns, "world_seed": names["world_seed"], "world": names["world"]}
 
-    def _asked_for(self, n: int, options: Any) -> tuple[DrawnWorlds, int] | None:
+    def _worlds_of_options(self, n: int, options: Any) -> tuple[DrawnWorlds, int] | None:
         """Worlds that ``options`` of a reset specify, and their seed or -1; or None."""
         if options is None:
             return None

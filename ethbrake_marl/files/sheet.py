@@ -49,7 +49,7 @@ class Estimate:
         return cells
 
 
-class Shown(NamedTuple):
+class CellText(NamedTuple):
     """Text of a cell: the value, and the interval if it has one."""
 
     value: str  # the number with its unit, or the text
@@ -60,7 +60,7 @@ class Shown(NamedTuple):
         return f"{self.value} [{self.interval}]" if self.interval else self.value
 
 
-Cell = Estimate | Shown | float | int | str | None
+Cell = Estimate | CellText | float | int | str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,18 +81,18 @@ class Column:
     def name(self) -> str:
         return self.key or self.heading
 
-    def show(self, cell: Cell) -> Shown:
+    def show(self, cell: Cell) -> CellText:
         """Text of a cell; a dash for None."""
-        if cell is None or isinstance(cell, Shown):
-            return cell or Shown(DASH)
+        if cell is None or isinstance(cell, CellText):
+            return cell or CellText(DASH)
         if isinstance(cell, str | int):
-            return Shown(str(cell))
+            return CellText(str(cell))
         if not isinstance(cell, Estimate):
-            return Shown(self._number(cell) + self.unit)
+            return CellText(self._number(cell) + self.unit)
         ends = () if cell.interval is None else cell.interval
-        return Shown(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
+        return CellText(self._number(cell.value) + self.unit, ", ".join(map(self._number, ends)))
 
-    def in_terminal(self, cell: Shown) -> str:
+    def in_terminal(self, cell: CellText) -> str:
         """Text of a cell in a terminal. A second line (the interval) is shown dim."""
         if self.interval == "beside":
             return cell.in_words
@@ -138,7 +138,7 @@ class Sheet:
     def names(self) -> list[str]:
         return [column.name for column in self.formats]
 
-    def shown(self) -> Iterator[str | tuple[Shown, ...]]:
+    def shown(self) -> Iterator[str | tuple[CellText, ...]]:
         """Each row as formatted cells, and each section as its name."""
         columns = self.formats
         for row in self.rows:
@@ -146,7 +146,7 @@ class Sheet:
                 yield row
             else:
                 cells = [column.show(cell) for column, cell in zip(columns, row, strict=False)]
-                yield (*cells, *[Shown("")] * (len(columns) - len(cells)))
+                yield (*cells, *[CellText("")] * (len(columns) - len(cells)))
 
     def only(self, columns: Iterable[int]) -> Sheet:
         """Table with only the given columns (from 0)."""

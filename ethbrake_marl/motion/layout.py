@@ -84,11 +84,11 @@ REAR_CHANGE = 34  # the same at its rear (m/s)
 LAST_TIME = 35  # of the pair: time of its last impact in this interval (s from its start); infinite: none
 PART = 36  # of a part of a line: acceleration by own forces (m/s2)
 PART_RATE = 37  # its rate (m/s3)
-ROWS = 38
+SCRATCH_ROWS = 38
 
 FAR_M = 1e300  # gap ahead of a line without an obstacle
 
 
 def scratch_for(bodies: int) -> Floats:
     """Scratch memory for worlds of so many bodies."""
-    return np.zeros((ROWS, bodies))
+    return np.zeros((SCRATCH_ROWS, bodies))

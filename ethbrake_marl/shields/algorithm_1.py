@@ -23,7 +23,7 @@ from ethbrake_marl.episode.state import END, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.fallbacks import held, rollout
+from ethbrake_marl.shields.fallbacks import constant_plans, rollout
 from ethbrake_marl.shields.shield import NamedShield, check_drivers, check_harm_count, checked_drivers, spread
 
 ACTION_ROUNDING = 1e-6  # of an action in 32 bits; a proposal within it counts as the applied action
@@ -73,7 +73,7 @@ class EpisodeShield:
         worlds = alert._replace(wanted=state.wanted)
         choice = coupled(worlds, body, self.count, state.clock[:, END]) if self.coupled else pairwise(worlds, body)
         backup = actions_of(alert, body, -choice.deceleration_mps2)[:, np.newaxis]
-        held_back = held(game, backup)
+        held_back = constant_plans(game, backup)
         policy_state = state._replace(memories={**state.memories, body: remembered})
         policy_harm = price(game, state, rollout(game, self.drivers, policy_state, held_back, self.count), self.count)
         bound_harm = price(game, state, held_back, self.count) if self.coupled else choice.harm

@@ -42,10 +42,10 @@ def first_plans(game: Game, alert: State, state: State, count: str) -> list[Floa
     if len(learners) > 1:
         commands, _ = descend(state, learners.tolist(), BRAKE_SHARES, FALLBACK_ROUNDS, until_s, count)
         actions += [actions_of(alert, learners, commands[:, learners]), np.full((n, len(learners)), -1.0)]
-    return [held(game, action) for action in actions]
+    return [constant_plans(game, action) for action in actions]
 
 
-def held(game: Game, actions: Floats) -> Floats:
+def constant_plans(game: Game, actions: Floats) -> Floats:
     """Plans [n, T, L] that repeat the actions [n, L] up to the horizon."""
     decisions = int(np.ceil(game.settings.horizon_s / game.settings.time_step_s)) + 1
     return np.repeat(actions[:, np.newaxis], decisions, axis=1)

@@ -185,7 +185,7 @@ class StepShield:
         self, game: Game, state: State, proposed: Floats | None, *, donate: bool
     ) -> tuple[Floats, StepShieldMemory]:
         memory: StepShieldMemory = state.memories["shield"]
-        proposed, state = self.asked(game, state, proposed)
+        proposed, state = self.collect_proposals(game, state, proposed)
         if not donate:
             memory = memory._replace(plan=memory.plan.copy(), price=memory.price.copy())
         worlds, now = np.arange(state.n), np.minimum(state.steps, memory.plan.shape[1] - 1)
@@ -219,7 +219,7 @@ class StepShield:
             reason=np.where(running, reason, ENDED), margin=margin,
         )  # fmt: skip
 
-    def asked(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
+    def collect_proposals(self, game: Game, state: State, proposed: Floats | None) -> tuple[Floats, State]:
         """Proposals [n, L], NaN for none, and the state with the new memories of the shield's agents.
 
         The agents propose where nobody else does. An agent with a memory is asked at every decision, so it stays up to

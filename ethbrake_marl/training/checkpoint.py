@@ -25,7 +25,7 @@ from ethbrake_marl.files.store import write_file
 
 COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining", "_total_timesteps")
 REPLAY = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-KEYS = {"training", "versions", "steps", "course", "model"}  # of a checkpoint
+CHECKPOINT_KEYS = {"training", "versions", "steps", "course", "model"}  # of a checkpoint
 MOST_CHECKPOINTS = 2  # checkpoints that are kept; if the newest is damaged, training resumes from the one before
 LARGEST_BYTES = 1 << 36
 
@@ -141,7 +141,7 @@ def read(path: Path) -> dict[str, Any]:
             saved = torch.load(stream, weights_only=True)
         except Exception as error:  # zipfile and torch raise many kinds for a file that is not theirs
             raise CorruptBundle(f"{path}: is damaged ({' '.join(str(error).split()):.200})") from None
-    if damaged or not isinstance(saved, dict) or saved.keys() != KEYS:
+    if damaged or not isinstance(saved, dict) or saved.keys() != CHECKPOINT_KEYS:
         raise CorruptBundle(f"{path}: is damaged, or not a checkpoint")
     return saved
 

@@ -21,7 +21,7 @@ from ethbrake_marl.files.plain import read_object
 from ethbrake_marl.names import check_path, open_game
 from ethbrake_marl.policies.manifest import installed_versions
 from ethbrake_marl.policies.policy import Policy
-from ethbrake_marl.progress import Progress, Told
+from ethbrake_marl.progress import Progress, ProgressOption
 from ethbrake_marl.registry import versions_used
 from ethbrake_marl.stopping import stop_on_signal
 from ethbrake_marl.training import checkpoint
@@ -93,7 +93,7 @@ def train(
     force: bool = False,
     settings: Sequence[str] = (),
     measure: PolicyMeasure | None = measure_on_list,
-    on_progress: Told = "show",
+    on_progress: ProgressOption = "show",
 ) -> TrainResult:
     """Train the learners of a scenario, and write the folder of the run.
 
@@ -138,7 +138,7 @@ def resume(
     directory: str | Path,
     *,
     measure: PolicyMeasure | None = measure_on_list,
-    on_progress: Told = "show",
+    on_progress: ProgressOption = "show",
     other_versions: bool = False,
 ) -> TrainResult:
     """Continue a stopped or killed training from its newest checkpoint, or from the beginning if there is none.

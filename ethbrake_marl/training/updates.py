@@ -110,7 +110,7 @@ class BetweenUpdates(BaseCallback):
     def keep_weights(self) -> None:
         """Copy the current weights. Raises ``TrainingDiverged``."""
         check_finite_model(self.model)
-        self.weights = weights_of(self.training, self.model)
+        self.weights = policy_weights(self.training, self.model)
         self.steps, self.updates = self.model.num_timesteps, self.count
 
     def make_policies(self) -> None:
@@ -223,7 +223,7 @@ def check_finite_model(model: BaseAlgorithm) -> None:
         )
 
 
-def weights_of(training: Training, model: BaseAlgorithm) -> list[dict[str, Float32s]]:
+def policy_weights(training: Training, model: BaseAlgorithm) -> list[dict[str, Float32s]]:
     """Copy of the weights of each group's policy."""
     algorithm = algorithm_of(training.recipe)
     return [algorithm.tensors(*pair) for pair in zip(algorithm.actors(model), training.networks, strict=True)]

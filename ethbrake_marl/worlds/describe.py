@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ethbrake_marl.episode.state import NUMBER, State
 from ethbrake_marl.motion.layout import Floats
-from ethbrake_marl.worlds.quantities import CAR_ROWS, QUANTITIES, RECORDING, USUAL
+from ethbrake_marl.worlds.quantities import CAR_QUANTITIES, QUANTITIES, RECORDING, USUAL
 from ethbrake_marl.worlds.sampling import DrawnWorlds, Texts
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
     weights if some world has them. A missing obstacle is NaN; an infinite rate becomes the largest valid number.
     """
     values = {"gaps_m": worlds.gaps_m, "speeds_mps": worlds.speeds_mps}
-    values |= {key: worlds.car[:, row, 1:] for key, row in CAR_ROWS.items()}
+    values |= {key: worlds.car[:, row, 1:] for key, row in CAR_QUANTITIES.items()}
     gap = worlds.obstacle_gap_m[:, np.newaxis]
     values["obstacle_gap_m"] = np.where(np.isfinite(gap), gap, np.nan)
     values["friction"] = np.broadcast_to(friction, worlds.n)[:, np.newaxis]
@@ -51,7 +51,7 @@ def quantities_of(worlds: State, friction: Floats | float = np.nan) -> dict[str,
 
 def fixed_columns(scenario: Scenario) -> set[str]:
     """Columns of ``quantities_of`` that are equal in all worlds, apart from gaps and speeds."""
-    keys = [key for key in CAR_ROWS if key in USUAL or key in scenario.sources]
+    keys = [key for key in CAR_QUANTITIES if key in USUAL or key in scenario.sources]
     ends = {QUANTITIES[key].column_of(i): bounds for key in keys for i, bounds in enumerate(scenario.bounds(key))}
     return {name for name, (low, high) in ends.items() if low == high}
 

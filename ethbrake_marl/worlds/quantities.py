@@ -193,7 +193,7 @@ ALTERNATIVES = {"gaps_m": "time_gaps_s", "speeds_mps": "line_speed_mps", "obstac
 WITHOUT_DEFAULT = ("braking_capacity_mps2", "driving_capacity_mps2", "mass_t", "latency_s")  # have no default
 OF_A_TYPE = (*WITHOUT_DEFAULT, "speed_limit_mps", "brake_rate_mps3", "release_rate_mps3")  # keys of a vehicle type
 
-CAR_ROWS = {
+CAR_QUANTITIES = {
     "mass_t": MASS,
     "speed_limit_mps": LIMIT,
     "latency_s": LATENCY,
@@ -211,7 +211,7 @@ def stream_width(stream: tuple[int, ...], vehicles: int) -> int:
     return NUMBERS_PER_VEHICLE * vehicles if stream in (MAIN, BRAKES) else OF_WORLD
 
 
-def check_count(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
+def check_length(value: Any, count: int, per: str, at: YamlPath = ()) -> None:
     right = f"must have {count}, one per {per}, or be a single entry for all"
     holds = not isinstance(value, tuple) or len(value) == count
     require(holds, at, UNSHOWN, f"has {len(value) if isinstance(value, tuple) else 1} entries; {right}")

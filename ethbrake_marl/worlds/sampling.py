@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.episode.state import PHYSICS, State
+from ethbrake_marl.episode.state import PHYSICS_MARK, State
 from ethbrake_marl.episode.step import StepSettings, at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion import layout
@@ -18,7 +18,7 @@ from ethbrake_marl.worlds.channel import PER_LINK
 from ethbrake_marl.worlds.counters import Numbers, Purpose, uniform_numbers, world_numbers
 from ethbrake_marl.worlds.derived import QuantityValues, obstacle_gap, world_values
 from ethbrake_marl.worlds.quantities import (
-    CAR_ROWS,
+    CAR_QUANTITIES,
     MIXTURE,
     NEWS,
     OF_WORLD,
@@ -134,7 +134,7 @@ def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, u
     if scenario.v2x.by_link:
         latency, reaction_time = scenario.v2x.news(latency, numbers(PER_LINK * N * N, NEWS), unheard)
     obstacle = quantities.get("obstacle_gap_m", np.full((n, 1), FAR_M))
-    of_car = [(row, quantities[key]) for key, row in CAR_ROWS.items() if key in quantities and row != LATENCY]
+    of_car = [(row, quantities[key]) for key, row in CAR_QUANTITIES.items() if key in quantities and row != LATENCY]
     of_car += [(LATENCY, latency), (layout.OWN_LATENCY, quantities["latency_s"])]
     for first in range(0, n, IN_CACHE):
         rows = slice(first, first + IN_CACHE)
@@ -151,7 +151,7 @@ def state_of(scenario: Scenario, quantities: QuantityValues, numbers: Numbers, u
         extension.name: extension.at_alert(scenario, numbers, unheard, n) for extension in scenario.v2x.extensions
     }
     if scenario.physics is not None:
-        memories[PHYSICS] = None  # a mark
+        memories[PHYSICS_MARK] = None  # a mark
     return at_alert(line, car, know, wanted, index)._replace(memories=memories)
 
 

@@ -36,7 +36,7 @@ from ethbrake_marl.worlds.checks import ScenarioWording, check_scenario
 from ethbrake_marl.worlds.counters import Purpose
 from ethbrake_marl.worlds.derived import world_values
 from ethbrake_marl.worlds.mixture import DESCRIPTIVE_KEYS, changed_content, with_members
-from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_count, table_columns
+from ethbrake_marl.worlds.quantities import OF_A_TYPE, OPTIONAL, QUANTITIES, USUAL, check_length, table_columns
 from ethbrake_marl.worlds.quantity import PerVehicle, Quantity, ScenarioPart, Weight, support
 from ethbrake_marl.worlds.roles import LEARNER, Roles, check_role, check_vehicle, names_of
 from ethbrake_marl.worlds.sampling import DrawnWorlds, draw_worlds
@@ -201,7 +201,7 @@ class Scenario(ScenarioPart):
     def _entries(cls, value: Any, info: ValidationInfo) -> Any:
         rule = QUANTITIES[str(info.field_name)]
         if "vehicles" in info.data:
-            check_count(value, rule.count(info.data["vehicles"]), rule.per)
+            check_length(value, rule.count(info.data["vehicles"]), rule.per)
         is_list = isinstance(value, tuple)
         for index, entry in enumerate(value if is_list else (value,)):
             rule.check(entry, (index,) if is_list else ())

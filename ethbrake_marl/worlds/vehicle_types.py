@@ -16,7 +16,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationInfo, 
 from ethbrake_marl.files.model import NAME_PATTERN, UNSHOWN, require, suggestion
 from ethbrake_marl.motion.layout import Bools, Floats, Ints
 from ethbrake_marl.worlds.channel import Equipage
-from ethbrake_marl.worlds.quantities import OF_A_TYPE, QUANTITIES, USUAL, check_count
+from ethbrake_marl.worlds.quantities import OF_A_TYPE, QUANTITIES, USUAL, check_length
 from ethbrake_marl.worlds.quantity import (
     ONE_OR_EACH,
     Pair,
@@ -121,7 +121,7 @@ Types = Annotated[
 def check_types(types: Any, kinds: Mapping[str, VehicleType] | None, vehicles: int) -> None:
     right = "can be used only with the key vehicle_types, which declares the types"
     require(kinds is not None, ("types",), types, right)
-    check_count(types, vehicles, "vehicle", ("types",))
+    check_length(types, vehicles, "vehicle", ("types",))
     known, is_list = [*(kinds or {}), ANY_TYPE], isinstance(types, tuple)
     for index, entry in enumerate(types if is_list else (types,)):
         for name in [entry] if isinstance(entry, str) else entry:

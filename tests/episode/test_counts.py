@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.episode.counts import COUNTS, ROWS, pair_amounts
+from ethbrake_marl.episode.counts import COUNTS, COUNTED_ROWS, pair_amounts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.objectives import amounts, objectives_of
@@ -71,7 +71,7 @@ def test_push__of_a_pressed_pair_costs_10_m2_s2_for_each_m_per_s() -> None:
 
 def test_amounts__of_pairs_and_worlds_have_the_weights_of_the_count() -> None:
     state = state_of([5.0, 5.0], [1.0, 1.0, 1.0])
-    state.line[0, ROWS] = np.arange(1.0, 7.0)[:, np.newaxis] * [1.0, 10.0, 100.0, 0.0]
+    state.line[0, COUNTED_ROWS] = np.arange(1.0, 7.0)[:, np.newaxis] * [1.0, 10.0, 100.0, 0.0]
     for count, weight in (("first", 1.0), ("total", 2.0), ("honest", 2.0 + 3.0 + 40.0 + 50.0 + 6.0)):
         assert pair_amounts(state.line, count)[0, 0].tolist() == [weight, 10.0 * weight, 100.0 * weight, 0.0]
         assert state.harm(count).tolist() == [111.0 * weight]

@@ -48,7 +48,7 @@ def driven(line: Floats, car: Floats, command: Any, start: Any, until: Any) -> t
     n, bodies = len(line), line.shape[2]
     wanted, after, met, scratch = np.zeros((n, bodies)), line.copy(), np.zeros(n, np.int64), scratch_for(bodies)
     wanted[:, 1:] = command
-    rows = np.zeros((n, at.ROWS, bodies))
+    rows = np.zeros((n, at.SCRATCH_ROWS, bodies))
     times = np.broadcast_to(np.float64(start), n).tolist(), np.broadcast_to(np.float64(until), n).tolist()
     for k in range(n):
         met[k] = move_line(after[k], car[k], wanted[k], scratch, times[0][k], times[1][k])

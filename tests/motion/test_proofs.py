@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.motion import contact as contacts, forces, impact, interval
-from ethbrake_marl.motion.layout import CAR_ROWS, CLOSING, LINE_ROWS, MASS, RESTITUTION, ROWS, SPEED
+from ethbrake_marl.motion.layout import CAR_ROWS, CLOSING, LINE_ROWS, MASS, RESTITUTION, SCRATCH_ROWS, SPEED
 
 z3 = pytest.importorskip("z3")
 pytestmark = pytest.mark.nightly
@@ -258,7 +258,7 @@ def _cluster(vehicles: int, closing: float) -> tuple[list[Symbol], list[Symbol],
     known = [exact(m) > 0 for m in mass] + [exact(restitution) >= 0, exact(restitution) <= 1]
 
     def resolve() -> list[Symbol]:
-        line, car, scratch = (np.zeros((n, vehicles), dtype=object) for n in (LINE_ROWS, CAR_ROWS, ROWS))
+        line, car, scratch = (np.zeros((n, vehicles), dtype=object) for n in (LINE_ROWS, CAR_ROWS, SCRATCH_ROWS))
         car[MASS], car[RESTITUTION], line[SPEED] = mass, restitution, speed
         scratch[CLOSING, : vehicles - 1] = closing
         impact.resolve_cluster(line, car, scratch, 0, vehicles - 1)

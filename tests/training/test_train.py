@@ -42,7 +42,7 @@ from ethbrake_marl.training.recipe import (
 from ethbrake_marl.training.run import RunFolder
 from ethbrake_marl.training.train import make_environment, make_model, train
 from ethbrake_marl.training.training import Training
-from ethbrake_marl.training.updates import TrainingDiverged, make_policies, weights_of
+from ethbrake_marl.training.updates import TrainingDiverged, make_policies, policy_weights
 from tests.refused import refused
 from tests.training.tiny import PAIR, TINY, TINY_SAC, TRAININGS, UPDATE, begin, dying_after, go_on, kept, killed
 
@@ -431,7 +431,7 @@ def test_policy__acts_as_the_model_does_without_exploration(name: str) -> None:
     training = Training.of(*TRAININGS[name])
     environment = make_environment(training)
     model = make_model(training, environment)
-    policies = make_policies(training, 5, weights_of(training, model))
+    policies = make_policies(training, 5, policy_weights(training, model))
     seen = environment.reset()
     expected, _ = model.predict(seen, deterministic=True)
     for place, learner in enumerate(training.learners):

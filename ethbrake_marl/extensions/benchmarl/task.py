@@ -16,7 +16,7 @@ from ethbrake_marl.episode.full_state import full_state, state_features
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, naming_extras
 from ethbrake_marl.faces.rendering import RENDERERS, make_renderer
-from ethbrake_marl.faces.shield import NO_TEAM, guarded
+from ethbrake_marl.faces.shield import NO_TEAM, guard_team
 from ethbrake_marl.faces.spaces import action_space, checked_actions, feature_box
 from ethbrake_marl.faces.stream import Stream, chosen_seed
 from ethbrake_marl.names import open_game
@@ -75,7 +75,7 @@ class LineEnv(EnvBase):  # type: ignore[misc]  # EnvBase has no types if the ext
                 " must have one or more learners, which all observe the same features"
             )
         if shield is not None:
-            game = game._replace(shield=guarded(NO_TEAM, shield, loaded, "first", {}).shield)
+            game = game._replace(shield=guard_team(NO_TEAM, shield, loaded, "first", {}).shield)
         self.game = game
         self.stream = Stream(loaded, self.game, chosen_seed(seed))
         rows = n, len(self.learners)

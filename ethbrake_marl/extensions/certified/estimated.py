@@ -172,7 +172,7 @@ class MedianLine(NamedTuple):
         located[:, 0] = False
         return News(pieces, sample, located, np.where(located, sample[:, AT], 0.0))
 
-    def heard(self, state: State, median: State) -> tuple[State, Bools]:
+    def corrected(self, state: State, median: State) -> tuple[State, Bools]:
         """Median lines after news, and whether they had foretold it, [n].
 
         ``state``: the truth now. ``median``: the lines now; they are corrected where they are contradicted.
@@ -180,7 +180,7 @@ class MedianLine(NamedTuple):
         foretold = self.agrees(state, median)
         rows = (~foretold).nonzero()[0]
         if len(rows):
-            median = median.put(rows, self.overwritten(state.take(rows), median.take(rows)))
+            median = median.put(rows, self.with_received(state.take(rows), median.take(rows)))
         return median, foretold
 
     def agrees(self, state: State, median: State) -> Bools:
@@ -189,12 +189,12 @@ class MedianLine(NamedTuple):
         ``state``: the truth now.
         """
         news = self.received(state)
-        far = np.abs(self.told(median, self.received(median).sample) - self.told(state, news.sample)) > SURPRISE
+        far = np.abs(self.message_contents(median, self.received(median).sample) - self.message_contents(state, news.sample)) > SURPRISE
         impacts = slice(self.body - 1, self.body + 1)
         struck = median.line[:, HIT, impacts] != state.line[:, HIT, impacts]
         return np.asarray(~((far & news.pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
 
-    def told(self, state: State, sample: Floats) -> Floats:
+    def message_contents(self, state: State, sample: Floats) -> Floats:
         """What a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
 
         ``sample``: as in ``News``. A place is the distance (m) from this vehicle.
@@ -205,7 +205,7 @@ class MedianLine(NamedTuple):
         motion = np.stack([sample[:, PLACE] - ego_place, sample[:, SAMPLE_SPEED], sample[:, SAMPLE_FORCE]], axis=1)
         return np.concatenate([motion, car], axis=1).transpose(0, 2, 1)
 
-    def overwritten(self, state: State, median: State) -> State:
+    def with_received(self, state: State, median: State) -> State:
         """Median lines with received values in place of assumed ones; ``state`` is the truth now.
 
         A received place and speed are moved on to the present by the sender's script, without contact. A sender that

@@ -54,7 +54,7 @@ class EstimatedShield(StepShield):
         self.line = line_of_learner(scenario)
 
     def begin(self, game: Game, alert: State, state: State) -> StepShieldMemory:
-        median, trusted = self.line.heard(state, reset_without_shield(game, self.line.at_alert(alert, state)))
+        median, trusted = self.line.corrected(state, reset_without_shield(game, self.line.at_alert(alert, state)))
         memory = self.first_memory(game, median, median, median, self.agents_at(game, alert))
         return memory._replace(members=MedianMemory(median, trusted))
 
@@ -62,11 +62,11 @@ class EstimatedShield(StepShield):
         self, game: Game, state: State, proposed: Floats | None, *, donate: bool
     ) -> tuple[Floats, StepShieldMemory]:
         memory: StepShieldMemory = state.memories["shield"]
-        median, foretold = self.line.heard(state, memory.members.median)
+        median, foretold = self.line.corrected(state, memory.members.median)
         foretold |= state.ended
         rows = (~foretold).nonzero()[0]
         if len(rows):
-            memory = self.planned_again(game, memory, median.take(rows), rows)
+            memory = self.plan_again(game, memory, median.take(rows), rows)
         memory = memory._replace(members=MedianMemory(median, memory.members.trusted & foretold))
         state = state._replace(memories={**state.memories, "shield": memory})
         applied, memory = super().decide(game, state, proposed, donate=donate)
@@ -82,7 +82,7 @@ class EstimatedShield(StepShield):
     def rolled_out(self, game: Game, state: State, plans: Floats, most: Any = np.inf) -> Floats:
         return super().rolled_out(*without_channel(game, state), plans, most)
 
-    def planned_again(self, game: Game, memory: StepShieldMemory, median: State, rows: Ints) -> StepShieldMemory:
+    def plan_again(self, game: Game, memory: StepShieldMemory, median: State, rows: Ints) -> StepShieldMemory:
         """In the worlds ``rows``, replace the plan in ``memory`` by the cheapest of itself and newly made plans."""
         plan, price = memory.plan.copy(), memory.price.copy()
         plan[rows], price[rows] = self.cheapest(game, median, [plan[rows], *self.plans(game, median, median, median)])
@@ -113,7 +113,7 @@ class EstimatedEpisodeShield(EpisodeShield):
         self.line = line_of_learner(scenario)
 
     def begin(self, game: Game, alert: State, state: State) -> EpisodeMemory:
-        median, _ = self.line.heard(state, reset_without_shield(game, self.line.at_alert(alert, state)))
+        median, _ = self.line.corrected(state, reset_without_shield(game, self.line.at_alert(alert, state)))
         game, median = without_channel(game, median)
         return super().begin(game, median, median)
 
@@ -147,7 +147,7 @@ class EstimatedEV2XBM:
         wanted = memory.median.wanted.copy()
         wanted[:, body] = state.wanted[:, body]
         foretold = hold_commands(memory.median._replace(wanted=wanted), state.time_s)
-        median, command = self.lines[body].overwritten(state, foretold), memory.command.copy()
+        median, command = self.lines[body].with_received(state, foretold), memory.command.copy()
         rows = (differ(foretold, median) | np.isnan(command)).nonzero()[0]
         if len(rows):
             here = median.take(rows)

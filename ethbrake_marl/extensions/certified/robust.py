@@ -21,7 +21,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
 from ethbrake_marl.motion.layout import BRAKING, GAP, IMPACTS, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
-from ethbrake_marl.shields.fallbacks import held
+from ethbrake_marl.shields.fallbacks import constant_plans
 from ethbrake_marl.shields.shield import NamedShield
 from ethbrake_marl.shields.step import StepShield, StepShieldMemory
 
@@ -103,7 +103,7 @@ class RobustShield(StepShield):
         commands = actions * states.car[:, np.newaxis, BRAKING, learners]
         harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.count)[0]
         best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
-        return [*plans, held(game, actions[best])]
+        return [*plans, constant_plans(game, actions[best])]
 
     def decide(
         self, game: Game, state: State, proposed: Floats | None, *, donate: bool

@@ -27,7 +27,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.evaluate import evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
-from ethbrake_marl.evaluation.measures import Given, Measure
+from ethbrake_marl.evaluation.measures import MeasureValue, Measure
 from ethbrake_marl.evaluation.statistics import Clusters
 from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds
 from ethbrake_marl.extensions.search.best_harm import search_list
@@ -179,7 +179,7 @@ def driven(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs:
     )
 
 
-def minimised_amount(declared: Declared, count: str, game: Game, alert: State, last: State) -> Given:
+def minimised_amount(declared: Declared, count: str, game: Game, alert: State, last: State) -> MeasureValue:
     """What the training minimises, as a mean over the learners, [n]: the objective ``declared`` in ``count``.
 
     A measure, once the first two arguments are given; ``alert`` is unused.

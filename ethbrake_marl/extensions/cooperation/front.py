@@ -34,7 +34,7 @@ MOST_CHOICES = 1_000  # choices of weights in a grid
 SLIGHT = 1e-4  # weight of the other vehicles in a corner; their harm decides between equal choices
 FIRST_SHARE = 0.6  # of the budget; the second round starts from the best results of all choices of weights
 
-Borne = Mapping[str, Floats]  # count of harm -> harm that each vehicle bears
+BorneHarm = Mapping[str, Floats]  # count of harm -> harm that each vehicle bears
 OnSearch = Callable[[int, int], None]  # called with the number of finished searches and of all
 
 
@@ -43,8 +43,8 @@ class Front(NamedTuple):
 
     weights: Floats  # [W, N] weights of the vehicles' harm
     harm_count: str  # count that is weighted (``episode.counts``)
-    borne: Borne  # [W, n, N] m2/s2 by count
-    agents: Mapping[str, Borne]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
+    borne: BorneHarm  # [W, n, N] m2/s2 by count
+    agents: Mapping[str, BorneHarm]  # agent -> harm of each vehicle if it drives, [W, n, N] m2/s2 by count
 
     @property
     def amounts(self) -> Floats:
@@ -182,7 +182,7 @@ def search_front(
     return Front(weights, count, borne, {name: _join_chunks([driven[name] for _, driven in parts]) for name in agents})
 
 
-def _join_chunks(parts: Sequence[Borne]) -> Borne:
+def _join_chunks(parts: Sequence[BorneHarm]) -> BorneHarm:
     return {count: np.concatenate([part[count] for part in parts], axis=1) for count in COUNTS}
 
 
@@ -208,7 +208,7 @@ class Drivers(NamedTuple):
 
 def _search_chunk(
     drivers: Drivers, worlds: State, weights: Floats, count: str, effort: Mapping[str, int], tell: Callable[[int], None]
-) -> tuple[ProfilePool, dict[str, Borne]]:
+) -> tuple[ProfilePool, dict[str, BorneHarm]]:
     """All profiles that were found in some worlds, and the harm of each vehicle if agents drive."""
     pool = ProfilePool(problem_of(drivers.game, worlds, count=count), count)
     driven, problem = _try_known_commands(pool, worlds, weights, drivers.preferring), pool.problem
@@ -222,7 +222,7 @@ def _search_chunk(
     for k, share in enumerate((FIRST_SHARE, 1.0 - FIRST_SHARE)):
         spent = {**effort, "budget": max(int(share * effort["budget"]), 1)}
         for row_starts, row in zip(starts, weights, strict=True):
-            aim = problem.minimising(row / row.sum())
+            aim = problem.with_weights(row / row.sum())
             pool.add(search_profiles(aim, [pool.best(row), *(row_starts if k == 0 else ())], **spent)[0])
             tell(problem.n)
     return pool, driven
@@ -230,14 +230,14 @@ def _search_chunk(
 
 def _try_known_commands(
     pool: ProfilePool, worlds: State, weights: Floats, preferring: Sequence[tuple[Game, Mapping[str, Team]]]
-) -> dict[str, Borne]:
+) -> dict[str, BorneHarm]:
     """Add constant commands, the shipped profiles and those of agents; return the harm if the agents drive."""
     problem = pool.problem
     constants = problem.constant(problem.even_grid(FRONT_CONSTANTS))
     for q in range(FRONT_CONSTANTS):
         pool.add(constants.take(slice(q, None, FRONT_CONSTANTS)))
     pool.add(best_stored(problem, pool.count)[1])
-    driven: dict[str, list[Borne]] = {name: [] for name in preferring[0][1]}
+    driven: dict[str, list[BorneHarm]] = {name: [] for name in preferring[0][1]}
     for row, (game, teams) in zip(weights, preferring, strict=True):
         car = worlds.car.copy()
         car[:, WEIGHT, 1:] = row
@@ -268,7 +268,7 @@ class ProfilePool:
         self.profiles: list[Profiles] = []
         self.borne: dict[str, list[Floats]] = {harm_count: [] for harm_count in COUNTS}
 
-    def add(self, profiles: Profiles) -> Borne:
+    def add(self, profiles: Profiles) -> BorneHarm:
         self.profiles.append(profiles)
         last = self.problem.follow(profiles)
         for count, harms in self.borne.items():
@@ -285,11 +285,11 @@ class ProfilePool:
     def best(self, weights: Floats) -> Profiles:
         chosen, rows = self.choice(weights), np.arange(self.problem.n)
         numbers = np.unique(chosen)
-        ends, commands = zip(*Profiles.padded([self.profiles[k] for k in numbers]), strict=True)
+        ends, commands = zip(*Profiles.pad([self.profiles[k] for k in numbers]), strict=True)
         place = np.searchsorted(numbers, chosen)
         return Profiles(np.stack(ends)[place, rows], np.stack(commands)[place, rows])
 
-    def least(self, weights: Floats) -> Borne:
+    def least(self, weights: Floats) -> BorneHarm:
         """Each vehicle's harm under the best profiles for all ``weights`` [W, N]: count -> [W, n, N]."""
         chosen, rows = [self.choice(row) for row in weights], np.arange(self.problem.n)
         return {count: np.stack([np.stack(harms)[k, rows] for k in chosen]) for count, harms in self.borne.items()}
@@ -297,7 +297,7 @@ class ProfilePool:
 
 def least_largest(
     scenario: Scenario, worlds: State, front: Front, *, budget: int = FRONT_BUDGET, threads: int = 1
-) -> Borne:
+) -> BorneHarm:
     """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm.
 
     It is count -> [n, N] m2/s2. The largest harm is at most that under any profile of ``front``, which was searched in

@@ -17,7 +17,7 @@ from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import by_recording
 from ethbrake_marl.evaluation.identity import about_scenario, versions, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
-from ethbrake_marl.extensions.cooperation.front import Borne, Front, weighted_harm
+from ethbrake_marl.extensions.cooperation.front import BorneHarm, Front, weighted_harm
 from ethbrake_marl.extensions.report.style import (
     TITLES,
     finish,
@@ -44,7 +44,7 @@ Json = dict[str, Any]
 
 
 def front_results(
-    front: Front, scenario: Scenario, drawn_worlds: DrawnWorlds, beside: Mapping[str, Borne], seed: int | None
+    front: Front, scenario: Scenario, drawn_worlds: DrawnWorlds, beside: Mapping[str, BorneHarm], seed: int | None
 ) -> Json:
     """Content of ``front.json``: the front, full braking, maximin, and the agents.
 
@@ -71,7 +71,7 @@ def front_results(
     }
 
 
-def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
+def _points(front: Front, borne: BorneHarm, by: Clusters) -> list[Json]:
     points = []
     for k, (weights, least) in enumerate(zip(front.weights, front.amounts, strict=True)):
         harm = borne[front.harm_count][k]
@@ -87,7 +87,7 @@ def _points(front: Front, borne: Borne, by: Clusters) -> list[Json]:
     return points
 
 
-def _vehicles(borne: Borne, by: Clusters) -> dict[str, list[Json]]:
+def _vehicles(borne: BorneHarm, by: Clusters) -> dict[str, list[Json]]:
     return {count: [mean(harm, by).to_json() for harm in borne[count].T] for count in COUNTS}
 
 
@@ -142,7 +142,7 @@ def hypervolume(points: Floats, reference: Floats) -> float:
     return sum(float(height) * hypervolume(below, reference[:-1]) for height, below in slices if height > 0.0)
 
 
-def full_braking(scenario: Scenario, drawn_worlds: DrawnWorlds) -> Borne:
+def full_braking(scenario: Scenario, drawn_worlds: DrawnWorlds) -> BorneHarm:
     game = open_game(scenario)[1]
     last = drive(game, drawn_worlds.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
     return {count: last.borne_harm(count) for count in COUNTS}

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.extensions.cuda.kernels import Mine, play_each
+from ethbrake_marl.extensions.cuda.kernels import ThreadMemory, play_each
 from ethbrake_marl.extensions.cuda.machine_code import ptx_of
 
 OLDEST = (7, 0)  # compute capability that torch supports, and with it this package
@@ -23,7 +23,7 @@ class Kernel(NamedTuple):
     """``kernels.play_world`` for n worlds, one thread for each: its GPU form and its processor form."""
 
     size: tuple[int, ...]  # bodies, learners, features, neighbours in view
-    mine: Mine  # memory of one thread, arrays
+    mine: ThreadMemory  # memory of one thread, arrays
 
     @property
     def name(self) -> str:
@@ -33,7 +33,7 @@ class Kernel(NamedTuple):
     def thread(self) -> Callable[..., None]:
         from ethbrake_marl.extensions.cuda.threads import play_thread  # numba.cuda is slow to import
 
-        return play_thread(Mine(*(array.shape for array in self.mine)))
+        return play_thread(ThreadMemory(*(array.shape for array in self.mine)))
 
     def launch(self, device: torch.device, n: int, *arguments: Any) -> None:
         """Run n threads. ``arguments``: tensors on this device, numbers, and tuples of both."""

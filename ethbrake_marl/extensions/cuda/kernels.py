@@ -17,7 +17,7 @@ from ethbrake_marl.episode.observe import N_NEIGHBOUR, N_OBSTACLE, N_OWN, N_ROLE
 from ethbrake_marl.episode.state import CLOCK_COLUMNS, ENDED
 from ethbrake_marl.episode.step import OUT_ROWS, step_worlds
 from ethbrake_marl.motion.compiling import large
-from ethbrake_marl.motion.layout import CAR_ROWS, LINE_ROWS, ROWS
+from ethbrake_marl.motion.layout import CAR_ROWS, LINE_ROWS, SCRATCH_ROWS
 
 # what a launch of `play` does
 STEP_MODE = 0  # a step; an episode that has ended stays as it is
@@ -29,7 +29,7 @@ LOOK = 3  # only observes
 FINE, NO_ACTION, PHYSICS_FAILED = 0, 1, 2
 
 
-class Stored(NamedTuple):
+class StoredEpisodes(NamedTuple):
     """Episodes, as in ``State``, with the index of the world last."""
 
     line: Any  # [LINE_ROWS, B, n]
@@ -54,7 +54,7 @@ class Ruling(NamedTuple):
     weights: Any  # [6]
 
 
-class Looking(NamedTuple):
+class ViewArrays(NamedTuple):
     offsets: Any
     role: Any
     obstacle: Any
@@ -62,7 +62,7 @@ class Looking(NamedTuple):
     scaling: Any  # [3, F]
 
 
-class Mine(NamedTuple):
+class ThreadMemory(NamedTuple):
     line: Any
     car: Any
     clock: Any
@@ -76,16 +76,16 @@ class Mine(NamedTuple):
     seen: Any  # float32, all others float64
 
 
-def memory_of(bodies: int, learners: int, features: int, neighbours: int) -> Mine:
+def memory_of(bodies: int, learners: int, features: int, neighbours: int) -> ThreadMemory:
     """Memory of one thread, for a processor."""
-    return Mine(
+    return ThreadMemory(
         line=np.zeros((1, LINE_ROWS, bodies)),
         car=np.zeros((1, CAR_ROWS, bodies)),
         clock=np.zeros((1, CLOCK_COLUMNS)),
         know=np.zeros((1, bodies, bodies)),
         wanted=np.zeros((1, bodies)),
         actions=np.zeros((1, learners)),
-        scratch=np.zeros((ROWS, bodies)),
+        scratch=np.zeros((SCRATCH_ROWS, bodies)),
         out=np.zeros((OUT_ROWS, 1)),
         reward=np.zeros((1, bodies - 1)),
         value=np.zeros(N_OWN + N_NEIGHBOUR * neighbours + N_ROLE + N_OBSTACLE),
@@ -129,7 +129,7 @@ def play_world(t, memory, stored, pool, following, actions, results, settings, v
     ``memory`` is the memory of this thread. ``stored`` has the running episodes, ``pool`` the worlds from which they
     begin; ``following`` [n] is the world of the pool in which each next episode begins. ``actions`` [n, L] float32 are
     clipped to [-1, 1]. If one of them is NaN, nothing moves and ``results.status`` says so. ``settings``: a ``Ruling``.
-    ``view``: a ``Looking``.
+    ``view``: a ``ViewArrays``.
     """
     load_world(t, stored, memory)
     is_new = mode == BEGIN

@@ -10,10 +10,10 @@ from typing import Any
 
 from numba import cuda, float32, float64
 
-from ethbrake_marl.extensions.cuda.kernels import Mine, play_world
+from ethbrake_marl.extensions.cuda.kernels import ThreadMemory, play_world
 
 
-def play_thread(shapes: Mine) -> Callable[..., None]:
+def play_thread(shapes: ThreadMemory) -> Callable[..., None]:
     """GPU kernel that runs ``play_world`` in n threads. ``shapes`` of their memory are constants of its code."""
     line, car, clock, know, wanted, proposed, scratch, out, rewards, value, shape_of_observations = shapes
 
@@ -22,7 +22,7 @@ def play_thread(shapes: Mine) -> Callable[..., None]:
     ) -> None:
         t = cuda.grid(1)
         if t < n:
-            memory = Mine(
+            memory = ThreadMemory(
                 cuda.local.array(line, float64),
                 cuda.local.array(car, float64),
                 cuda.local.array(clock, float64),

@@ -17,11 +17,11 @@ from ethbrake_marl.episode.state import ENDED
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.cuda.device import enough_memory
 from ethbrake_marl.extensions.cuda.graphs import Graphed
-from ethbrake_marl.extensions.cuda.kernels import Stored
+from ethbrake_marl.extensions.cuda.kernels import StoredEpisodes
 from ethbrake_marl.extensions.cuda.worlds import POOL, Worlds
 from ethbrake_marl.extensions.learners.algorithms import Vine
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
-from ethbrake_marl.extensions.learners.vine import ClippedActor, Tried, VineModel
+from ethbrake_marl.extensions.learners.vine import ClippedActor, TrialResults, VineModel
 from ethbrake_marl.faces.sb3 import EthBrakeVecEnv
 from ethbrake_marl.training.training import Training
 
@@ -73,7 +73,7 @@ class CudaVineModel(VineModel):
         super().__init__(training, environment)
         count, place, zeros = recipe.n_envs * recipe.n_steps, self.worlds.device, torch.zeros
         kind = self.worlds.pool.line.dtype
-        self.visited = Stored(*(zeros(*part.shape[:-1], count, dtype=kind, device=place) for part in self.worlds.pool))
+        self.visited = StoredEpisodes(*(zeros(*part.shape[:-1], count, dtype=kind, device=place) for part in self.worlds.pool))
         self.seen = self.worlds.reset().repeat(recipe.n_steps, 1, 1)  # [D, L, F]
         self.each_learner = torch.arange(self.learners, device=place)
         self.played = Graphed(self.play_here, place)
@@ -86,7 +86,7 @@ class CudaVineModel(VineModel):
         return actor
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        episodes = [f"worlds.now.{name}" for name in Stored._fields]
+        episodes = [f"worlds.now.{name}" for name in StoredEpisodes._fields]
         return super()._get_torch_save_params()[0], [*episodes, "worlds.following", "worlds.results.observations"]
 
     def _update_learning_rate(self, optimizers: Any) -> None:
@@ -106,7 +106,7 @@ class CudaVineModel(VineModel):
         return outputs.clamp(-1.0, 1.0).view(observations.shape[:2])
 
     @torch.no_grad()
-    def collect(self, callback: BaseCallback) -> tuple[Tensor, Stored]:
+    def collect(self, callback: BaseCallback) -> tuple[Tensor, StoredEpisodes]:
         """Drive all worlds for ``n_steps`` decisions; return observations [D L, F], and the states at the decisions."""
         worlds = self.worlds
         for step in range(self.recipe.n_steps):
@@ -124,7 +124,7 @@ class CudaVineModel(VineModel):
         self.train_actor(self.measure(observations))
 
     @torch.no_grad()
-    def measure(self, observations: Tensor) -> Tried:
+    def measure(self, observations: Tensor) -> TrialResults:
         """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's.
 
         ``observations`` [D L, F]: observations at all visited decisions.
@@ -134,7 +134,7 @@ class CudaVineModel(VineModel):
         sample = observations[torch.from_numpy(branches.decisions(self.learners)).to(place)]
         gained, moved = self.played(*(torch.from_numpy(column).to(place) for column in branches))
         self.branches.check()
-        return Tried(sample, self.policy.learning(sample)[:, 0], self.measured_gradient(gained, moved))
+        return TrialResults(sample, self.policy.learning(sample)[:, 0], self.measured_gradient(gained, moved))
 
     def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
         """Simulate branches; return what learners gained and how far their actions were moved, [2, 2B].

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import LAST, State
-from ethbrake_marl.episode.step import HARM, OUT_ROWS, TERMINATED, TOTAL_HARM, TRUNCATED, failure
+from ethbrake_marl.episode.step import FIRST_HARM, OUT_ROWS, TERMINATED, TOTAL_HARM, TRUNCATED, failure
 from ethbrake_marl.errors import InvalidInput, check_whole_number
 from ethbrake_marl.extensions.cuda.device import Kernel, device_named, enough_memory
 from ethbrake_marl.extensions.cuda.kernels import (
@@ -21,10 +21,10 @@ from ethbrake_marl.extensions.cuda.kernels import (
     PHYSICS_FAILED,
     RENEW,
     STEP_MODE,
-    Looking,
+    ViewArrays,
     Results,
     Ruling,
-    Stored,
+    StoredEpisodes,
     memory_of,
 )
 from ethbrake_marl.names import open_game
@@ -104,7 +104,7 @@ class Worlds:
         L, F = len(self.game.settings.learners), len(self.view.names)
         with enough_memory(f"n = {n} worlds, and a pool of {first.n}, on device {str(self.device)!r}"):
             self.pool = self.stored(first)
-            self.now = Stored(*(self._zeros(*array.shape[:-1], n) for array in self.pool))
+            self.now = StoredEpisodes(*(self._zeros(*array.shape[:-1], n) for array in self.pool))
             self.following = self._zeros(n, kind=torch.int64)
             self.results = Results(
                 self._zeros(OUT_ROWS, n),
@@ -118,9 +118,9 @@ class Worlds:
     def _zeros(self, *shape: int, kind: torch.dtype = torch.float64) -> Tensor:
         return torch.zeros(*shape, dtype=kind, device=self.device)
 
-    def stored(self, state: State) -> Stored:
+    def stored(self, state: State) -> StoredEpisodes:
         arrays = (state.line, state.car, state.clock, state.know, state.wanted)
-        return Stored(*(torch.from_numpy(np.moveaxis(array, 0, -1).copy()).to(self.device) for array in arrays))
+        return StoredEpisodes(*(torch.from_numpy(np.moveaxis(array, 0, -1).copy()).to(self.device) for array in arrays))
 
     @property
     def observations(self) -> Tensor:
@@ -152,9 +152,9 @@ class Worlds:
         self._launch(actions.detach().resolve_neg().contiguous(), RENEW if renew else STEP_MODE)
         out, reward, observations, _ = self.results
         ends = out[TERMINATED] == 1.0, out[TRUNCATED] == 1.0
-        return Stepped(observations, reward, *ends, out[HARM], out[TOTAL_HARM])
+        return Stepped(observations, reward, *ends, out[FIRST_HARM], out[TOTAL_HARM])
 
-    def put(self, stored: Stored, rows: Tensor) -> Tensor:
+    def put(self, stored: StoredEpisodes, rows: Tensor) -> Tensor:
         """Continue from the episodes ``rows`` [n] of ``stored``; return the observations, [n, L, F].
 
         Raises ``InvalidInput`` for another number of rows, and for worlds with another number of vehicles.
@@ -234,7 +234,7 @@ def check_runs(game: Game) -> None:
         )
 
 
-def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Looking, Kernel]:
+def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, ViewArrays, Kernel]:
     """Kernel ``play`` and its constant arguments. ``bodies``: number of bodies, vehicles and obstacle."""
     on = partial(torch.tensor, device=device)
     settings, plan = game.settings, game.views[int(game.settings.learners[0])].plan
@@ -245,6 +245,6 @@ def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, Lo
         float(settings.terminal),
         on(settings.weights),
     )
-    looking = Looking(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
+    looking = ViewArrays(on(plan.offsets), plan.role, plan.obstacle, on(plan.places), on(plan.scaling))
     size = bodies, len(settings.learners), plan.scaling.shape[1], len(plan.offsets)
     return ruling, looking, Kernel(size, memory_of(*size))

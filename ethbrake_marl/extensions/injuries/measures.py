@@ -13,7 +13,7 @@ import numpy as np
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
-from ethbrake_marl.evaluation.measures import Given
+from ethbrake_marl.evaluation.measures import MeasureValue
 from ethbrake_marl.extensions.injuries.curves import CURVES, expected_injuries, speed_changes
 from ethbrake_marl.registry import Part
 
@@ -27,7 +27,7 @@ class Injuries:
     def see(self, before: State, step: Step | None, after: State) -> None:
         self.changes = np.maximum(self.changes, speed_changes(before, after))
 
-    def result(self, last: State) -> Given:
+    def result(self, last: State) -> MeasureValue:
         """Injuries of the line, and of each vehicle, [n]."""
         injuries = expected_injuries(self.changes, self.curve)
         return {"": injuries.sum(axis=1), **{f"{i + 1}": column for i, column in enumerate(injuries.T)}}

@@ -42,7 +42,7 @@ def linear_layers(network: nn.Sequential) -> list[nn.Linear]:
     return [layer for layer in network if isinstance(layer, nn.Linear)]
 
 
-class Averaged(nn.Module):
+class AveragedNetwork(nn.Module):
     """A network in training, ``learning``, and ``average``, a copy whose weights are its running average."""
 
     def __init__(self, average: nn.Sequential, learning: nn.Sequential, rate: float) -> None:

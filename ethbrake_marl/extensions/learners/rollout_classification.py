@@ -16,7 +16,7 @@ from torch.nn.functional import softplus
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
-from ethbrake_marl.extensions.learners.networks import Averaged, ReplayBuffer, draw_rows, perceptron, zero_last_layer
+from ethbrake_marl.extensions.learners.networks import AveragedNetwork, ReplayBuffer, draw_rows, perceptron, zero_last_layer
 from ethbrake_marl.extensions.learners.recipes import RolloutClassificationRecipe
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
@@ -24,7 +24,7 @@ from ethbrake_marl.policies.layers import Float32s
 FOR_GOOD = 2**31  # steps, more than an episode has
 
 
-class Branches(NamedTuple):
+class ChoiceBranches(NamedTuple):
     """Simulations to the end, [M]: each begins at a decision with a choice, and leaves the rest to the network."""
 
     decision: Ints  # 0 to B - 1
@@ -32,7 +32,7 @@ class Branches(NamedTuple):
     steps: Ints  # for which the choice is held
 
     @classmethod
-    def of(cls, candidates: Ints, steps: Ints, choices: int) -> tuple[Branches, Ints]:
+    def of(cls, candidates: Ints, steps: Ints, choices: int) -> tuple[ChoiceBranches, Ints]:
         """One branch for each different choice of a decision, and the branches of ``candidates``, [B, C].
 
         ``candidates`` [B, C] are numbers below ``choices``; those of a decision are held for ``steps`` [B].
@@ -41,13 +41,13 @@ class Branches(NamedTuple):
         decision, choice = np.divmod(pairs, choices)
         return cls(decision, choice, steps[decision]), back.reshape(candidates.shape)
 
-    def with_full_braking(self, decisions: int) -> Branches:
+    def with_full_braking(self, decisions: int) -> ChoiceBranches:
         """These branches, and then one for each of the decisions that brakes fully to the end."""
         braking = np.arange(decisions), np.zeros(decisions, np.int64), np.full(decisions, FOR_GOOD)
-        return Branches(*(np.append(*parts) for parts in zip(self, braking, strict=True)))
+        return ChoiceBranches(*(np.append(*parts) for parts in zip(self, braking, strict=True)))
 
 
-class Chooser(Averaged):
+class Chooser(AveragedNetwork):
     """Network that scores actions from -1, full braking, to 1, and takes the best.
 
     The *extra cost* of a choice is its cost minus the cost of the cheapest choice tried at the same decision.
@@ -135,7 +135,7 @@ class RolloutClassificationModel(BranchingModel):
         recipe = self.recipe
         rows = draw_rows(np.flatnonzero(moving(states).repeat(self.learners)), recipe.tried)
         tried_choices = self.choices_at(observations[rows])
-        branches, branch = Branches.of(tried_choices, self.drawn_steps(len(rows)), recipe.network.choices)
+        branches, branch = ChoiceBranches.of(tried_choices, self.drawn_steps(len(rows)), recipe.network.choices)
         if not recipe.caution:
             return rows, tried_choices, self.costs_of(states, rows, branches)[branch]
         cost = self.costs_of(states, rows, branches.with_full_braking(len(rows)))
@@ -144,7 +144,7 @@ class RolloutClassificationModel(BranchingModel):
         costs += recipe.caution * progress * np.maximum(costs - of_braking, 0.0)
         return rows, tried_choices, costs
 
-    def costs_of(self, states: State, rows: Ints, branches: Branches) -> Floats:
+    def costs_of(self, states: State, rows: Ints, branches: ChoiceBranches) -> Floats:
         """Cost of each branch, [M]: minus the return of the learner that decides. ``rows`` [B]: its decisions."""
         chooser, learners = self.policy, self.learners
         world, learner = np.divmod(rows[branches.decision], learners)

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
-from ethbrake_marl.extensions.learners.networks import Averaged, draw_rows, linear_layers, perceptron
+from ethbrake_marl.extensions.learners.networks import AveragedNetwork, draw_rows, linear_layers, perceptron
 from ethbrake_marl.extensions.learners.recipes import VineRecipe
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.layers import Float32s
 
 
-class ClippedActor(Averaged):
+class ClippedActor(AveragedNetwork):
     """A deterministic policy: the network's output, clipped to [-1, 1]."""
 
     def __init__(self, inputs: int, recipe: VineRecipe) -> None:
@@ -58,7 +58,7 @@ class Branches(NamedTuple):
         return (self.world * learners + self.learner)[: len(self.world) // 2]
 
 
-class Tried(NamedTuple):
+class TrialResults(NamedTuple):
     """Results at B decisions at which a higher and a lower action were tried."""
 
     seen: Tensor  # [B, F] observations
@@ -79,13 +79,13 @@ class VineModel(BranchingModel):
     def improve(self, observations: Any, states: Any) -> None:
         self.train_actor(self.try_out(observations, states))
 
-    def try_out(self, observations: Float32s, states: State) -> Tried:
+    def try_out(self, observations: Float32s, states: State) -> TrialResults:
         """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's."""
         branches = self.draw_branches(np.flatnonzero(moving(states).repeat(self.learners)))
         gained, moved = self.play(states, branches)
         sample = observations[branches.decisions(self.learners)]
         gradient = self.measured_gradient(torch.from_numpy(gained), torch.from_numpy(moved))
-        return Tried(torch.from_numpy(sample), torch.from_numpy(self.policy.means(sample)), gradient)
+        return TrialResults(torch.from_numpy(sample), torch.from_numpy(self.policy.means(sample)), gradient)
 
     def draw_branches(self, decisions: Ints) -> Branches:
         rows, offset = draw_rows(decisions, self.recipe.tried), self.recipe.offset
@@ -124,7 +124,7 @@ class VineModel(BranchingModel):
         self.logger.record("train/gradient_cut", 1.0 - float(gradient.abs().sum()) / total if total else 0.0)
         return gradient.float()
 
-    def train_actor(self, results: Tried) -> None:
+    def train_actor(self, results: TrialResults) -> None:
         recipe = self.recipe
         self._update_learning_rate(self.policy.optimizer)
         lesson, losses = (results.seen, *trusted_targets(results, recipe.trust_radius, recipe.anchor)), []
@@ -141,7 +141,7 @@ class VineModel(BranchingModel):
         return self.policy.descend(loss, self.recipe.averaging)
 
 
-def trusted_targets(results: Tried, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
+def trusted_targets(results: TrialResults, radius: float, anchor: float) -> tuple[Tensor, Tensor]:
     """Targets of the actor's outputs, and the weights of the squared errors in the loss, [B] each.
 
     Let m be the present output and g the slope of the return at m. Then ``weight = |g| / radius + anchor`` and ``target

@@ -22,7 +22,7 @@ from ethbrake_marl.extensions.messages.links import (
     P_SPEED,
     PIECES,
     MessageMemory,
-    estimated,
+    estimated_line,
     newest_samples,
 )
 from ethbrake_marl.motion.layout import (
@@ -72,7 +72,7 @@ def known_pieces(state: State, observer: int) -> Bools:
     return pieces
 
 
-def believed(state: State, observer: int) -> State:
+def belief_of(state: State, observer: int) -> State:
     """State as the body ``observer`` estimates it. What it does not know is NaN, except gaps.
 
     Old samples are moved on to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which it
@@ -81,7 +81,7 @@ def believed(state: State, observer: int) -> State:
     """
     known = known_pieces(state, observer)
     news = newest_samples(state, observer)
-    line, car = estimated(state, observer, known, news), state.car.copy()
+    line, car = estimated_line(state, observer, known, news), state.car.copy()
     for rows, array in ((LINE_PIECES, line), (CAR_PIECES, car)):
         for row, piece in rows.items():
             array[:, row][~known[:, :, piece]] = np.nan
@@ -92,14 +92,14 @@ def believed(state: State, observer: int) -> State:
     )
 
 
-def believed_whole(state: State, observer: int) -> State:
+def predictable_belief_of(state: State, observer: int) -> State:
     """State as the body ``observer`` estimates it, without the vehicles that it cannot predict.
 
     It can predict a vehicle of which it knows all quantities but the intent. For the others ``know`` is infinite.
     """
     known = known_pieces(state, observer)
     line, predictable = (
-        estimated(state, observer, known, newest_samples(state, observer)),
+        estimated_line(state, observer, known, newest_samples(state, observer)),
         known[:, :, :P_INTENT].all(axis=2),
     )
     return state._replace(line=line, know=_known_if(state, observer, np.asarray(predictable)))

@@ -12,7 +12,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import Layer, LayeredScript, LayeredView
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.messages.belief import ages_s, believed, believed_whole, known_pieces, require_pieces
+from ethbrake_marl.extensions.messages.belief import ages_s, belief_of, predictable_belief_of, known_pieces, require_pieces
 from ethbrake_marl.extensions.messages.links import (
     MESSAGES_KEY,
     P_ACCELERATION,
@@ -58,7 +58,7 @@ class MessagesLayer(Layer):
         return _remembering(state, after_step(before, state, partial(game.seen, body=0, before=self)))
 
     def seen(self, state: State, body: int) -> State:
-        return believed(state, body)
+        return belief_of(state, body)
 
     def hides(self, alert: State, body: int) -> Bools:
         """Bodies (0: obstacle) that vehicle ``body`` does not fully know at its first decision, [n, N + 1]."""
@@ -108,7 +108,7 @@ class BelievedView(LayeredView):
         far = np.array([name.partition(".")[0] in GROUPS for name in self.names])
         self.parts = [
             (view.part([self.names[c] for c in columns[rows]]), columns[rows], belief)
-            for rows, belief in ((~far, believed), (far, believed_whole))
+            for rows, belief in ((~far, belief_of), (far, predictable_belief_of))
             if rows.any()
         ]
         split = [name.partition(".") for name in self.names]

@@ -186,7 +186,7 @@ def newest_samples(state: State, observer: int) -> Floats:
     return news
 
 
-def estimated(state: State, observer: int, known: Bools, news: Floats) -> Floats:
+def estimated_line(state: State, observer: int, known: Bools, news: Floats) -> Floats:
     line, bodies, aged = state.line.copy(), known.shape[1], state.memories[MESSAGES_KEY].is_periodic
     working = np.empty(bodies), np.empty(bodies, np.bool_)
     estimate_worlds(observer, state.time_s.copy(), state.car[:, LIMIT].copy(), known, news, aged, line, *working)

@@ -28,7 +28,7 @@ from ethbrake_marl.worlds.scenario import Scenario
 
 NAME = "reports"  # of the key, and of the memory: a whole number below 2^53 for each world, [n]
 NOISE = (6,)  # stream of these numbers
-KEYS = ("noise_mps", "bias_mps", "liar")
+REPORT_KEYS = ("noise_mps", "bias_mps", "liar")
 MOST_MPS = 50.0  # largest noise and bias
 
 
@@ -99,7 +99,7 @@ class Reports(Extension):
         require(isinstance(value, Mapping) and len(value) > 0, (key,), value, right)
         for name, content in value.items():
             at = (key, name)
-            require(name in KEYS, at, UNSHOWN, f"unknown key; {suggestion(str(name), KEYS) or f'known: {KEYS}'}")
+            require(name in REPORT_KEYS, at, UNSHOWN, f"unknown key; {suggestion(str(name), REPORT_KEYS) or f'known: {REPORT_KEYS}'}")
             if name == "liar":
                 require(isinstance(content, str), at, content, "must be the name of a vehicle, such as vehicle_1")
                 continue

@@ -7,7 +7,7 @@ import numpy as np
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.measures import Given, Statistic
+from ethbrake_marl.evaluation.measures import MeasureValue, Statistic
 from ethbrake_marl.extensions.proofs.avoidability import avoidability
 from ethbrake_marl.extensions.proofs.lower_bound import LowerBound, lower_bound
 from ethbrake_marl.motion.forces import capacities
@@ -15,7 +15,7 @@ from ethbrake_marl.motion.layout import BRAKING
 from ethbrake_marl.registry import Part
 
 
-def avoidable(game: Game, alert: State, last: State) -> Given:
+def avoidable(game: Game, alert: State, last: State) -> MeasureValue:
     """Whether some commands avoid all contact (proven), and if not, why: ``early``, ``front`` or ``rear``.
 
     The commands are those of Vehicle 2 of three (or of Vehicles 2 and 3 together) or of either of two vehicles; all
@@ -28,7 +28,7 @@ def avoidable(game: Game, alert: State, last: State) -> Given:
 _bound_cache: dict[bytes, LowerBound] = {}  # of the worlds that were last asked for: all agents drive the same ones
 
 
-def proven_harm(game: Game, alert: State, last: State) -> Given:
+def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
     """Lower bound on the harm or honest cost of all commands that change at decisions, [n] m2/s2.
 
     ``impact``: whether the bound is above 0. The result is the same for every agent.

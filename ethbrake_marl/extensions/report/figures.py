@@ -54,7 +54,7 @@ LONG = 30  # characters of a label that make a legend narrow
 EstimateCurve = Mapping[Any, Estimate]  # x -> estimate; texts stand side by side
 
 
-def mean_over_seeds(trainings: Sequence[Mapping[Any, float]]) -> EstimateCurve:
+def curve_over_seeds(trainings: Sequence[Mapping[Any, float]]) -> EstimateCurve:
     """Mean of several training runs, plus and minus one standard deviation over the seeds.
 
     ``trainings``: for each run, step or progress -> value. The curve has the steps that all runs have.

@@ -21,7 +21,7 @@ from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
 from ethbrake_marl.extensions.report.page import Section, drawing, page_part, table, whole_page
-from ethbrake_marl.files.sheet import Column, Sheet, Shown
+from ethbrake_marl.files.sheet import Column, Sheet, CellText
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
 
@@ -169,7 +169,7 @@ def worst_section(compared: Compared, focus: str, watched: Collection[int]) -> S
     rows = []
     for k in worst_rows(compared, focus).tolist():
         number = int(result.worlds["world"][k])
-        name = Shown(page_part("watch", number)) if k in watched else number
+        name = CellText(page_part("watch", number)) if k in watched else number
         rows.append([name, *(values[k].item() for values in columns.values())])
     by = IN_WORDS[minimised]
     if known_best is not None and minimised in known_best.harm:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import SHORT_NAMES
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.report.figures import curves_figure, mean_over_seeds
+from ethbrake_marl.extensions.report.figures import curves_figure, curve_over_seeds
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge
@@ -203,10 +203,10 @@ def reproduce_curves(delay: str, settings: ReproductionSettings) -> Made:
     text = f"{title}: return and harm against progress, mean over seeds; bands: one standard deviation."
     panels = {
         "Mean return of training episodes": {
-            name: mean_over_seeds(course.returns) for name, course in delay_courses.items()
+            name: curve_over_seeds(course.returns) for name, course in delay_courses.items()
         },
         f"{TITLES['first']}, fixed list": {
-            name: mean_over_seeds(course.harm) for name, course in delay_courses.items()
+            name: curve_over_seeds(course.harm) for name, course in delay_courses.items()
         },
     }
     figure = DrawnFigure(f"learning-{delay}", title, text, curves_figure(panels, "Training progress (%)", text))

@@ -39,7 +39,7 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.reward import Rewarding, RewardParams
 from ethbrake_marl.episode.script_calls import ask_scripts
 from ethbrake_marl.episode.state import ENDED, FIRST_DECISION, LAST, STEPS, TIME, State
-from ethbrake_marl.episode.step import COST, HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
+from ethbrake_marl.episode.step import COST, FIRST_HARM, OUT_ROWS, SAFE_END, TERMINATED, TOTAL_HARM, TRUNCATED, Step
 from ethbrake_marl.episode.terms import pair_energies
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.files.model import UNSHOWN, require
@@ -165,12 +165,12 @@ class PaperMap:
         last = after.clock[:, STEPS] >= after.clock[:, LAST]
         after.clock[:, ENDED] = over | last | after.at_rest
         out = np.zeros((OUT_ROWS, state.n))
-        for row, of_line in ((HARM, FIRST), (TOTAL_HARM, TOTAL)):
+        for row, of_line in ((FIRST_HARM, FIRST), (TOTAL_HARM, TOTAL)):
             out[row] = (after.line[:, of_line] - before.line[:, of_line]).sum(axis=1)
         ends = after.ended & ~over
         out[TERMINATED], out[TRUNCATED] = ends & after.at_rest, ends & ~after.at_rest
         out[SAFE_END] = ends & ~after.collided
-        out[COST] = settings.weights[OF_FIRST] * out[HARM] + settings.weights[OF_TOTAL] * out[TOTAL_HARM]
+        out[COST] = settings.weights[OF_FIRST] * out[FIRST_HARM] + settings.weights[OF_TOTAL] * out[TOTAL_HARM]
         shared = settings.terminal * out[SAFE_END] - settings.harm * out[COST]
         reward = np.repeat(shared[:, np.newaxis], state.vehicles, axis=1)
         return after, Step(reward, out, settings.time_step_s)

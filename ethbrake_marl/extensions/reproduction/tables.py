@@ -162,7 +162,7 @@ def process_sheet(settings: ReproductionSettings, reading: Reading, episodes: in
     return [Sheet(f"The {PAPERS} in its map, {episodes:,} worlds", ("Strategy", *TABLE_COLUMNS), rows, note)]
 
 
-def compare_harm(outcomes: Mapping[str, RandomOutcome], smaller: str, *larger: str) -> list[Less]:
+def harm_difference(outcomes: Mapping[str, RandomOutcome], smaller: str, *larger: str) -> list[Less]:
     return [
         Less.of_worlds(f"{smaller} minus {rival}, {harm}", outcomes[smaller][count], outcomes[rival][count])
         for rival in larger
@@ -209,13 +209,13 @@ def conclusions(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str]) 
             part for name in hybrids for part in compare_collisions(outcomes, name, NON_E, E_V2X_BM)
         ],
         "Non-E does the most harm": [
-            part for name in (E_V2X_BM, *hybrids) for part in compare_harm(outcomes, name, NON_E)
+            part for name in (E_V2X_BM, *hybrids) for part in harm_difference(outcomes, name, NON_E)
         ],
         "the hybrids do the least harm": [
-            part for name in hybrids for part in compare_harm(outcomes, name, NON_E, E_V2X_BM)
+            part for name in hybrids for part in harm_difference(outcomes, name, NON_E, E_V2X_BM)
         ],
         "contribution 1: learning does less harm than the analytic baseline": [
-            part for name in policies for part in compare_harm(outcomes, name, *baselines)
+            part for name in policies for part in harm_difference(outcomes, name, *baselines)
         ],
         "contribution 1: learning avoids collisions of the baseline": [
             part for name in policies for part in compare_collisions(outcomes, name, E_V2X_BM)
@@ -224,7 +224,7 @@ def conclusions(outcomes: Mapping[str, RandomOutcome], policies: Iterable[str]) 
             part
             for name in policies
             for part in (
-                *compare_harm(outcomes, f"Hybrid {name}", name),
+                *harm_difference(outcomes, f"Hybrid {name}", name),
                 *compare_collisions(outcomes, f"Hybrid {name}", name),
             )
         ],
@@ -282,7 +282,7 @@ def reproduce_hybrid_table(settings: ReproductionSettings) -> Made:
     outcomes, nearest_outcomes = (strategies(reading, episodes, {STANDALONE: spec}) for reading in (STATED, NEAREST))
     name, rivals = f"Hybrid {STANDALONE}", (STANDALONE, E_V2X_BM)
     parts = [
-        compare_harm(reading_outcomes, name, *rivals) + compare_collisions(reading_outcomes, name, *rivals)
+        harm_difference(reading_outcomes, name, *rivals) + compare_collisions(reading_outcomes, name, *rivals)
         for reading_outcomes in (outcomes, nearest_outcomes)
     ]
     why = "the hybrid compares the policy with what E-V2X-BM predicts, not with what E-V2X-BM does"

@@ -12,7 +12,7 @@ from ethbrake_marl.agents.drive import MODEL, Agent, Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number
-from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, commands_of, e_v2x_bm_profiles
+from ethbrake_marl.extensions.search.best_harm import SEARCH_BUDGET, agent_commands, e_v2x_bm_profiles
 from ethbrake_marl.extensions.search.pricing import Problem, problem_of, with_braking
 from ethbrake_marl.extensions.search.search import refine, search_profiles
 from ethbrake_marl.extensions.search.tables import best_stored, outdated_tables
@@ -104,14 +104,14 @@ class BestHarm(Planner):
         start = START.get(self.count, OTHER_START)
         policy = make_agent(start, scenario=self.scenario)
         assert not isinstance(policy, Team)
-        policy_commands = commands_of(problem, game, alert, Team(start, {body: policy}))[:, :, 0]
+        policy_commands = agent_commands(problem, game, alert, Team(start, {body: policy}))[:, :, 0]
         better = refine(problem, policy_commands, budget=1)[1] < values[self.count]
         first = np.where(better[:, np.newaxis], policy_commands, best[:, : policy_commands.shape[1]])
         best[:, : policy_commands.shape[1]], harm = refine(problem, first, budget=self.budget)
         return best, harm
 
 
-class Searched(Planner):
+class SearchAround(Planner):
     """Agent that improves another agent's commands by a search at the alert.
 
     It never does more harm than that agent, if the other vehicles keep their commands.
@@ -129,7 +129,7 @@ class Searched(Planner):
             self.inner.check(game, body)
 
     def choose(self, game: Game, alert: State, problem: Problem, body: int) -> tuple[Floats, Floats]:
-        start = commands_of(problem, game, alert, Team(self.inner.name, {body: self.inner}))[:, :, 0]
+        start = agent_commands(problem, game, alert, Team(self.inner.name, {body: self.inner}))[:, :, 0]
         return refine(problem, start, budget=self.candidates)
 
 
@@ -165,7 +165,7 @@ def make_searched(team: Team, argument: str | None, settings: Any) -> Team:
             f"agent {settings.spec!r}: a search around a shield; write +search first: AGENT+search+SHIELD"
         )
     scenario = settings.needed_scenario()
-    drivers = {i: Searched(agent, scenario, settings.harm_count) for i, agent in team.drivers.items()}
+    drivers = {i: SearchAround(agent, scenario, settings.harm_count) for i, agent in team.drivers.items()}
     return Team(settings.spec, drivers)
 
 

@@ -71,7 +71,7 @@ def best_harm(
     outcomes = [(profiles, problem.values(profiles)) for profiles in first_profiles]
     for count in counts:
         starts = [profiles for profiles, _ in outcomes]
-        outcomes.append(_search(game, alert, problem.counting(count), starts, objective, effort))
+        outcomes.append(_search(game, alert, problem.with_count(count), starts, objective, effort))
     names = [f"vehicle_{body}" for body in problem.bodies]
     header: dict[str, Any] = {"scenario": game.name, "vehicles": names, "budget": budget, "search_seed": seed}
     header["physics"] = physics_digest()
@@ -177,7 +177,7 @@ def search_list(
     )
 
 
-def commands_of(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
+def agent_commands(problem: Problem, game: Game, alert: State, team: Team) -> Floats:
     """Let a team drive; return its commands at every decision of a problem, [n, T, B] m/s2, the last ones repeated."""
     bodies, states = sorted(team.drivers), play(game, alert, team)
     next(states)
@@ -187,5 +187,5 @@ def commands_of(problem: Problem, game: Game, alert: State, team: Team) -> Float
 
 def driven_profiles(problem: Problem, game: Game, alert: State, team: Team) -> Profiles:
     """Let a team drive; return its commands as profiles with one phase for each change of command."""
-    steps = Profiles.of_steps(commands_of(problem, game, alert, team), problem.last_step)
+    steps = Profiles.of_steps(agent_commands(problem, game, alert, team), problem.last_step)
     return Profiles.join([compact(*profile) for profile in zip(*steps, strict=True)])

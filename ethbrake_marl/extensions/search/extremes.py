@@ -52,7 +52,7 @@ def extreme_profiles(problem: Problem) -> Profiles:
                 low, high = max(best - around, 0.0), best + around
         if candidates:
             order = np.concatenate(values).argsort(kind="stable")[:KEPT_PROFILES]
-            best_profiles = Profiles.padded([Profiles.join(candidates).take(order)], MOST_PHASES)[0]
+            best_profiles = Profiles.pad([Profiles.join(candidates).take(order)], MOST_PHASES)[0]
             ends[k], commands[k] = best_profiles
     return Profiles(ends.reshape(-1, MOST_PHASES), commands.reshape(-1, MOST_PHASES, 1))
 

@@ -8,7 +8,7 @@ from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
-from ethbrake_marl.evaluation.measures import Given, Statistic
+from ethbrake_marl.evaluation.measures import MeasureValue, Statistic
 from ethbrake_marl.extensions.search.pricing import problem_of
 from ethbrake_marl.extensions.search.tables import best_stored as stored, outdated_tables, shipped_tables
 from ethbrake_marl.motion.layout import Floats
@@ -44,7 +44,7 @@ def _why_unknown(scenario: str) -> str:
     )
 
 
-def best_known(game: Game, alert: State, last: State) -> Given:
+def best_known(game: Game, alert: State, last: State) -> MeasureValue:
     """Least harm (honest: least honest cost) of the world in a shipped table, found by a search or an agent.
 
     The result is the same for every agent.
@@ -52,7 +52,7 @@ def best_known(game: Game, alert: State, last: State) -> Given:
     return least_known_values(game, alert)
 
 
-def regret(game: Game, alert: State, last: State) -> Given:
+def regret(game: Game, alert: State, last: State) -> MeasureValue:
     """Harm (or honest cost) minus the least known in the same world. Below 0: the agent did even less."""
     return {count: last.harm(count) - harm for count, harm in least_known_values(game, alert).items()}
 

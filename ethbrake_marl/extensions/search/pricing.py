@@ -71,9 +71,9 @@ class Profiles(NamedTuple):
         phase = np.minimum(phase, self.ends.shape[1] - 1)
         return np.take_along_axis(self.commands_mps2, phase[:, :, np.newaxis], 1)
 
-    def shortened(self) -> Profiles:
+    def shorten(self) -> Profiles:
         """Profiles with ``MOST_PHASES`` phases. Those of a longer one have its command at their beginning."""
-        ends, commands = Profiles.padded([self], MOST_PHASES)[0]
+        ends, commands = Profiles.pad([self], MOST_PHASES)[0]
         fits = ends[:, MOST_PHASES - 1] == ends[:, -1]
         few = np.minimum(np.array([*FEW_ENDS, np.iinfo(np.int64).max]), ends[:, -1:])
         begun = self.stepwise(FEW_ENDS[-1] + 1)[:, [0, *FEW_ENDS]]
@@ -90,7 +90,7 @@ class Profiles(NamedTuple):
         return Profiles(ends, np.ascontiguousarray(commands_mps2))
 
     @staticmethod
-    def padded(parts: Sequence[Profiles], least: int = 1) -> list[Profiles]:
+    def pad(parts: Sequence[Profiles], least: int = 1) -> list[Profiles]:
         """Add empty phases so that all parts have the same number of phases, at least ``least``."""
         width = max([least, *(part.ends.shape[1] for part in parts)])
         return [
@@ -103,14 +103,14 @@ class Profiles(NamedTuple):
 
     @staticmethod
     def join(parts: Sequence[Profiles]) -> Profiles:
-        return Profiles(*(np.concatenate(arrays) for arrays in zip(*Profiles.padded(parts), strict=True)))
+        return Profiles(*(np.concatenate(arrays) for arrays in zip(*Profiles.pad(parts), strict=True)))
 
 
 def best_of(results: Sequence[tuple[Floats, Profiles]]) -> tuple[Floats, Profiles]:
     """Least of several harms [n] in each world, and its profile. ``results``: pairs; ties: the first."""
     harms = np.stack([harm for harm, _ in results])
     pick, rows = harms.argmin(axis=0), np.arange(harms.shape[1])
-    padded_profiles = Profiles.padded([profiles for _, profiles in results])
+    padded_profiles = Profiles.pad([profiles for _, profiles in results])
     return harms[pick, rows], Profiles(*(np.stack(arrays)[pick, rows] for arrays in zip(*padded_profiles, strict=True)))
 
 
@@ -151,7 +151,7 @@ class Problem(NamedTuple):
     def take(self, rows: Any) -> Problem:
         return self._replace(state=self.state.take(rows), shares=self.shares[rows], identity=self.identity[rows])
 
-    def counting(self, count: str) -> Problem:
+    def with_count(self, count: str) -> Problem:
         return self._replace(harm_count=count)
 
     def even_grid(self, number: int) -> Floats:
@@ -204,7 +204,7 @@ class Problem(NamedTuple):
         last = self.follow(profiles)
         return {count: self.value(last, count) for count in COUNTS}
 
-    def minimising(self, weights: Floats, *, largest: bool = False) -> Problem:
+    def with_weights(self, weights: Floats, *, largest: bool = False) -> Problem:
         """Problem that minimises the sum of the vehicles' harm times ``weights`` [n, N].
 
         ``largest``: the largest of these products instead.
@@ -340,14 +340,14 @@ def with_objective(problem: Problem, objective: Declared) -> Problem:
     if set(forms) == {"total"}:
         return problem
     if set(forms) == {"maximin"}:
-        return problem.minimising(np.ones(problem.state.vehicles), largest=True)
+        return problem.with_weights(np.ones(problem.state.vehicles), largest=True)
     weights = [] if "maximin" in forms else [objectives[i].weights(car, i) for i in chosen]
     if not weights or any(not np.array_equal(weights[0], vector) for vector in weights[1:]):
         raise InvalidInput(
             f"objective {objective!r}: the {len(chosen)} controlled vehicles have different objectives, but a search"
             " minimises one; give all of them the same, for instance weighted:1,4,1"
         )
-    return problem.minimising(weights[0])
+    return problem.with_weights(weights[0])
 
 
 @kernel

@@ -50,7 +50,7 @@ def search_profiles(
     for name, value, least in (("budget", budget, 1), ("threads", threads, 1), ("seed", seed, 0)):
         check_whole_number(name, value, least)
     n = problem.n
-    ends, commands = join_profiles([part.shortened() for part in starts], n)
+    ends, commands = join_profiles([part.shorten() for part in starts], n)
     long_starts = [part for part in starts if part.ends.shape[1] > MOST_PHASES]  # in the search they are shortened
     random, polishing = random_states(problem.identity, seed), int(POLISHING_SHARE * budget)
 

@@ -10,7 +10,7 @@ import torch
 
 import ethbrake_marl as eb
 from ethbrake_marl.extensions.learners.start import widened
-from ethbrake_marl.extensions.learners.vine import Tried, trusted_targets
+from ethbrake_marl.extensions.learners.vine import TrialResults, trusted_targets
 from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.training.recipe import load_recipe
 from ethbrake_marl.training.train import train
@@ -24,7 +24,7 @@ def test_targets__keep_the_slope_and_stay_within_the_radius_and_the_bounds() -> 
     # r = 0.05 and k = 3: g = 0.15 moves by 0.15 / (3 + 3), g = 1e6 by almost 0.05, g = 0 not at all
     gradient = torch.tensor([0.0, 0.15, -0.15, 1e6, 1e6, 0.15, -1e6, -0.15, -1e6])
     mean = torch.tensor([0.3, 0.0, 0.0, 0.0, 1.0, -2.0, -2.0, 2.0, -1.0])
-    target, weight = trusted_targets(Tried(torch.zeros(9, 1), mean, gradient), 0.05, 3.0)
+    target, weight = trusted_targets(TrialResults(torch.zeros(9, 1), mean, gradient), 0.05, 3.0)
     assert [round(float(each), 6) for each in target] == [0.3, 0.025, -0.025, 0.05, 1.0, -1.975, -2.0, 1.975, -1.0]
     assert [round(float(each), 5) for each in weight[[0, 1, 2, 4]]] == [3.0, 6.0, 6.0, 3.0]
     assert [round(float(each), 5) for each in (weight * (target - mean))[:3]] == [0.0, 0.15, -0.15]

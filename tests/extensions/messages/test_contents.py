@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.extensions.messages.belief import believed, known_pieces
+from ethbrake_marl.extensions.messages.belief import belief_of, known_pieces
 from ethbrake_marl.extensions.messages.links import PIECES
 from ethbrake_marl.motion.layout import (
     BRAKE_RATE,
@@ -85,7 +85,7 @@ def test_believed__is_nan_where_nothing_is_known() -> None:
     tells = {"vehicle_1": ["speed", "mass"], "vehicle_2": [*PIECES], "vehicle_3": []}
     game, state = played({"tells": tells})
     state = stepped(game, state, -1.0)  # at 0.6 s: Vehicle 1 has 16.4 m/s, Vehicle 2 17.3
-    two = believed(state, 2)
+    two = belief_of(state, 2)
     assert two.line[0, SPEED, 1:] == pytest.approx([16.4, 17.3, np.nan], nan_ok=True)
     assert two.line[0, FORCE, 1:] == pytest.approx([np.nan, -7.0, np.nan], nan_ok=True)
     assert two.car[0, MASS, 1:] == pytest.approx([4.5, 5.5, np.nan], nan_ok=True)
@@ -129,7 +129,7 @@ def test_obstacle__is_known_with_the_place_of_vehicle_1() -> None:
     listed, near = ["own", "front_1", "obstacle"], LINE.replace(obstacle_gap_m=60)
     game, state = played({"tells": {"vehicle_1": ["speed"]}}, listed, scenario=near)
     assert (seen_by(game, state, 1)["obstacle.known"], seen_by(game, state, 2)["obstacle.known"]) == (1.0, 0.0)
-    assert believed(state, 2).obstacle_gap_m.tolist() == [np.inf]
+    assert belief_of(state, 2).obstacle_gap_m.tolist() == [np.inf]
     game, state = played({"tells": ["place"]}, listed, scenario=near)
     assert seen_by(game, state, 2)["obstacle.gap"] == pytest.approx((60 - 9 + 8) / 10)
 

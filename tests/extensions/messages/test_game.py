@@ -8,7 +8,7 @@ import pytest
 from ethbrake_marl.episode.features import FEATURES, register_feature
 from ethbrake_marl.episode.play import price
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.messages.belief import believed, require_pieces
+from ethbrake_marl.extensions.messages.belief import belief_of, require_pieces
 from ethbrake_marl.extensions.messages.game import MESSAGES_LAYER
 from ethbrake_marl.extensions.messages.links import MESSAGES_KEY
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv
@@ -42,7 +42,7 @@ def test_script__acts_on_what_its_vehicle_believes() -> None:
     _, game = game_of(LINE.replace(v2x=PERIODIC), {3: script})
     state = game.reset(game.draw(1, 7, 0))
     for _ in range(8):
-        expected = believed(state, 3)
+        expected = belief_of(state, 3)
         state = stepped(game, state, -1.0)
         assert script.seen[-1].line.tobytes() == expected.line.tobytes()
         assert script.seen[-1].car.tobytes() == expected.car.tobytes()

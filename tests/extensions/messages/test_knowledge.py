@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.messages.belief import CAR_PIECES, ages_s, believed, known_pieces
+from ethbrake_marl.extensions.messages.belief import CAR_PIECES, ages_s, belief_of, known_pieces
 from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, P_ACCELERATION, P_INTENT, P_PLACE, P_SPEED
 from ethbrake_marl.motion.layout import FORCE, GAP, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -79,7 +79,7 @@ def test_what_has_not_been_received__changes_no_bit(base: str, channel: str) -> 
         for body in (1, 2, 3):
             other = altered(state, body, rng)
             assert game.observe_alike(other, [body]).tobytes() == game.observe_alike(state, [body]).tobytes()
-            one, two = believed(state, body), believed(other, body)
+            one, two = belief_of(state, body), belief_of(other, body)
             np.testing.assert_array_equal(one.line[:, : GAP + 1], two.line[:, : GAP + 1])
             np.testing.assert_array_equal(one.car, two.car)
             np.testing.assert_array_equal(one.wanted, two.wanted)

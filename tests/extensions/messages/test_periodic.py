@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ethbrake_marl.extensions.messages.belief import ages_s, believed
+from ethbrake_marl.extensions.messages.belief import ages_s, belief_of
 from ethbrake_marl.extensions.messages.links import MESSAGES_KEY, loss_number, moved_on
 from ethbrake_marl.motion.layout import GAP, HIT, SPEED
 from ethbrake_marl.worlds.catalogue import load_scenario
@@ -83,21 +83,21 @@ def test_believed__knows_of_no_impact_between_others() -> None:
     game, state = played(EVERY_SECOND, scenario=LINE.replace(gaps_m=[2, 30]))
     while not state.pair_hit[0, 0]:
         state = stepped(game, state, 0.0)
-    three = believed(state, 3)
-    assert (three.line[0, HIT, 1], believed(state, 2).line[0, HIT, 1]) == (0.0, 1.0)
+    three = belief_of(state, 3)
+    assert (three.line[0, HIT, 1], belief_of(state, 2).line[0, HIT, 1]) == (0.0, 1.0)
     assert three.line[0, SPEED, 1] < state.line[0, SPEED, 1]  # as if it had braked on
     assert three.line[0, GAP, 1] == 0.0  # moved on, the two would overlap
     present = played({"tells": ["place"]}, scenario=LINE.replace(gaps_m=[2, 30]))
     while not present[1].pair_hit[0, 0]:
         present = present[0], stepped(*present, 0.0)
-    assert believed(present[1], 3).line[0, HIT, 1] == 1.0
+    assert belief_of(present[1], 3).line[0, HIT, 1] == 1.0
 
 
 def test_obstacle_hit__is_known_from_a_message() -> None:
     game, state = played(EVERY_SECOND, scenario=LINE.replace(obstacle_gap_m=20, gaps_m=[60, 60]))
     known = []
     while len(known) < 14:  # Vehicle 1 hits it at 1.23 s; the samples of 1.3 s and 1.4 s are used at 1.5 s or 1.6 s
-        known.append((round(float(state.time_s[0]), 1), believed(state, 2).line[0, HIT, 0], state.line[0, HIT, 0]))
+        known.append((round(float(state.time_s[0]), 1), belief_of(state, 2).line[0, HIT, 0], state.line[0, HIT, 0]))
         state = stepped(game, state, -1.0)
     assert [min(time for time, *hit in known if hit[k] == 1.0) for k in (0, 1)] == [1.6, 1.3]
 

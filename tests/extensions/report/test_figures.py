@@ -17,7 +17,7 @@ from ethbrake_marl.extensions.report.figures import (
     harm_above,
     harm_against_total_gap,
     harm_by_agent,
-    mean_over_seeds,
+    curve_over_seeds,
     trajectories,
     worlds_figure,
 )
@@ -154,8 +154,8 @@ def test_intervals__are_by_recording_wherever_worlds_come_from_recordings() -> N
 
 
 def test_curves__are_means_with_bands_and_lines() -> None:
-    curve = mean_over_seeds([{0: 4.0, 10: 1.0, 15: 9.0}, {0: 8.0, 10: 3.0}])  # at the steps that all have
-    assert mean_over_seeds([{5: 2.0}]) == {5.0: Estimate(2.0, (2.0, 2.0))}
+    curve = curve_over_seeds([{0: 4.0, 10: 1.0, 15: 9.0}, {0: 8.0, 10: 3.0}])  # at the steps that all have
+    assert curve_over_seeds([{5: 2.0}]) == {5.0: Estimate(2.0, (2.0, 2.0))}
     panels = {"harm": {"ppo": curve}, "return": {"ppo": {1: Estimate(-1.0, None)}}}
     figure = curves_figure(panels, "x", "c", lines={"harm": {"best known": 0.5}})
     left, right = figure.axes

@@ -11,7 +11,7 @@ from ethbrake_marl.errors import plain_text
 from ethbrake_marl.extensions.report.figures import SLIM_IN
 from ethbrake_marl.extensions.report.page import Section, data, drawing, page_part, table, whole_page as page_of
 from ethbrake_marl.extensions.report.style import finish, new_figure
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet, Shown
+from ethbrake_marl.files.sheet import Column, Estimate, Sheet, CellText
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
 
 
@@ -20,7 +20,7 @@ def whole_page(text: str) -> str:
     body = [
         text,
         page_part("paragraph", text, "note"),
-        table(Sheet(text, [text, text], [[text, Shown(text, text)], text, [text, text]])),
+        table(Sheet(text, [text, text], [[text, CellText(text, text)], text, [text, text]])),
         table(Sheet("", [text, Column(text)], [[text, text]])),
         page_part("facts", {text: text}),
         page_part("remarks", [text]),

@@ -8,7 +8,7 @@ import pytest
 import ethbrake_marl as eb
 from ethbrake_marl.episode.counts import COLUMN, HARM
 from ethbrake_marl.errors import Unfamiliar
-from ethbrake_marl.extensions.search.agents import Searched
+from ethbrake_marl.extensions.search.agents import SearchAround
 from ethbrake_marl.training.experiment import usable
 from tests.refused import refused
 
@@ -45,7 +45,7 @@ def test_best_harm__of_no_table_is_never_worse_than_its_start_or_e_v2x_bm(count:
 @pytest.mark.parametrize(("inside", "count"), [("constant:5", "first"), ("ppo", "total"), ("ppo", "honest")])
 def test_searched__is_never_worse_and_better_with_more_candidates(inside: str, count: str) -> None:
     agent, column = eb.make_agent(inside, scenario=PAPER), COLUMN[count]
-    agents = {"plain": agent, **{str(n): Searched(agent, PAPER, count, n) for n in (20, 200)}}
+    agents = {"plain": agent, **{str(n): SearchAround(agent, PAPER, count, n) for n in (20, 200)}}
     result = eb.evaluate("paper-random", agents, episodes=30, seed=3, harm_count=count)
     plain, some, many = (result[name][column] for name in agents)
     assert (some <= plain).all() and (some < plain - 0.1).any() and many.mean() < some.mean()
@@ -162,7 +162,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "agent 'best_harm:1.5': after the colon, give the number of profiles": drive(PAPER, "best_harm:1.5"),
     "agent 'best_harm:0': after the colon": drive(PAPER, "best_harm:0"),
     "agent 'best_harm': needs a scenario": lambda: eb.make_agent("best_harm"),
-    "search: candidates = 0: must be a whole number": lambda: Searched(eb.make_agent("coast"), PAPER, candidates=0),
+    "search: candidates = 0: must be a whole number": lambda: SearchAround(eb.make_agent("coast"), PAPER, candidates=0),
     "'full_brake+step+search': a search around a shield; write +search first": drive(PAPER, "full_brake+step+search"),
     "vehicle_3 is driven by 'ppo', whose commands are not known at the alert": drive(PLANS, "full_brake+search"),
     OTHER_WORLDS: drive(PAPER, "coast", seed=8, measures="limits"),

@@ -147,7 +147,7 @@ def test_best_harm__under_the_honest_count_is_never_worse_than_e_v2x_bm_and_can_
 
 @pytest.mark.parametrize("stepwise", [False, True])
 def test_search__counts_motion_at_the_horizon_as_the_episode_does(stepwise: bool) -> None:
-    problem, values = PROBLEM.counting("honest"), np.empty(1)
+    problem, values = PROBLEM.with_count("honest"), np.empty(1)
     driving, random = problem.constant(problem.bounds[:, np.newaxis, :, 1]), random_states(problem.identity, 0)
     last = problem.follow(driving)
     assert last.line[:, MOVING].any(axis=1).all()
@@ -186,7 +186,7 @@ def test_refine__golden_and_never_worse() -> None:
 def test_profiles__compact_short_and_joined() -> None:
     profile = compact(np.array([2, 2, 5, 9, 9]), np.array([[-1.0], [3.0], [-1.0], [-2.0], [4.0]]))
     assert profile.ends.tolist() == [[5, 9]] and profile.commands_mps2[0, :, 0].tolist() == [-1.0, -2.0]
-    long = Profiles(np.arange(1, 15)[np.newaxis], -np.arange(14.0).reshape(1, 14, 1)).shortened()
+    long = Profiles(np.arange(1, 15)[np.newaxis], -np.arange(14.0).reshape(1, 14, 1)).shorten()
     assert long.ends.tolist() == [[1, 2, 3, 4, 6, 8, 11, 14, 14, 14, 14, 14]]
     assert long.commands_mps2[0, :8, 0].tolist() == [-0.0, -1.0, -2.0, -3.0, -4.0, -6.0, -8.0, -11.0]
     both = join_profiles([Profiles(np.array([[3], [4]]), np.full((2, 1, 1), each)) for each in (0.0, 1.0)], 2)
