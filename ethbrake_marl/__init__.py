@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     # Scenarios, and the worlds drawn from them
     from ethbrake_marl.worlds.catalogue import list_scenarios as list_scenarios, load_scenario as load_scenario
     from ethbrake_marl.worlds.scenario import Scenario as Scenario
-    from ethbrake_marl.worlds.given import read_worlds as read_worlds, worlds_from_table as worlds_from_table
+    from ethbrake_marl.worlds.user_worlds import read_worlds as read_worlds, worlds_from_table as worlds_from_table
 
     # The game: its state, its one step, what would happen
     from ethbrake_marl.names import open_game as open_game
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
     # Agents, teams and policies
     from ethbrake_marl.names import AgentSettings as AgentSettings, make_agent as make_agent
-    from ethbrake_marl.agents.drive import Agent as Agent, Team as Team, drive as drive, play as play
+    from ethbrake_marl.agents.team import Agent as Agent, Team as Team, play_to_end as play_to_end, play as play
     from ethbrake_marl.agents.policy_agent import LearnedAgent as LearnedAgent, policy_agent as policy_agent
     from ethbrake_marl.policies.bundle import load_policy as load_policy, load_shipped as load_shipped
     from ethbrake_marl.policies.policy import Policy as Policy

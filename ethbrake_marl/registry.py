@@ -51,7 +51,7 @@ class Part:
     """
 
     def __init__(self, *arguments: Any, **settings: Any) -> None:
-        self.given, self.settings = arguments, settings
+        self.arguments, self.settings = arguments, settings
 
 
 @cache
@@ -167,7 +167,7 @@ class Registry(Mapping[str, T]):
             # An entry point that defines several parts is a dictionary of them.
             parts = value if isinstance(value, dict) else {name: value}
             for part_name, part in parts.items():
-                arguments, settings = (part.given, part.settings) if isinstance(part, Part) else ((part,), {})
+                arguments, settings = (part.arguments, part.settings) if isinstance(part, Part) else ((part,), {})
                 self._register(part_name, *arguments, **settings)
         except (EthBrakeError, TypeError) as error:
             raise InvalidInput(f"{where}: {error}") from error

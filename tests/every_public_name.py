@@ -75,7 +75,7 @@ def play_by_hand() -> float:
     after, step = game.step(state, np.zeros((10, 1)))
     assert_type(step, eb.Step)
     team = eb.Team.of({"vehicle_2": Cautious()}, "cautious")
-    last = eb.drive(game, worlds, team)
+    last = eb.play_to_end(game, worlds, team)
     states = [state for _, state in eb.play(game, worlds, team)]
     return float(harm.sum() + held.sum() + after.n + last.harm("total").sum() + len(states))
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ethbrake_marl import names
-from ethbrake_marl.agents.drive import Team, drive
+from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, UnknownName
 from ethbrake_marl.names import (
     AgentSettings,
@@ -225,7 +225,7 @@ def test_a_group__stands_for_its_agents_and_a_list_has_each_once():
 def test_a_team__drives_every_learner_with_one_agent():
     scenario, game = open_game("cooperation-3-pair")
     team = make_teams(["full_brake"], scenario)["full_brake"]
-    assert np.isfinite(drive(game, scenario.sample(5, 7), team).harm()).all()
+    assert np.isfinite(play_to_end(game, scenario.sample(5, 7), team).harm()).all()
 
 
 def test_agents__are_given_as_names_or_as_mappings_of_names_agents_and_vehicles():

@@ -76,7 +76,11 @@ def main(words: list[str]) -> None:
             print(f"left out, because they were made for other physics: {', '.join(outdated)}", file=sys.stderr)
         sheet = shipped_bounds(shipped_tables())
         heads = [column if isinstance(column, str) else column.heading for column in sheet.columns]
-        print("\n".join(f"| {' | '.join(row)} |" for row in (heads, *([c.in_words for c in r] for r in sheet.shown()))))
+        print(
+            "\n".join(
+                f"| {' | '.join(row)} |" for row in (heads, *([c.in_words for c in r] for r in sheet.formatted_rows()))
+            )
+        )
         return
     names = [Path(word).name if word.endswith(".npz") else word for word in words]  # without folders
     command = shlex.join(["docs/studies/best_harm.py", *names])

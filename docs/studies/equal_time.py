@@ -33,13 +33,15 @@ def drive(
     """Return the median processor time per world (ms) and the last states of every team. The teams drive in turn."""
     parts = [worlds.take(slice(first, first + AT_ONCE)) for first in range(0, worlds.n, AT_ONCE)]
     for team in teams.values():
-        eb.drive(game, worlds.take(slice(0, 2)), team)  # compiles kernels and reads tables, before the measurement
+        eb.play_to_end(
+            game, worlds.take(slice(0, 2)), team
+        )  # compiles kernels and reads tables, before the measurement
     spent: dict[str, list[float]] = {name: [] for name in teams}
     last = {}
     for _ in range(repeats):
         for name, team in teams.items():
             begin = time.process_time()
-            last[name] = [eb.drive(game, part, team) for part in parts]
+            last[name] = [eb.play_to_end(game, part, team) for part in parts]
             spent[name].append(1e3 * (time.process_time() - begin) / worlds.n)
     return {name: (float(np.median(spent[name])), eb.State.join(_plain(last[name]))) for name in teams}
 

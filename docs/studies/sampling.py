@@ -61,7 +61,7 @@ class Convergence:
 def driven(agent: str, worlds: int, changes: Mapping[str, Any]) -> eb.State:
     """Return the ends of the first worlds of the list under a changed scenario, with an agent as Vehicle 2."""
     scenario, game = eb.open_game(eb.load_scenario(SCENARIO).replace(**changes))
-    return eb.drive(game, scenario.sample(worlds, SEED), eb.Team.of({"vehicle_2": eb.make_agent(agent)}, agent))
+    return eb.play_to_end(game, scenario.sample(worlds, SEED), eb.Team.of({"vehicle_2": eb.make_agent(agent)}, agent))
 
 
 def convergence(agent: str, worlds: int = WORLDS, steps_s: Sequence[float] = STEPS_S) -> Convergence:

@@ -107,7 +107,7 @@ class Clock:
         """Evaluate the team if an evaluation is due. The first call comes before the first decision."""
         spent = time.process_time() - self.begun if self.points else 0.0
         if decisions >= len(self.points) * self.steps / POINTS:
-            last = eb.drive(eb.open_game(self.scenario)[1], self.worlds, make_team())
+            last = eb.play_to_end(eb.open_game(self.scenario)[1], self.worlds, make_team())
             harms = [last.harm(count).mean() for count in COUNTS]
             self.points.append([decisions, spent, *map(float, harms)])
         self.begun = time.process_time() - spent

@@ -52,7 +52,7 @@ def beyond_horizon(proposer: str) -> str:
     """Count worlds above the bound if the episode ends at 3 s, once all vehicles have braked from then on to rest."""
     scenario, game = eb.open_game(eb.load_scenario("paper-random").replace(horizon_s=3.0))
     team = eb.shield(eb.make_agent(proposer), scenario=scenario)
-    last = eb.drive(game, scenario.sample(2_000, 7), team)
+    last = eb.play_to_end(game, scenario.sample(2_000, 7), team)
     bound = last.memories["shield"].first
     later = eb.hold(last, -last.car[:, 3], [2], -last.car[:, np.newaxis, 3, [2]], 60.0, "first")[0, :, 0]
     return f"{proposer}: above the bound when all vehicles are at rest: {(later > bound + 1e-9).mean():.1%}"

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, NO_BODIES, STATE
 from ethbrake_marl.agents.pairwise import ConstantDeceleration, closed_form, pairwise
+from ethbrake_marl.agents.team import MODEL, NO_BODIES, STATE
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import StepSettings, failure, first_decision, step

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ethbrake_marl.agents.drive import Agent, Team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.team import Agent, Team
 from ethbrake_marl.episode.layer import MESSAGES
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.policies.bundle import load_drivers, load_policy, load_shipped, shipped_policies

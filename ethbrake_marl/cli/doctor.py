@@ -133,9 +133,9 @@ def _golden_impact() -> tuple[bool, str]:
 
     The exact harm, the square of the impact speed, is ``10^2 - 2 * 5 * 8 = 20`` m2/s2.
     """
-    from ethbrake_marl.agents.drive import drive
+    from ethbrake_marl.agents.team import play_to_end
     from ethbrake_marl.names import make_teams, open_game
-    from ethbrake_marl.worlds.given import worlds_from_state
+    from ethbrake_marl.worlds.user_worlds import worlds_from_state
 
     scenario, game = open_game(
         {
@@ -144,7 +144,7 @@ def _golden_impact() -> tuple[bool, str]:
         }
     )  # fmt: skip
     team = make_teams("full_brake", scenario)["full_brake"]
-    harm = float(drive(game, worlds_from_state(scenario, {}), team).harm("total")[0])
+    harm = float(play_to_end(game, worlds_from_state(scenario, {}), team).harm("total")[0])
     text = f"car at 10 m/s, braking with 5 m/s2, 8 m behind a standing car: harm {harm:.9g} (exact: 20)"
     return abs(harm - 20.0) < 1e-9, text
 
@@ -156,7 +156,7 @@ def _golden_baseline() -> tuple[bool, str]:
     """
     from ethbrake_marl.agents.pairwise import pairwise
     from ethbrake_marl.worlds.catalogue import load_scenario
-    from ethbrake_marl.worlds.given import worlds_from_state
+    from ethbrake_marl.worlds.user_worlds import worlds_from_state
 
     scenario = load_scenario("paper-distance").replace(gaps_m=7.0)
     best = pairwise(worlds_from_state(scenario, {}), 2)

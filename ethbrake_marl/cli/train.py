@@ -146,8 +146,8 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
 
     ``scenario`` is the name or path to print in that command; None: the name in the run's folder.
     """
-    from ethbrake_marl.agents.drive import Team, drive
     from ethbrake_marl.agents.scripts import Held
+    from ethbrake_marl.agents.team import Team, play_to_end
     from ethbrake_marl.cli.settings import read_settings
     from ethbrake_marl.episode.counts import COLUMN, HARM, IN_WORDS
     from ethbrake_marl.files.plain import read_object
@@ -166,7 +166,7 @@ def show_trained(out: Out, result: TrainResult, scenario: str | None = None) -> 
     ]
     if (count := plan.reward.harm_count) not in HARM:
         columns.append(Column(IN_WORDS[count].capitalize(), COLUMN[count]))
-    measured = {"full_brake": metrics_of(training, drive(game, worlds, brake))}
+    measured = {"full_brake": metrics_of(training, play_to_end(game, worlds, brake))}
     measured[result.agent] = dict(result.metrics or {})
     if OBJECTIVE_METRIC in measured["full_brake"]:
         columns.append(Column("Objective", OBJECTIVE_METRIC))

@@ -16,7 +16,7 @@ from ethbrake_marl.motion.layout import Bools, Floats, Ints
 if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game
 
-# what agents need to know that act on what their vehicle sees (all texts: `agents.drive.KNOWLEDGE`)
+# what agents need to know that act on what their vehicle sees (all texts: `agents.team.KNOWLEDGE`)
 SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
 MESSAGES = "messages"  # also the messages that the vehicle has received
 

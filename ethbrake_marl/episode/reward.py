@@ -31,13 +31,11 @@ from ethbrake_marl.episode.terms import (
     still_moving,
 )
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.files.model import UNSHOWN, FileModel, first_mistake, require
+from ethbrake_marl.files.model import UNSHOWN, FileModel, NonNegative, Positive, first_mistake, require
 from ethbrake_marl.motion.layout import Floats, Ints
 
 HarmCount = Literal["first", "total", "honest"]
-NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Omitted = Annotated[float, Field(ge=0.0, allow_inf_nan=False, exclude_if=not_)]  # in files only if it is not 0
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -136,8 +134,8 @@ class RewardParams(FileModel):
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         weighted_terms = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
         right = (
-            f"must be given together with {''.join(weighted_terms[:1])}, because its default weight is 1; write harm: 1,"
-            " or harm: 0 for a reward without harm"
+            f"must be given together with {''.join(weighted_terms[:1])}, because its default weight is 1; write harm:"
+            " 1, or harm: 0 for a reward without harm"
         )
         require(not weighted_terms or "harm" in names, ("harm",), UNSHOWN, right)
         right = "has no effect, because it changes only the term harm, whose weight is 0; leave it out or give a weight"

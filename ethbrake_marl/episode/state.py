@@ -251,7 +251,7 @@ def map_arrays(function: Callable[..., Any], memory: Any, *siblings: Any) -> Any
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """``rows`` of every array in a memory (``map_arrays``). Slices are copied, to give compiled code the usual layout."""
+    """``rows`` of every array in a memory (``map_arrays``). Slices are copied, so kernels get the usual layout."""
     if isinstance(rows, slice):
         return map_arrays(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)

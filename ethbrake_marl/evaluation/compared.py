@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.door import evaluate
 from ethbrake_marl.evaluation.evaluate import Result

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.drive import CHUNK, KNOWLEDGE, MODEL, UNSTATED, Team, check_knows, play
+from ethbrake_marl.agents.team import CHUNK, KNOWLEDGE, MODEL, UNSTATED, Team, check_knows, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import STEPS, TIME, State
 from ethbrake_marl.errors import AgentFailed, InvalidInput, check_whole_number, count_of, naming_extras, unknown_name
@@ -133,7 +133,7 @@ def evaluate_teams(
     """
     if jobs is not None:
         check_whole_number("jobs", jobs, 1)
-    draw = worlds if isinstance(worlds, DrawnWorlds) else DrawnWorlds.given(worlds)
+    draw = worlds if isinstance(worlds, DrawnWorlds) else DrawnWorlds.from_state(worlds)
     _check(draw.worlds, agents, game)
     chosen = (*DEFAULT, *measures)
     alert, n, of_worlds = draw.worlds, draw.worlds.n, columns_of(draw)
@@ -142,7 +142,7 @@ def evaluate_teams(
             raise InvalidInput(f"measure {measure.name!r}: is the name of a column of the worlds; give another name")
     owners: dict[str, Measure] = {}
     for measure in chosen:
-        for statistic in measure.shown:
+        for statistic in measure.statistics:
             owner = owners.setdefault(statistic.key, measure)
             if owner != measure:
                 raise InvalidInput(

@@ -80,7 +80,7 @@ class Measure(NamedTuple):
     of: Callable[[Game, State, State], MeasureValue] | None = None
     meaning: str = ""
     unit: str = "1"
-    shown: tuple[Statistic, ...] = ()  # statistics of its columns; any other column has a mean or rate of its name
+    statistics: tuple[Statistic, ...] = ()  # statistics of its columns; any other column has a mean or rate of its name
     watch: Callable[[Game, State], Watch | None] | None = None  # begins with (game, alert)
 
 

@@ -22,7 +22,7 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import Step
 from ethbrake_marl.episode.terms import BUILT_IN, TERMS, TermFunction, collision, drove, jerk, push, risk
 from ethbrake_marl.errors import AlreadyExists, EthBrakeError, InvalidInput, unknown_name
-from ethbrake_marl.evaluation.measures import DEFAULT, MeasureValue, Measure, Statistic, Watch
+from ethbrake_marl.evaluation.measures import DEFAULT, Measure, MeasureValue, Statistic, Watch
 from ethbrake_marl.files.python_file import load_from_file
 from ethbrake_marl.motion.layout import Floats
 from ethbrake_marl.registry import Part, Registry
@@ -33,7 +33,7 @@ def register_measure(
     of: Callable[[Game, State, State], MeasureValue] | None = None,
     *,
     unit: str = "1",
-    shown: Iterable[Statistic] = (),
+    statistics: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> None:
     """Register a measure, for ``measures_called``. Entry points: ``ethbrake_marl.measures``.
@@ -46,7 +46,7 @@ def register_measure(
             in ``_interval``, ``_low``, ``_high``, ``_error``, ``_freedom``.
         of: ``of(game, alert, last)`` returns [n] or [n, N].
         unit: unit of the value.
-        shown: how tables show it; by default the mean, or the share of worlds in which it is true.
+        statistics: how tables show it; by default the mean, or the share of worlds in which it is true.
         watch: instead of ``of``: ``watch(game, alert)`` returns a ``Watch``, which sees every step.
 
     >>> import ethbrake_marl as eb
@@ -56,7 +56,7 @@ def register_measure(
     >>> eb.register_measure("rear_speed_mps", rear_speed, unit="m/s")
 
     """
-    measure = _check_measure(name, of, unit, shown, watch)
+    measure = _check_measure(name, of, unit, statistics, watch)
     MEASURES.add(name, measure, lambda registered: registered == measure)
 
 
@@ -64,7 +64,7 @@ def _check_measure(
     name: str,
     of: Callable[[Game, State, State], MeasureValue] | None = None,
     unit: str = "1",
-    shown: Iterable[Statistic] = (),
+    statistics: Iterable[Statistic] = (),
     watch: Callable[[Game, State], Watch | None] | None = None,
 ) -> Measure:
     right = r"(?!.*_([0-9]+|interval|low|high|error|freedom)\Z)[a-z][a-z0-9_]{0,63}"
@@ -81,7 +81,7 @@ def _check_measure(
         )
     if name in (*DEFAULT_MEASURES, *RESERVED_NAMES) or name in TERMS:
         raise AlreadyExists(f"measure {name!r}: this name is already in use; give another name")
-    return Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(shown), watch)
+    return Measure(name, of, " ".join(str(function.__doc__).split()), str(unit), tuple(statistics), watch)
 
 
 DEFAULT_MEASURES = tuple(measure.name for measure in DEFAULT)
@@ -135,9 +135,9 @@ def _qualify_measure(name: str, measure: Measure) -> Measure:
             heading=statistic.heading and f"{statistic.heading} ({file})",
             short=statistic.short and f"{statistic.short}\n({file})",
         )
-        for statistic in measure.shown
+        for statistic in measure.statistics
     )
-    return measure._replace(name=name, shown=tuple(statistics))
+    return measure._replace(name=name, statistics=tuple(statistics))
 
 
 def _measures_named(name: str) -> list[Measure]:
@@ -164,7 +164,7 @@ def _of_file(file: str, name: str) -> Measure:
     value = load_from_file(file, name)
     part = value if isinstance(value, Part) else Part(value)
     try:
-        measure = _check_measure(**signature(register_measure).bind(name, *part.given, **part.settings).arguments)
+        measure = _check_measure(**signature(register_measure).bind(name, *part.arguments, **part.settings).arguments)
         if name in MEASURES and MEASURES[name] != measure:
             raise AlreadyExists(f"measure {name!r} is registered already; give another name")
     except TypeError as error:

@@ -139,19 +139,19 @@ def still_moving(game: Game, alert: State, last: State) -> MeasureValue:
 FAR = "Share of worlds in which Vehicle 1 is pushed more than 5 m beyond the point where it would stop by itself."
 PUSHED_M = Part(
     watch=pushed_m, unit="m",
-    shown=(
+    statistics=(
         Statistic("pushed_m_1", "mean", "Vehicle 1 pushed (m)", "Pushed\nm", "1"),
         Statistic("pushed_far_rate", "rate", "Vehicle 1 pushed > 5 m", "Pushed\n> 5 m", "1_far", FAR),
     ),
 )  # fmt: skip
-PUSHED_MPS = Part(pushed_mps, unit="m/s", shown=(Statistic("pushed_mps", "mean", "Push (m/s)", "Push\nm/s"),))
+PUSHED_MPS = Part(pushed_mps, unit="m/s", statistics=(Statistic("pushed_mps", "mean", "Push (m/s)", "Push\nm/s"),))
 DROVE_TOWARDS = Part(
     watch=drove_towards,
-    shown=(
+    statistics=(
         Statistic("drove_towards", "mean", "Drove before the first impact", "Drove\nshare"),
         Statistic("drove_hard_rate", "rate", "Drove at > 1 m/s2 before the first impact", "Drove\nhard", "hard"),
     ),
 )  # fmt: skip
 STILL_MOVING = Part(
-    still_moving, unit="", shown=(Statistic("still_moving_rate", "rate", "Still moving", "Still\nmoving"),)
+    still_moving, unit="", statistics=(Statistic("still_moving_rate", "rate", "Still moving", "Still\nmoving"),)
 )  # fmt: skip

@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team, play
+from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.errors import InvalidInput, count_of

@@ -47,10 +47,13 @@ class SummaryTable(list[SummaryRow]):
     """
 
     def __init__(
-        self, rows: Iterable[SummaryRow], shown: Mapping[str, tuple[Measure, Statistic]], parameters: Mapping[str, Any]
+        self,
+        rows: Iterable[SummaryRow],
+        statistics: Mapping[str, tuple[Measure, Statistic]],
+        parameters: Mapping[str, Any],
     ) -> None:
         super().__init__(rows)
-        self.shown = dict(shown)  # key of an estimate -> its measure and statistic
+        self.statistics = dict(statistics)  # key of an estimate -> its measure and statistic
         self.parameters = dict(parameters)  # plain data: scenario, seed, times, quantities, digests, versions
 
     def __repr__(self) -> str:
@@ -63,7 +66,7 @@ class SummaryTable(list[SummaryRow]):
         """Table with all columns that have a heading."""
         columns = [
             Column(statistic.heading, key, short=statistic.short, **_FORMATS.get(statistic.kind, {}))
-            for key, (_, statistic) in self.shown.items()
+            for key, (_, statistic) in self.statistics.items()
             if statistic.heading
         ]
         rows = [
@@ -88,7 +91,7 @@ class SummaryTable(list[SummaryRow]):
         """Table of measures without a column of their own, or None."""
         labels = {
             key: f"{key} ({measure.unit})" if measure.unit and statistic.kind != "decrease" else key
-            for key, (measure, statistic) in self.shown.items()
+            for key, (measure, statistic) in self.statistics.items()
             if not statistic.heading and measure not in DEFAULT
         }
         rows = [(row.agent, words, row.estimates[key]) for row in self for key, words in labels.items()]
@@ -124,10 +127,10 @@ class SummaryTable(list[SummaryRow]):
         """Heading -> meaning of the column; for measures without a column, name -> meaning."""
         texts = {
             statistic.heading: statistic.meaning or measure.meaning
-            for measure, statistic in self.shown.values()
+            for measure, statistic in self.statistics.values()
             if statistic.heading
         }
-        for measure, statistic in self.shown.values():
+        for measure, statistic in self.statistics.values():
             if not statistic.heading and measure not in DEFAULT:
                 texts[measure.name] = measure.meaning
         return HEADINGS | {
@@ -156,7 +159,7 @@ class SummaryTable(list[SummaryRow]):
             f"Worlds: {caption(self.parameters)}. Harms are means per world in m²/s². The 95 % interval of a value is"
             " in brackets or below the value."
         )
-        compared = [key for key, (_, statistic) in self.shown.items() if statistic.kind in COMPARE]
+        compared = [key for key, (_, statistic) in self.statistics.items() if statistic.kind in COMPARE]
         if any(row[key] is not None for row in self for key in compared):
             worlds += " A decrease is relative to the baseline, by default full braking."
         return "\n\n".join([worlds, *self.notes()])
@@ -204,7 +207,7 @@ def _statistics_of(result: Result) -> dict[str, tuple[str, Measure, Statistic]]:
     for name, kind in kinds.items():
         measure = result.measure_of(name)
         ending = name.removeprefix(measure.name).removeprefix("_")
-        declared = [statistic for statistic in measure.shown if statistic.ending == ending]
+        declared = [statistic for statistic in measure.statistics if statistic.ending == ending]
         for statistic in declared or [Statistic(name, "rate" if kind == "b" else "mean")]:
             if minimised != "honest" and (measure.name == COLUMN["honest"] or ending == "honest"):  # only in JSON
                 statistic = statistic._replace(heading="")
@@ -262,7 +265,7 @@ def summarise_lists(tables: Mapping[str, SummaryTable], results: Mapping[str, Re
         Column("First-impact harm", "first_impact_harm", short="First-impact\nharm"),
         Column("Total harm", "total_harm", short="Total\nharm"),
     ]  # fmt: skip
-    keys = [key for key in FIRST_COLUMNS if all(table.shown[key][1].heading for table in tables.values())]
+    keys = [key for key in FIRST_COLUMNS if all(table.statistics[key][1].heading for table in tables.values())]
     rows: list[Any] = []
     if COLUMN["honest"] in keys:
         columns.append(Column("Honest cost", COLUMN["honest"], short="Honest\ncost"))

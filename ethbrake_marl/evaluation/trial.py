@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import drive
+from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
@@ -44,7 +44,7 @@ def try_scenario(scenario: Scenario, count: str = "first") -> Trial:
         if loaded.learners and spec in AGENTS and not (alone and len(loaded.learners) > 1):
             try:
                 team = team_of(make_agent(spec, scenario=loaded, harm_count=count), loaded)
-                end_state = drive(game, worlds, team)
+                end_state = play_to_end(game, worlds, team)
             except InvalidInput as error:
                 if spec == "full_brake":  # a script's error
                     raise

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.faces.face import Face

@@ -14,9 +14,9 @@ from ethbrake_marl.episode.state import FIRST_IN_LIST, NUMBER, State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Ints
 from ethbrake_marl.worlds.describe import columns_of
-from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.sampling import DrawnWorlds, merge_draws
 from ethbrake_marl.worlds.scenario import Scenario
+from ethbrake_marl.worlds.user_worlds import worlds_from_state
 
 OPTIONS = ("initial_state", "listed_world")
 
@@ -35,7 +35,9 @@ class Stream(NamedTuple):
     game: Game
     seed: Any = None  # of all rows, or of each row, [n]
     next: Any = 0  # number of the next world, of all rows or of each row
-    given: tuple[DrawnWorlds, int] | None = None  # the worlds that the last reset asked for, and their seed or -1
+    option_worlds: tuple[DrawnWorlds, int] | None = (
+        None  # the worlds that the last reset asked for, and their seed or -1
+    )
 
     def reset(self, n: int, seed: Any, options: Any = None) -> tuple[Stream, State]:
         """New episodes in the first n worlds of ``seed``, or in the next n worlds if it is None.
@@ -55,7 +57,7 @@ class Stream(NamedTuple):
         worlds, after = (
             self._draw(np.arange(n), chosen, first) if option_worlds is None else (option_worlds[0].worlds, first)
         )
-        return self._replace(seed=chosen, next=after, given=option_worlds), self.game.reset(worlds)
+        return self._replace(seed=chosen, next=after, option_worlds=option_worlds), self.game.reset(worlds)
 
     def next_episodes(self, rows: Ints) -> tuple[Stream, State]:
         """New episodes in the next world of each row. They share no memory with other episodes."""
@@ -75,12 +77,14 @@ class Stream(NamedTuple):
         It is -1 for a world that the caller made.
         """
         seed = self.seed if isinstance(self.seed, int) else np.asarray(self.seed)[rows]
-        return seed if self.given is None else np.where(state.clock[:, NUMBER] < 0.0, self.given[1], seed)
+        return (
+            seed if self.option_worlds is None else np.where(state.clock[:, NUMBER] < 0.0, self.option_worlds[1], seed)
+        )
 
     def describe(self, state: State) -> dict[str, Any]:
         """Drawn values of each running world: name such as ``gap_1_m`` or ``scenario`` -> [n]."""
         numbers, seeds = state.clock[:, NUMBER].astype(np.int64), np.full(state.n, self.seed, object)
-        place, parts = np.arange(state.n), [] if self.given is None else [self.given[0]]
+        place, parts = np.arange(state.n), [] if self.option_worlds is None else [self.option_worlds[0]]
         of_stream = np.flatnonzero(numbers >= 0)
         place[of_stream] = np.arange(len(of_stream)) + len(parts) * state.n
         parts += [self.scenario.draw(1, int(seeds[k]), first=int(numbers[k]), purpose="training") for k in of_stream]
@@ -107,7 +111,7 @@ class Stream(NamedTuple):
             raise InvalidInput(f"reset: options has both {OPTIONS[0]} and {OPTIONS[1]}; pass only one of them")
         if "initial_state" in options:
             initial_world = worlds_from_state(self.scenario, options["initial_state"])
-            return DrawnWorlds.given(initial_world.take(np.zeros(n, np.int64))), -1
+            return DrawnWorlds.from_state(initial_world.take(np.zeros(n, np.int64))), -1
         if "listed_world" not in options:
             return None
         listed_world = options["listed_world"]

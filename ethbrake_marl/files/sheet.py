@@ -111,7 +111,7 @@ class Sheet:
 
     >>> from ethbrake_marl.files.sheet import Column, Estimate, Sheet
     >>> sheet = Sheet("Harm", ["Agent", Column("Total", "total_harm")], [("coast", Estimate(1.5, (1.0, 2.0)))])
-    >>> [cell.in_words for row in sheet.shown() for cell in row]
+    >>> [cell.in_words for row in sheet.formatted_rows() for cell in row]
     ['coast', '1.50 [1.00, 2.00]']
     >>> sheet.json()
     [{'Agent': 'coast', 'total_harm': 1.5, 'total_harm_interval': [1.0, 2.0]}]
@@ -138,7 +138,7 @@ class Sheet:
     def names(self) -> list[str]:
         return [column.name for column in self.formats]
 
-    def shown(self) -> Iterator[str | tuple[CellText, ...]]:
+    def formatted_rows(self) -> Iterator[str | tuple[CellText, ...]]:
         """Each row as formatted cells, and each section as its name."""
         columns = self.formats
         for row in self.rows:
@@ -180,7 +180,7 @@ class Sheet:
             row
             if isinstance(row, str)
             else [column.in_terminal(cell) for column, cell in zip(columns, row, strict=True)]
-            for row in self.shown()
+            for row in self.formatted_rows()
         ]
         column_count, numbers = self._fitted(options.max_width, [row for row in rows if not isinstance(row, str)])
         for k, column in enumerate(columns[:column_count]):

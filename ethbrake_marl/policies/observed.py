@@ -18,8 +18,8 @@ from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import CorruptBundle, InvalidInput
 from ethbrake_marl.files.model import FileModel
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.given import worlds_from_table
 from ethbrake_marl.worlds.roles import names_of
+from ethbrake_marl.worlds.user_worlds import worlds_from_table
 
 # The worlds in which features are tried. Files of policies depend on them.
 TRIAL_LINE = {

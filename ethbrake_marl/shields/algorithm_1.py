@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent, propose
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
+from ethbrake_marl.agents.team import MODEL, Agent, propose
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import price

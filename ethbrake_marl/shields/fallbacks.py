@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent, propose
 from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.agents.team import Agent, propose
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import descend, hold

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Agent, Team, check_agent
+from ethbrake_marl.agents.team import Agent, Team, check_agent
 from ethbrake_marl.episode.counts import check_count
 from ethbrake_marl.episode.game import Game, Shield
 from ethbrake_marl.episode.script_calls import guard_scripts

@@ -37,7 +37,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent, propose
+from ethbrake_marl.agents.team import MODEL, Agent, propose
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import follow_plans
 from ethbrake_marl.episode.script_calls import begin_script
@@ -121,7 +121,7 @@ class StepShield:
 
     # A subclass for worlds that may be in one of M states overrides the next two; ``first_memory`` gets the states.
 
-    def seen(self, state: State, memory: StepShieldMemory) -> State:
+    def possible_states(self, state: State, memory: StepShieldMemory) -> State:
         """M possible states of each world, M rows per world, the nominal one first. Here M = 1."""
         return state
 
@@ -162,7 +162,7 @@ class StepShield:
     ) -> StepShieldMemory:
         """Memory at the first decision; its plan is the best constant actions or the agents' rollout.
 
-        ``states`` are the possible states (``seen``), ``agents`` body -> memory at the alert.
+        ``states`` are the possible states (``possible_states``), ``agents`` body -> memory at the alert.
         """
         plan, harm = self.cheapest(game, states, self.plans(game, alert, state, states))
         caps = follow_plans(game, state, plan, self.count)[0].borne_harm(self.count) if self.cap else None
@@ -256,7 +256,7 @@ class StepShield:
         """
         most, plans = self.bound(memory)[rows], memory.plan[rows]
         plans[np.arange(len(rows)), now] = actions
-        possible_states = self.seen(state, memory)
+        possible_states = self.possible_states(state, memory)
         M = possible_states.n // state.n
         before = take_worlds(possible_states, rows, M)
         # First the actions with the rest of the present plan, then, where this is rejected, with each fallback.

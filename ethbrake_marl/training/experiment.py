@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.door import EPISODES, SEED, evaluate

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import CHUNK, Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.team import CHUNK, Team, play_to_end
 from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.episode.objectives import OBJECTIVES, amounts, objectives_of
 from ethbrake_marl.episode.state import State
@@ -38,7 +38,7 @@ def measure_on_list(training: Training) -> Evaluate:
     def measure(policies: Policies) -> dict[str, float]:
         drivers = {1 + scenario.vehicle_names.index(name): LearnedAgent(policy) for name, policy in policies.items()}
         team = Team("policy", drivers)
-        return metrics_of(training, State.join([drive(game, part, team) for part in parts]))
+        return metrics_of(training, State.join([play_to_end(game, part, team) for part in parts]))
 
     return measure
 

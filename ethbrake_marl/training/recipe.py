@@ -15,7 +15,7 @@ from pydantic import Field, field_validator, model_validator
 from ethbrake_marl.episode.features import listed_features
 from ethbrake_marl.episode.reward import RewardParams, own_terms
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.files.model import NAME_PATTERN, FileModel, Wording, read_model, refuse
+from ethbrake_marl.files.model import NAME_PATTERN, FileModel, NonNegative, Positive, Wording, read_model, refuse
 from ethbrake_marl.files.yaml import Document, YamlPath, flow_text, read_yaml
 from ethbrake_marl.policies.network import Activation, NetworkSpec
 from ethbrake_marl.registry import Registry
@@ -24,8 +24,6 @@ from ethbrake_marl.worlds.scenario import plain
 
 Scheme = Literal["single", "shared", "independent", "centralised"]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
-Positive = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 Rate = Annotated[float, Field(gt=0.0, le=1.0)]
 LayerSizes = Annotated[
     tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(strict=False, min_length=1, max_length=8)

@@ -54,7 +54,7 @@ class DrawnWorlds(NamedTuple):
     rejected: int = 0  # draws with an impact before the first learner could act
 
     @classmethod
-    def given(cls, worlds: State) -> DrawnWorlds:
+    def from_state(cls, worlds: State) -> DrawnWorlds:
         n = worlds.n
         return cls(worlds, np.full(n, np.nan), np.full((n, worlds.vehicles), ""), np.full(n, ""), np.full(n, ""))
 

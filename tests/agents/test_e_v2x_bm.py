@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ethbrake_marl.agents import e_v2x_bm
-from ethbrake_marl.agents.drive import MODEL, STATE, Team, drive
 from ethbrake_marl.agents.e_v2x_bm import coupled, harms
 from ethbrake_marl.agents.pairwise import CLOSED_FORM_CANDIDATES, find_candidates, harm_of_deceleration, meet, pairwise
+from ethbrake_marl.agents.team import MODEL, STATE, Team, play_to_end
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.step import at_alert, first_decision
 from ethbrake_marl.errors import InvalidInput, PhysicsError
@@ -298,7 +298,7 @@ def test_agent__does_the_harm_that_it_predicts_to_the_last_bit(name, n, count):
     worlds, agent = scenario.sample(n, 5), make_agent("e_v2x_bm", scenario=scenario, harm_count=count)
     body, *others = scenario.learners
     team = Team("one", {body: agent, **dict.fromkeys(others, make_agent("full_brake"))})
-    last = drive(game, worlds, team)
+    last = play_to_end(game, worlds, team)
     predicted = last.memories[body].predicted_harm
     assert (predicted == last.harm(count)).all() and predicted.any()
     assert agent.name == "e_v2x_bm" and agent.knows == MODEL
@@ -308,7 +308,7 @@ def test_agent__does_the_harm_that_it_predicts_to_the_last_bit(name, n, count):
 def test_agents__have_the_harm_of_the_readme():
     scenario, game = open_game("paper-random")
     worlds, agent = scenario.sample(10_000, 7), make_agent("e_v2x_bm:pairwise")
-    last = drive(game, worlds, Team("pairwise", {2: agent}))
+    last = play_to_end(game, worlds, Team("pairwise", {2: agent}))
     means = last.harm().mean(), last.harm("total").mean(), last.memories[2].predicted_harm.mean()
     assert [f"{mean:.2f}" for mean in means] == ["19.20", "20.68", "9.45"] and agent.knows == STATE
 

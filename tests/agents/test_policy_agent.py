@@ -21,9 +21,9 @@ from gymnasium.spaces import Box, Discrete
 from stable_baselines3.common import vec_env
 from stable_baselines3.common.monitor import Monitor
 
-from ethbrake_marl.agents.drive import Agent, Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent, policy_agent
 from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.agents.team import Agent, Team, play_to_end
 from ethbrake_marl.episode.features import GROUPS
 from ethbrake_marl.episode.observe import View
 from ethbrake_marl.errors import AgentFailed, InvalidInput, Unfamiliar
@@ -45,7 +45,7 @@ TINY = {"net_arch": [4]}
 
 
 def harms(agent: Agent, game: Any = GAME, worlds: Any = WORLDS) -> list[float]:
-    return drive(game, worlds, Team("mine", {2: agent})).harm("first").tolist()
+    return play_to_end(game, worlds, Team("mine", {2: agent})).harm("first").tolist()
 
 
 def actions(agent: Agent) -> list[float]:
@@ -98,7 +98,7 @@ def test_learned_agent__warns_of_another_training(change: dict[str, Any], text: 
     policy = type(PPO)(PPO.manifest.model_copy(update=change), PPO.tensors)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        drive(GAME, WORLDS, Team("old", {2: LearnedAgent(policy, "old")}))
+        play_to_end(GAME, WORLDS, Team("old", {2: LearnedAgent(policy, "old")}))
     texts = [str(each.message) for each in caught if each.category is Unfamiliar]
     assert len(texts) == (text is not None) and all(each.startswith(text or "") for each in texts)
 
@@ -170,7 +170,7 @@ def test_memory__belongs_to_each_world_and_to_nobody_else() -> None:
         assert command == pytest.approx(-k / 10.0 * state.car[:, BRAKING, 2])
         assert all(np.array_equal(a, b) for a, b in zip(before, memory, strict=True))
         memory = after
-    bound = drive(GAME, WORLDS, Team("mine", {2: agent}, StepShield({2: agent})))
+    bound = play_to_end(GAME, WORLDS, Team("mine", {2: agent}, StepShield({2: agent})))
     assert (bound.harm("first") <= bound.memories["shield"].first).all() and sum(harms(agent)) > bound.harm().sum()
 
 
@@ -397,7 +397,7 @@ def test_answer__that_is_refused_names_the_vehicle_whatever_the_others_do(messag
     good, bad = policy_agent(lambda seen: np.zeros(len(seen)), name="good"), policy_agent(ANSWERS[message], name="bad")
     where = f"world 6, vehicle_{body}" if "action " in message else f"vehicle_{body}"
     with refused(f"agent 'bad', {where}{message}", AgentFailed):
-        drive(game, scenario.sample(3, 7, first=5), Team("mine", {2: good, 3: good} | {body: bad}))
+        play_to_end(game, scenario.sample(3, 7, first=5), Team("mine", {2: good, 3: good} | {body: bad}))
 
 
 @pytest.mark.parametrize("body", [2, 3])
@@ -405,7 +405,7 @@ def test_answer__of_a_policy_with_a_state_names_the_vehicle(body: int) -> None:
     scenario, game = open_game("cooperation-3-pair")
     bad = policy_agent(lambda seen, state: seen[:, 0], initial_state=lambda n: np.zeros((n, 1)), name="bad")
     with refused(f"agent 'bad', vehicle_{body}: returned array(", AgentFailed):
-        drive(game, scenario.sample(3, 7), Team("mine", {2: Held("coast"), 3: Held("coast")} | {body: bad}))
+        play_to_end(game, scenario.sample(3, 7), Team("mine", {2: Held("coast"), 3: Held("coast")} | {body: bad}))
 
 
 @pytest.mark.parametrize(("index", "message"), [(5, "action 5"), (-1, "action -1"), (1.0, "float64 of shape (12,)")])

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ethbrake_marl import policies
-from ethbrake_marl.agents.drive import drive
+from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
 from tests.refused import refused
@@ -29,4 +29,4 @@ def test_team_of_a_run__has_a_policy_for_each_learner(tmp_path: Path) -> None:
         shutil.copytree(SHIPPED, tmp_path / "policy" / vehicle)
     scenario, game = open_game("cooperation-3-pair")
     team: Any = make_agent(f"team@{tmp_path}", scenario=scenario)
-    assert list(team.drivers) == [2, 3] and drive(game, scenario.sample(2, 7), team).ended.all()
+    assert list(team.drivers) == [2, 3] and play_to_end(game, scenario.sample(2, 7), team).ended.all()

@@ -17,7 +17,7 @@ from ethbrake_marl.agents.pairwise import CLOSED_FORM_CANDIDATES, find_candidate
 from ethbrake_marl.cli.app import run_command
 from ethbrake_marl.motion.layout import BRAKING, LATENCY
 from ethbrake_marl.worlds.explain import new_scenario_text
-from ethbrake_marl.worlds.given import worlds_from_table
+from ethbrake_marl.worlds.user_worlds import worlds_from_table
 from tests.docs.printed import BLOCK, PAGES, PICTURES, ROOT, TABLES, missing_figures, pictures, rows, tables
 from tests.docs.site import DOCS, load
 from tests.programmes import bounds

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.episode.counts import COUNTS, COUNTED_ROWS, pair_amounts
+from ethbrake_marl.episode.counts import COUNTED_ROWS, COUNTS, pair_amounts
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.objectives import amounts, objectives_of

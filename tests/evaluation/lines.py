@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.layer import SENSORS
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.evaluation.evaluate import Result, evaluate_teams

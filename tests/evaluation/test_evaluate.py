@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.e_v2x_bm import EV2XBM
 from ethbrake_marl.agents.policy_agent import LearnedAgent
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.episode.terms import TERMS, register_term
 from ethbrake_marl.errors import AlreadyExists, InvalidInput, PhysicsError, UnknownName
@@ -152,8 +152,8 @@ def test_measure_of_ones_own__is_a_column_with_its_statistic(monkeypatch: pytest
         """Whether the last gap is below 1 m."""
         return last.gaps_m < 1.0 if game.settings.learners[0] == 1 else last.gaps_m[:, -1] < 1.0
 
-    register_measure("near", near, unit="", shown=[Statistic("near_rate", "rate", "Near")])
-    register_measure("near", near, unit="", shown=[Statistic("near_rate", "rate", "Near")])  # twice the same
+    register_measure("near", near, unit="", statistics=[Statistic("near_rate", "rate", "Near")])
+    register_measure("near", near, unit="", statistics=[Statistic("near_rate", "rate", "Near")])  # twice the same
     result = evaluated("paper-random", 20, measures=["near"])
     table = summarise(result)
     assert table[0]["near_rate"] == rate(result["full_brake"]["near"]) and "Near" in str(table)
@@ -253,7 +253,7 @@ def test_agents_and_measures_of_a_python_file__run_in_every_process(
 
 
 def test_measures_of_two_files_with_one_name__stand_side_by_side_and_one_after_the_other(empty_folder: Path) -> None:
-    near = "near = Part(near, shown=[Statistic('near_rate', 'rate', 'Near')])\n"
+    near = "near = Part(near, statistics=[Statistic('near_rate', 'rate', 'Near')])\n"
     for file, value in (("mine.py", 1.0), ("b/mine.py", 2.0)):
         Path(file).parent.mkdir(exist_ok=True)
         text = f"def worst(game, alert, last):\n    'A number.'\n    return 0.0 * last.time_s + {value}\n"

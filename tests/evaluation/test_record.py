@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.drive import Team, drive
+from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.evaluation.record import EpisodeRecord, record_episode
 from ethbrake_marl.names import open_game
 from ethbrake_marl.worlds.scenario import Scenario
@@ -43,7 +43,7 @@ def test_record__is_the_episode_of_an_evaluation_and_ends_with_it(scenario: str)
     for number in range(4):
         agent = FULL_BRAKE if scenario == "stress-wide" else GENTLE
         record, team = recorded(scenario, agent, number), Team("x", {2: agent})
-        last = drive(game, loaded.sample(1, 7, first=number), team)
+        last = play_to_end(game, loaded.sample(1, 7, first=number), team)
         assert record.time_s[-1] == last.time_s[0] and record.last.line.tolist() == last.line.tolist()
         assert record.speeds_mps[-1].tolist() == last.speeds_mps[0].tolist()
         assert record.gaps_m[-1].tolist() == last.gaps_m[0].tolist()

@@ -125,7 +125,7 @@ def test_heading__of_a_measure_of_ones_own_is_shown_whatever_its_name(tmp_path: 
     (tmp_path / "mine.py").write_text(
         "from ethbrake_marl import Part\nfrom ethbrake_marl.evaluation.measures import Statistic\n\n\n"
         "def value(game, alert, last):\n    'Nothing.'\n    return alert.time_s\n\n\n"
-        "honest_gap = Part(value, shown=(Statistic('honest_gap', 'mean', 'Honest gap'),))\n"
+        "honest_gap = Part(value, statistics=(Statistic('honest_gap', 'mean', 'Honest gap'),))\n"
     )
     result = eb.evaluate("paper-random", "full_brake", episodes=3, measures=f"{tmp_path / 'mine.py'}:honest_gap")
     assert "honest_gap" in summarise(result).sheet().names

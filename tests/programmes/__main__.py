@@ -1,7 +1,7 @@
 """Command line of the programmes: ``python -m tests.programmes [NAME [options]]``; without a name it lists them.
 
 A programme is a module of this folder. Its function ``cases(given)`` yields the name of each case and a function that
-runs it and returns ``ProgressOption``: True (good), False (failed) or None (skipped, or without a claim), and one line of text.
+runs it and returns ``Told``: True (good), False (failed) or None (skipped, or without a claim), and one line of text.
 An ``AssertionError`` is a failure. The optional table ``OPTIONS`` has arguments of ``add_argument``.
 """
 

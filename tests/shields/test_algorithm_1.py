@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.drive import Agent, Team, drive
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.agents.team import Agent, Team, play_to_end
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.names import make_agent, open_game
 from ethbrake_marl.policies.bundle import load_shipped
@@ -32,7 +32,7 @@ def test_the_harm_is_the_smaller_one_to_the_bit(agent: Agent, name: str, count: 
     if name == "build-up":
         agent = Held("full_brake") if agent is PPO else agent
     game, alert, team = hybrid(agent, name, harm_count=count)
-    last = drive(game, alert, team)
+    last = play_to_end(game, alert, team)
     memory = last.memories["shield"]
     assert (last.harm(count) == np.minimum(memory.policy_harm, memory.bound_harm)).all()
     assert (memory.chosen == (memory.policy_harm <= memory.bound_harm)).all()
@@ -40,7 +40,7 @@ def test_the_harm_is_the_smaller_one_to_the_bit(agent: Agent, name: str, count: 
 
 def test_a_better_policy_drives_as_if_alone() -> None:
     game, alert, team = hybrid(PPO)
-    last, alone = drive(game, alert, team), drive(game, alert, team._replace(shield=None))
+    last, alone = play_to_end(game, alert, team), play_to_end(game, alert, team._replace(shield=None))
     chosen = last.memories["shield"].chosen
     assert chosen.mean() > 0.9
     np.testing.assert_allclose(last.harm()[chosen], alone.harm()[chosen], atol=1e-6)
@@ -49,10 +49,10 @@ def test_a_better_policy_drives_as_if_alone() -> None:
 
 def test_h_star_is_that_of_e_v2x_bm() -> None:
     game, alert, team = hybrid(Held("coast"))
-    memory = drive(game, alert, team).memories["shield"]
+    memory = play_to_end(game, alert, team).memories["shield"]
     np.testing.assert_allclose(memory.bound_harm, coupled(alert, 2, "first", game.settings.horizon_s).harm, atol=1e-6)
     game, alert, team = hybrid(Held("coast"), bound="pairwise")
-    memory = drive(game, alert, team).memories["shield"]
+    memory = play_to_end(game, alert, team).memories["shield"]
     np.testing.assert_array_equal(memory.bound_harm, pairwise(alert, 2).harm)
     wanted = np.where(memory.chosen, 0.0, -pairwise(alert, 2).deceleration_mps2)
     np.testing.assert_allclose(memory.applied[:, 0] * alert.braking_capacity_mps2[:, 1], wanted, atol=1e-12)

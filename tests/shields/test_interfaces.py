@@ -12,9 +12,9 @@ from pettingzoo.test import api_test, parallel_api_test
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.errors import InvalidInput, UnknownName
 from ethbrake_marl.faces.gymnasium import EthBrakeEnv
 from ethbrake_marl.faces.pettingzoo import EthBrakeParallelEnv, raw_env

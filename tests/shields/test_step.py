@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.agents.policy_agent import LearnedAgent
 from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.play import follow_plans, price
@@ -20,7 +20,7 @@ from ethbrake_marl.policies.bundle import load_shipped
 from ethbrake_marl.shields.fallbacks import first_plans
 from ethbrake_marl.shields.shield import ShieldReason
 from ethbrake_marl.shields.step import StepShield
-from ethbrake_marl.worlds.given import worlds_from_state
+from ethbrake_marl.worlds.user_worlds import worlds_from_state
 from tests.shields.attack import LINES, WAYS
 
 NAN = np.nan
@@ -221,7 +221,7 @@ def shielded(agent: Any, name: str = "paper", n: int = 40, **options: Any) -> tu
 
 def test_a_team_better_than_constants_is_left_alone() -> None:
     game, alert, team = shielded(LearnedAgent(load_shipped("ppo")))
-    last, alone = drive(game, alert, team), drive(game, alert, team._replace(shield=None))
+    last, alone = play_to_end(game, alert, team), play_to_end(game, alert, team._replace(shield=None))
     memory = last.memories["shield"]
     better = alone.harm() <= memory.first
     assert better.mean() > 0.9 and (memory.replaced[better] == 0).all()
@@ -230,7 +230,7 @@ def test_a_team_better_than_constants_is_left_alone() -> None:
 
 def test_an_agent_worse_than_constants_is_held_to_them() -> None:
     game, alert, team = shielded(make_agent("full_brake"))
-    last, alone = drive(game, alert, team), drive(game, alert, team._replace(shield=None))
+    last, alone = play_to_end(game, alert, team), play_to_end(game, alert, team._replace(shield=None))
     assert (last.harm() <= alone.harm()).all() and last.harm().mean() < 0.8 * alone.harm().mean()
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.drive import drive
+from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.names import make_agent, open_game, team_of
 from ethbrake_marl.policies.bundle import load_policy
 from ethbrake_marl.training import train as train_module
@@ -31,7 +31,7 @@ def test_train__leaves_policies_that_drive_as_they_were_measured(scheme: Any, tm
     separate = scheme == "independent"
     assert result.agent == f"team@{run}"
     scenario, game = open_game(PAIR)
-    last = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))
+    last = play_to_end(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))
     least = min(each["first_impact_harm"] for each in result.evaluations)
     assert last.harm("first").mean() == pytest.approx(least, rel=1e-12)
     manifests = [load_policy(run / place).manifest for place in result.training.drivers.values()]

@@ -22,7 +22,7 @@ from stable_baselines3 import A2C
 from stable_baselines3.common.vec_env import VecNormalize
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from ethbrake_marl.agents.drive import drive
+from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.errors import AlreadyExists, InvalidInput
 from ethbrake_marl.motion.digest import physics_digest
 from ethbrake_marl.names import make_agent, open_game, team_of
@@ -81,7 +81,7 @@ def test_train__leaves_the_policy_that_is_the_best_on_the_list(trained: tuple[Pa
     assert policy.manifest.learners == ("vehicle_2",) and policy.manifest.seeds == {"training": 0, "evaluation": 7}
     scenario, game = open_game("paper-random")
     assert result.agent == f"policy@{run}"
-    ended = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent), scenario))
+    ended = play_to_end(game, scenario.sample(10, 7), team_of(make_agent(result.agent), scenario))
     least = min(each["first_impact_harm"] for each in result.evaluations)
     assert (
         ended.harm("first").mean() == pytest.approx(least, rel=1e-12) and least == result.metrics["first_impact_harm"]
@@ -189,7 +189,7 @@ def test_train__objectives_decide_where_they_are_not_the_harm_of_the_line(tmp_pa
     recipe = TINY.replace(reward={"harm": 0.05, "objective": "own"}, total_steps=UPDATE)
     result = train(recipe, PAIR, tmp_path / "run", on_progress=None)
     scenario, game = open_game(PAIR)
-    last = drive(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))
+    last = play_to_end(game, scenario.sample(10, 7), team_of(make_agent(result.agent, scenario=PAIR), scenario))
     assert result.metrics is not None
     own = [result.metrics[f"objective_{name}"] for name in result.policies]
     assert own == pytest.approx(last.borne_harm("first")[:, 1:].mean(axis=0))

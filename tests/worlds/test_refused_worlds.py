@@ -8,8 +8,8 @@ import pytest
 
 from ethbrake_marl.worlds import sampling
 from ethbrake_marl.worlds.catalogue import load_scenario
-from ethbrake_marl.worlds.given import read_worlds, worlds_from_state, worlds_from_table
 from ethbrake_marl.worlds.scenario import Scenario
+from ethbrake_marl.worlds.user_worlds import read_worlds, worlds_from_state, worlds_from_table
 from tests.refused import refused
 
 PAPER = load_scenario("paper-random")

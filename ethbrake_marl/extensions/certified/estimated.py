@@ -189,7 +189,12 @@ class MedianLine(NamedTuple):
         ``state``: the truth now.
         """
         news = self.received(state)
-        far = np.abs(self.message_contents(median, self.received(median).sample) - self.message_contents(state, news.sample)) > SURPRISE
+        far = (
+            np.abs(
+                self.message_contents(median, self.received(median).sample) - self.message_contents(state, news.sample)
+            )
+            > SURPRISE
+        )
         impacts = slice(self.body - 1, self.body + 1)
         struck = median.line[:, HIT, impacts] != state.line[:, HIT, impacts]
         return np.asarray(~((far & news.pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import ESTIMATED, Agent
 from ethbrake_marl.agents.e_v2x_bm import coupled
 from ethbrake_marl.agents.pairwise import pairwise
+from ethbrake_marl.agents.team import ESTIMATED, Agent
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State, check_exact
 from ethbrake_marl.episode.step import hold_commands
@@ -73,7 +73,7 @@ class EstimatedShield(StepShield):
         after, _ = game.follow(median, applied)
         return applied, memory._replace(members=memory.members._replace(median=after))
 
-    def seen(self, state: State, memory: StepShieldMemory) -> State:
+    def possible_states(self, state: State, memory: StepShieldMemory) -> State:
         """Median lines, with the present memories of the agents in ``state``."""
         median: State = memory.members.median
         agent_memories = {body: state.memories[body] for body in self.drivers if body in state.memories}

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent
+from ethbrake_marl.agents.team import MODEL, Agent
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import END, State, map_arrays, take
@@ -75,7 +75,7 @@ class RobustShield(StepShield):
         memory = self.first_memory(game, alert, state, states, self.agents_at(game, alert))
         return memory._replace(members=Members(split_members(states, state.n), np.ones(state.n, np.bool_)))
 
-    def seen(self, state: State, memory: StepShieldMemory) -> State:
+    def possible_states(self, state: State, memory: StepShieldMemory) -> State:
         """Stored members, M rows for each world, with the present memories of the agents in ``state``."""
         states = join_members(memory.members.states)
         rows = np.arange(state.n).repeat(states.n // state.n)

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team
 from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.counts import COLUMN
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared, amounts, objectives_of
@@ -27,7 +27,7 @@ from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.door import SEED
 from ethbrake_marl.evaluation.evaluate import evaluate_teams
 from ethbrake_marl.evaluation.identity import about_scenario
-from ethbrake_marl.evaluation.measures import MeasureValue, Measure
+from ethbrake_marl.evaluation.measures import Measure, MeasureValue
 from ethbrake_marl.evaluation.statistics import Clusters
 from ethbrake_marl.extensions.cooperation.levels import Level, common_worlds
 from ethbrake_marl.extensions.search.best_harm import search_list

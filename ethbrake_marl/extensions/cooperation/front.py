@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team
+from ethbrake_marl.agents.team import Team
 from ethbrake_marl.episode.counts import COUNTS, check_count
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from ethbrake_marl.agents.drive import Team, drive
 from ethbrake_marl.agents.scripts import FULL_BRAKE
+from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.counts import COUNTS, IN_WORDS
 from ethbrake_marl.errors import count_of
 from ethbrake_marl.evaluation.captions import by_recording
 from ethbrake_marl.evaluation.identity import about_scenario, versions, worlds_sha256
 from ethbrake_marl.evaluation.statistics import Clusters, difference, mean
 from ethbrake_marl.extensions.cooperation.front import BorneHarm, Front, weighted_harm
+from ethbrake_marl.extensions.cooperation.results import Json
 from ethbrake_marl.extensions.report.style import (
     TITLES,
     finish,
@@ -39,8 +39,6 @@ FRONT_NAME = (
 )
 MOST_DIMENSIONS = 5  # the time grows with the number of points to the power of the dimensions less one
 SIZE_IN = (5.6, 4.6)  # narrow enough for a phone
-
-Json = dict[str, Any]
 
 
 def front_results(
@@ -144,7 +142,7 @@ def hypervolume(points: Floats, reference: Floats) -> float:
 
 def full_braking(scenario: Scenario, drawn_worlds: DrawnWorlds) -> BorneHarm:
     game = open_game(scenario)[1]
-    last = drive(game, drawn_worlds.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
+    last = play_to_end(game, drawn_worlds.worlds, Team("full_brake", dict.fromkeys(scenario.learners, FULL_BRAKE)))
     return {count: last.borne_harm(count) for count in COUNTS}
 
 

@@ -73,7 +73,9 @@ class CudaVineModel(VineModel):
         super().__init__(training, environment)
         count, place, zeros = recipe.n_envs * recipe.n_steps, self.worlds.device, torch.zeros
         kind = self.worlds.pool.line.dtype
-        self.visited = StoredEpisodes(*(zeros(*part.shape[:-1], count, dtype=kind, device=place) for part in self.worlds.pool))
+        self.visited = StoredEpisodes(
+            *(zeros(*part.shape[:-1], count, dtype=kind, device=place) for part in self.worlds.pool)
+        )
         self.seen = self.worlds.reset().repeat(recipe.n_steps, 1, 1)  # [D, L, F]
         self.each_learner = torch.arange(self.learners, device=place)
         self.played = Graphed(self.play_here, place)

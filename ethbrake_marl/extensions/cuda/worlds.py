@@ -21,10 +21,10 @@ from ethbrake_marl.extensions.cuda.kernels import (
     PHYSICS_FAILED,
     RENEW,
     STEP_MODE,
-    ViewArrays,
     Results,
     Ruling,
     StoredEpisodes,
+    ViewArrays,
     memory_of,
 )
 from ethbrake_marl.names import open_game

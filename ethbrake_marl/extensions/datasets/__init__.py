@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team, play
+from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.commands import actions_of
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.observe import Observations

@@ -16,7 +16,13 @@ from torch.nn.functional import softplus
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.learners.branches import Moment, moving, play_on
 from ethbrake_marl.extensions.learners.model import BranchingModel
-from ethbrake_marl.extensions.learners.networks import AveragedNetwork, ReplayBuffer, draw_rows, perceptron, zero_last_layer
+from ethbrake_marl.extensions.learners.networks import (
+    AveragedNetwork,
+    ReplayBuffer,
+    draw_rows,
+    perceptron,
+    zero_last_layer,
+)
 from ethbrake_marl.extensions.learners.recipes import RolloutClassificationRecipe
 from ethbrake_marl.motion.layout import Floats, Ints
 from ethbrake_marl.policies.layers import Float32s

@@ -12,7 +12,13 @@ from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.layer import Layer, LayeredScript, LayeredView
 from ethbrake_marl.episode.observe import Observations, View
 from ethbrake_marl.episode.state import State
-from ethbrake_marl.extensions.messages.belief import ages_s, belief_of, predictable_belief_of, known_pieces, require_pieces
+from ethbrake_marl.extensions.messages.belief import (
+    ages_s,
+    belief_of,
+    known_pieces,
+    predictable_belief_of,
+    require_pieces,
+)
 from ethbrake_marl.extensions.messages.links import (
     MESSAGES_KEY,
     P_ACCELERATION,

@@ -99,7 +99,12 @@ class Reports(Extension):
         require(isinstance(value, Mapping) and len(value) > 0, (key,), value, right)
         for name, content in value.items():
             at = (key, name)
-            require(name in REPORT_KEYS, at, UNSHOWN, f"unknown key; {suggestion(str(name), REPORT_KEYS) or f'known: {REPORT_KEYS}'}")
+            require(
+                name in REPORT_KEYS,
+                at,
+                UNSHOWN,
+                f"unknown key; {suggestion(str(name), REPORT_KEYS) or f'known: {REPORT_KEYS}'}",
+            )
             if name == "liar":
                 require(isinstance(content, str), at, content, "must be the name of a vehicle, such as vehicle_1")
                 continue

@@ -60,10 +60,10 @@ def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int
     return int(learners[0])
 
 
-AVOIDABLE = Part(avoidable, shown=(Statistic("avoidable_rate", "rate", "Avoidable", "Avoid-\nable"),))
+AVOIDABLE = Part(avoidable, statistics=(Statistic("avoidable_rate", "rate", "Avoidable", "Avoid-\nable"),))
 PROVEN_HARM = Part(
     proven_harm, unit="m2/s2",
-    shown=(
+    statistics=(
         Statistic("proven_harm", "mean", "Proven harm", "Proven\nharm"),
         Statistic("impact_proven_rate", "rate", "Impact proven", "Impact\nproven", "impact"),
     ),

@@ -21,7 +21,7 @@ from ethbrake_marl.extensions.report.best_known import BestKnown, shown_counts
 from ethbrake_marl.extensions.report.episodes import episodes_section, shown_worlds, worst_rows
 from ethbrake_marl.extensions.report.figures import harm_above, harm_by_agent
 from ethbrake_marl.extensions.report.page import Section, drawing, page_part, table, whole_page
-from ethbrake_marl.files.sheet import Column, Sheet, CellText
+from ethbrake_marl.files.sheet import CellText, Column, Sheet
 from ethbrake_marl.files.store import write_output
 from ethbrake_marl.motion.layout import Bools
 

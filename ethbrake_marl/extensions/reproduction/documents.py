@@ -15,7 +15,10 @@ LATEX = str.maketrans({
 
 def sheet_texts(sheet: Sheet) -> list[list[str]]:
     """Texts of headings and rows."""
-    return [sheet.headings, *([cell.in_words for cell in row if not isinstance(cell, str)] for row in sheet.shown())]
+    return [
+        sheet.headings,
+        *([cell.in_words for cell in row if not isinstance(cell, str)] for row in sheet.formatted_rows()),
+    ]
 
 
 def markdown(sheet: Sheet) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ethbrake_marl.episode.counts import SHORT_NAMES
 from ethbrake_marl.evaluation.statistics import mean
-from ethbrake_marl.extensions.report.figures import curves_figure, curve_over_seeds
+from ethbrake_marl.extensions.report.figures import curve_over_seeds, curves_figure
 from ethbrake_marl.extensions.report.style import TITLES
 from ethbrake_marl.extensions.reproduction.made import DrawnFigure, Made, ReproductionSettings
 from ethbrake_marl.extensions.reproduction.verdicts import Claim, Less, judge

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.agents.pairwise import (
     CLOSED_FORM_CANDIDATES,
     RELATIVE_TIE,
@@ -23,6 +22,7 @@ from ethbrake_marl.agents.pairwise import (
     harm_of_deceleration,
     pairwise,
 )
+from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import ENDED, State
 from ethbrake_marl.errors import Unfamiliar
@@ -175,4 +175,4 @@ def drive_all(worlds: Reading, spec: str, counted: str, episodes: int) -> Random
     scenario, game, alert = open_reading(worlds, episodes)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", Unfamiliar)
-        return outcome_of(drive(game, alert, teams_of({spec: spec}, scenario, harm_count=counted)[spec]))
+        return outcome_of(play_to_end(game, alert, teams_of({spec: spec}, scenario, harm_count=counted)[spec]))

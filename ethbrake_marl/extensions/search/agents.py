@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import MODEL, Agent, Team
+from ethbrake_marl.agents.team import MODEL, Agent, Team
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import FIRST_DECISION, State
 from ethbrake_marl.errors import InvalidInput, Unfamiliar, check_whole_number

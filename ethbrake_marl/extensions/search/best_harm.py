@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team, play
 from ethbrake_marl.agents.e_v2x_bm import coupled
+from ethbrake_marl.agents.team import Team, play
 from ethbrake_marl.episode.counts import COUNTS, HARM
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.objectives import Declared

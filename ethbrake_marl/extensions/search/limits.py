@@ -62,11 +62,11 @@ COUNT_HEADINGS = {"honest": "honest cost", "first": "first-impact", "total": "to
 LIMITS = {
     "best_known": Part(
         best_known, unit="m2/s2",
-        shown=tuple(Statistic(f"best_known_{count}", "mean", ending=count) for count in HARM),
+        statistics=tuple(Statistic(f"best_known_{count}", "mean", ending=count) for count in HARM),
     ),
     "regret": Part(
         regret, unit="m2/s2",
-        shown=tuple(
+        statistics=tuple(
             statistic
             for count, name in COUNT_HEADINGS.items()
             for statistic in (

@@ -9,13 +9,12 @@ import numpy as np
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.motion.layout import Bools, Floats
+from ethbrake_marl.worlds.quantities import Place
 from ethbrake_marl.worlds.sampling import draw_once, has_early_impact
 from ethbrake_marl.worlds.scenario import Scenario
 
 _UNUSED = 0.5  # value of a random number without effect
 _TRIAL_WORLDS = 16  # random worlds in which the effect of a number is looked for: a load matters for some types only
-
-Place = tuple[tuple[int, ...], int]  # stream of random numbers (``worlds.counters``), and column in it
 
 
 class Cube(NamedTuple):

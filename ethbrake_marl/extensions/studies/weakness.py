@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ethbrake_marl.agents.drive import Team, drive
+from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.game import Game
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
@@ -63,7 +63,7 @@ class WeaknessMeasure(NamedTuple):
 
     def __call__(self, worlds: State) -> WeaknessResult:
         """Measure in some worlds. Raises ``InvalidInput`` for ``bound`` without a shield."""
-        last, *rival_states = (drive(self.game, worlds, team) for team in self.teams)
+        last, *rival_states = (play_to_end(self.game, worlds, team) for team in self.teams)
         harm = last.harm(self.harm_count)
         if self.name == "harm":
             return WeaknessResult(harm, harm, None)

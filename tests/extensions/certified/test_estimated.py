@@ -279,7 +279,7 @@ def test_no_world_depends_on_the_batch(spec: str, scenario: eb.Scenario) -> None
     _, game = eb.open_game(scenario)
     worlds, agent = scenario.sample(5, 3), eb.make_agent(spec, scenario=scenario)
     team = agent if isinstance(agent, eb.Team) else eb.Team(spec, {2: agent})
-    whole, alone = eb.drive(game, worlds, team), eb.drive(game, worlds.take([4]), team)
+    whole, alone = eb.play_to_end(game, worlds, team), eb.play_to_end(game, worlds.take([4]), team)
     np.testing.assert_array_equal(whole.line[4], alone.line[0])
 
 

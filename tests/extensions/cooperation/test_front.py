@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.drive import Team, drive
+from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.counts import COUNTS
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.evaluation.statistics import difference, mean
@@ -70,7 +70,7 @@ def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None
     found = search_front(obstacle, obstacle.sample(20, 777), [row], budget=30, count="total")
     scenario, game = eb.open_game(obstacle.replace(harm_weight=row.tolist(), objective="preference"))
     for name in ("universal", "vine-paper", "rollout-obstacle"):
-        last = drive(game, scenario.sample(20, 777), Team(name, {2: eb.make_agent(name)}))
+        last = play_to_end(game, scenario.sample(20, 777), Team(name, {2: eb.make_agent(name)}))
         assert (found.amounts[0] <= weighted_harm(last.borne_harm("total"), row)).all()
 
 
@@ -78,7 +78,7 @@ def test_point__is_never_beaten_by_a_shipped_policy_that_was_not_given() -> None
 def test_agents__beside_the_front_bear_what_an_evaluation_says(spec: str, front: Front) -> None:
     scenario, game = eb.open_game(preferring(WEIGHTS[4]))
     agent = eb.make_agent(spec, scenario=scenario)
-    last = drive(game, scenario.sample(20, 7), Team(spec, {2: agent}))
+    last = play_to_end(game, scenario.sample(20, 7), Team(spec, {2: agent}))
     for count in COUNTS:
         assert front.agents[spec][count][4].tolist() == last.borne_harm(count).tolist()
 

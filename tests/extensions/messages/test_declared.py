@@ -8,8 +8,8 @@ import pytest
 
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.explain import scenario_json_schema, sentences
-from ethbrake_marl.worlds.given import worlds_from_state
 from ethbrake_marl.worlds.scenario import Scenario
+from ethbrake_marl.worlds.user_worlds import worlds_from_state
 from tests.extensions.messages.line import LINE
 from tests.refused import refused
 

@@ -12,12 +12,12 @@ from ethbrake_marl.evaluation.compared import Compared
 from ethbrake_marl.evaluation.statistics import mean
 from ethbrake_marl.extensions.report.figures import (
     BINS,
+    curve_over_seeds,
     curves_figure,
     deceleration_figure,
     harm_above,
     harm_against_total_gap,
     harm_by_agent,
-    curve_over_seeds,
     trajectories,
     worlds_figure,
 )

@@ -11,7 +11,7 @@ from ethbrake_marl.errors import plain_text
 from ethbrake_marl.extensions.report.figures import SLIM_IN
 from ethbrake_marl.extensions.report.page import Section, data, drawing, page_part, table, whole_page as page_of
 from ethbrake_marl.extensions.report.style import finish, new_figure
-from ethbrake_marl.files.sheet import Column, Estimate, Sheet, CellText
+from ethbrake_marl.files.sheet import CellText, Column, Estimate, Sheet
 from tests.fixtures.page import HOSTILE, UNSEEN, Page
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.drive import drive
 from ethbrake_marl.agents.pairwise import harm_of_deceleration, pairwise
+from ethbrake_marl.agents.team import play_to_end
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.reproduction import register
 from ethbrake_marl.extensions.reproduction.made import ReproductionSettings
@@ -100,7 +100,7 @@ def test_baselines__are_what_the_agents_do(reading: Reading) -> None:
 def test_predicted__harm_of_the_hybrid_is_what_algorithm_1_expects() -> None:
     scenario, game = open_game(RANDOM)
     team = teams_of("ppo+episode:pairwise", scenario)["ppo+episode:pairwise"]
-    memory = drive(game, scenario.sample(WORLDS, 7), team).memories["shield"]
+    memory = play_to_end(game, scenario.sample(WORLDS, 7), team).memories["shield"]
     expected = np.minimum(memory.policy_harm, memory.bound_harm)
     collided, harm = report_outcome(HYBRID_PPO, STATED._replace(hybrid="predicted"), WORLDS, "ppo")
     assert np.array_equal(harm, expected) and np.array_equal(collided, expected > 0.0)

@@ -248,7 +248,7 @@ def test_5000_worlds__cannot_be_driven_at_the_speeds_of_the_figure_of_distances(
 
 def test_trajectories_and_accelerations__have_these_numbers() -> None:
     made = trajectories.reproduce_trajectories(SETTINGS), trajectories.reproduce_accelerations(SETTINGS)
-    ends, commands = ([[cell.in_words for cell in row] for row in each.sheets[0].shown()] for each in made)
+    ends, commands = ([[cell.in_words for cell in row] for row in each.sheets[0].formatted_rows()] for each in made)
     assert len(ends) == len(commands) == 8
     assert ["as stated", "1", "PPO", "0", "0.00", "0.00", "0.16", "1.84"] in ends
     found = {each.paper: (each.outcome, each.nearest, each.why) for one in made for each in one.claims}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ethbrake_marl as eb
-from ethbrake_marl.agents.drive import Team, drive
+from ethbrake_marl.agents.team import Team, play_to_end
 from ethbrake_marl.episode.objectives import amounts, objectives_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.extensions.search.best_harm import driven_profiles
@@ -35,7 +35,7 @@ def driven(name: str, **settings: Any) -> tuple[Problem, Profiles, State]:
     scenario, game = eb.open_game(name)
     alert, team = scenario.sample(20, seed=3), Team("wild", dict.fromkeys(scenario.learners, Wild()))
     problem = problem_of(game, alert, **settings)
-    return problem, driven_profiles(problem, game, alert, team), drive(game, alert, team)
+    return problem, driven_profiles(problem, game, alert, team), play_to_end(game, alert, team)
 
 
 @pytest.mark.parametrize("body", [2, 3])

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ethbrake_marl.agents.drive import Team, drive, play, propose
 from ethbrake_marl.agents.scripts import Held
+from ethbrake_marl.agents.team import Team, play, play_to_end, propose
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import AgentFailed, InvalidInput
 from ethbrake_marl.evaluation.door import evaluate
@@ -52,16 +52,16 @@ def test_agents__are_asked_at_every_decision_from_the_first_and_never_before() -
         for row in np.flatnonzero(before.ended):
             assert all((a[row] == b[row]).all() for a, b in zip(before[:5], state[:5], strict=True))
     assert all((a == b).all() for a, b in zip(before_driving, worlds[:5], strict=True))
-    last = drive(GAME, worlds, Team("counting", {2: Counting()}))
+    last = play_to_end(GAME, worlds, Team("counting", {2: Counting()}))
     for k in range(5):
-        alone = drive(GAME, worlds.take([k]), Team("counting", {2: Counting()}))
+        alone = play_to_end(GAME, worlds.take([k]), Team("counting", {2: Counting()}))
         assert alone.line.tobytes() == last.line[[k]].tobytes() == states[-1].line[[k]].tobytes()
 
 
 def test_an_episode__is_the_one_that_an_environment_plays_with_the_same_actions() -> None:
     env, (_, game) = EthBrakeParallelEnv("cooperation-3-pair"), PAIR
     env.reset(seed=3)
-    last = drive(game, game.draw(1, 3, 0), Team("both", {2: Held("full_brake"), 3: Held("coast")}))
+    last = play_to_end(game, game.draw(1, 3, 0), Team("both", {2: Held("full_brake"), 3: Held("coast")}))
     while env.agents:
         *_, infos = env.step({"vehicle_2": [-1.0], "vehicle_3": [0.0]})
     assert infos["vehicle_1"]["world_total_harm"] == last.harm("total")[0]
@@ -78,7 +78,7 @@ def test_an_episode__is_the_one_that_an_environment_plays_with_the_same_actions(
 )
 def test_a_team__drives_exactly_the_learners(drivers: Any, message: str) -> None:
     with refused(f"team 'mine': {message}"):
-        drive(GAME, PAPER.sample(2, 7), Team("mine", drivers))
+        play_to_end(GAME, PAPER.sample(2, 7), Team("mine", drivers))
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_a_team__is_made_of_agents(drivers: Any, message: str) -> None:
     with refused(message):
         Team.of(drivers, "t")
     team = Team.of({"vehicle_3": Held("coast"), "vehicle_2": Held("full_brake")}, "t")
-    assert list(team.drivers) == [2, 3] and drive(PAIR[1], PAIR[0].sample(2, 7), team).ended.all()
+    assert list(team.drivers) == [2, 3] and play_to_end(PAIR[1], PAIR[0].sample(2, 7), team).ended.all()
 
 
 SCRIPTED = PAPER.replace(roles=dict.fromkeys(PAPER.vehicle_names, "full_brake"))
@@ -107,8 +107,8 @@ def test_a_shield__without_a_learner_is_refused(name: str) -> None:
     scenario, game = open_game(SCRIPTED)
     for team in (make_agent(name, scenario=scenario), shield(Held("coast"), scenario=scenario)):
         with refused("the scenario has no learner that its shield could guard; leave out the shield"):
-            drive(game, scenario.sample(2, 7), team)
-    assert drive(game, scenario.sample(2, 7), team._replace(shield=None)).ended.all()
+            play_to_end(game, scenario.sample(2, 7), team)
+    assert play_to_end(game, scenario.sample(2, 7), team._replace(shield=None)).ended.all()
     with refused("mode 'episode' needs the policy of exactly one learner, not of 0"):
         make_agent("coast+episode", scenario=scenario)
     with refused("scenario 'paper-random' has no learner that the agents could drive"):
@@ -118,7 +118,7 @@ def test_a_shield__without_a_learner_is_refused(name: str) -> None:
 def test_a_shield_of_the_game__is_never_dropped() -> None:
     game = GAME._replace(shield=StepShield())
     with refused("the game has a shield of its own; put it around the team instead"):
-        drive(game, PAPER.sample(2, 7), Team("coast", {2: Held("coast")}))
+        play_to_end(game, PAPER.sample(2, 7), Team("coast", {2: Held("coast")}))
 
 
 class Gives:
@@ -152,7 +152,7 @@ BAD: dict[str, Any] = {
 @pytest.mark.parametrize("message", BAD)
 def test_what_an_agent_must_not_do__is_refused_with_its_name_and_vehicle(message: str) -> None:
     with refused(message) as caught:
-        drive(GAME, PAPER.sample(2, 7), Team("mine", {2: Gives(BAD[message])}))
+        play_to_end(GAME, PAPER.sample(2, 7), Team("mine", {2: Gives(BAD[message])}))
     assert str(caught.value).startswith("agent 'gives', ")
 
 
@@ -173,7 +173,7 @@ def test_error__names_the_vehicle_and_the_world_whatever_the_others_do(fault: st
     drivers = {each: Gives(FAULTS[fault]) if each == body else Held("coast") for each in (1, 2, 3)}
     where = f"world 6, vehicle_{body}" if "command " in fault else f"vehicle_{body}"
     with refused(f"agent 'gives', {where}{fault}", AgentFailed):
-        drive(game, scenario.sample(3, 7, first=5), Team("mine", drivers))
+        play_to_end(game, scenario.sample(3, 7, first=5), Team("mine", drivers))
 
 
 class Breaks(Gives):
@@ -188,12 +188,12 @@ def test_error_at_the_alert__names_the_vehicle(body: int) -> None:
     scenario, game = open_game("cooperation-4-all")
     drivers = {each: Breaks(None) if each == body else Held("coast") for each in (1, 2, 3)}
     with refused(f"agent 'gives', vehicle_{body}: begin fails: LookupError: mine", AgentFailed):
-        drive(game, scenario.sample(3, 7), Team("mine", drivers))
+        play_to_end(game, scenario.sample(3, 7), Team("mine", drivers))
 
 
 def test_a_constant__beyond_the_capacity_is_refused() -> None:
     with pytest.raises(InvalidInput, match=r"agent 'constant:20', world 5, vehicle_2 at .* command -20 m/s2; must be"):
-        drive(GAME, PAPER.sample(2, 7, first=5), Team("constant:20", {2: Held("constant:20")}))
+        play_to_end(GAME, PAPER.sample(2, 7, first=5), Team("constant:20", {2: Held("constant:20")}))
 
 
 def test_proposals__stand_in_the_order_of_the_drivers() -> None:

@@ -140,7 +140,7 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
         yield step, state
 
 
-def drive(game: Game, alert: State, team: Team) -> State:
+def play_to_end(game: Game, alert: State, team: Team) -> State:
     """Let a team drive the worlds ``alert`` to the end; return the last state."""
     for _, state in play(game, alert, team, donate=True):
         last = state

@@ -10,7 +10,7 @@ import pytest
 from ethbrake_marl.episode.state import NUMBER
 from ethbrake_marl.worlds.catalogue import load_scenario
 from ethbrake_marl.worlds.describe import quantities_of
-from ethbrake_marl.worlds.given import given_columns, read_worlds, worlds_from_state, worlds_from_table
+from ethbrake_marl.worlds.user_worlds import given_columns, read_worlds, worlds_from_state, worlds_from_table
 from tests.refused import refused
 from tests.worlds.test_scenario import bits, line
 
