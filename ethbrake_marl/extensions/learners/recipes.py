@@ -9,19 +9,10 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from ethbrake_marl.agents.trained import make_trained
 from ethbrake_marl.episode.layer import MESSAGES
-from ethbrake_marl.files.model import FileModel, refuse
+from ethbrake_marl.files.model import FileModel, NonNegative, Positive, refuse
 from ethbrake_marl.policies.network import Activation, NetworkSpec
 from ethbrake_marl.registry import Part
-from ethbrake_marl.training.recipe import (
-    ACTOR_LAYERS,
-    BATCH_SIZE,
-    NETWORK,
-    LayerSizes,
-    NonNegative,
-    Positive,
-    Rate,
-    TrainingRecipe,
-)
+from ethbrake_marl.training.recipe import ACTOR_LAYERS, BATCH_SIZE, NETWORK, LayerSizes, Rate, TrainingRecipe
 
 MOST_STORED_DECISIONS = 2**22  # of one update whose states fit into memory
 
