@@ -35,10 +35,10 @@ def lines_at(
     loaded, game = eb.open_game(scenario)
     line, alert = MedianLine.of(loaded, 2), loaded.sample(n, 7)
     state = game.reset(alert)
-    median = line.heard(state, reset_without_shield(game, line.at_alert(alert, state)))[0]
+    median = line.corrected(state, reset_without_shield(game, line.at_alert(alert, state)))[0]
     for _ in range(steps):
         state = game.step(state, np.full((n, 1), action))[0]
-        median = line.heard(state, game.follow(median, np.full((n, 1), action))[0])[0]
+        median = line.corrected(state, game.follow(median, np.full((n, 1), action))[0])[0]
     return line, state, median
 
 
