@@ -1,6 +1,6 @@
 """Names of version 1.0 that 2.0 has changed. There are no aliases: the error for an old name says the new one.
 
-The changelog shows the same table.
+The table of the changelog contains these names too.
 """
 
 from __future__ import annotations
@@ -8,19 +8,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from types import MappingProxyType
 
-RENAMED: Mapping[str, str] = MappingProxyType(
-    {  # public names of Python, names of scenarios, policies, shields and commands, keys and columns
+RENAMED: Mapping[str, str] = MappingProxyType(  # Python names, scenarios, policies, recipes, shields, commands
+    {
         "EthBrake-v1": "EthBrake-v2",
-        "universal-paper": "vine-paper",
-        "experts": "universal or ppo",
-        "cooperation-0-sensors": "level-0-sensors",
-        "cooperation-1-capacities": "level-1-intent",
-        "standards-ccrb": "standards-ccrb-2026",
-        "standards-ccrm": "standards-ccrm-2026",
-        "robust:estimated": "step:estimated or robust:INTERVALS",
+        "drive": "play_to_end",
         "compare": "evaluate",
         "compare_results": "evaluate",
         "fronts": "cooperation",
+        "universal-paper": "vine-paper",
+        "cooperation-0-sensors": "level-0-sensors",
+        "standards-ccrb": "standards-ccrb-2026",
+        "standards-ccrm": "standards-ccrm-2026",
+        "robust:estimated": "step:estimated",
     }
 )
 
