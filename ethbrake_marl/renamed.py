@@ -19,7 +19,6 @@ RENAMED: Mapping[str, str] = MappingProxyType(  # Python names, scenarios, polic
         "cooperation-0-sensors": "level-0-sensors",
         "standards-ccrb": "standards-ccrb-2026",
         "standards-ccrm": "standards-ccrm-2026",
-        "robust:estimated": "step:estimated",
     }
 )
 
