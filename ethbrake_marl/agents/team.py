@@ -125,6 +125,8 @@ def play(game: Game, alert: State, team: Team, *, donate: bool = False) -> Itera
     The first pair is ``None`` and the state at the first decision. Without a shield the agents' commands (m/s2) are
     applied directly; a shield asks its own agents. ``donate``: each state is overwritten when the next one is computed.
     """
+    if not isinstance(team, Team):
+        raise InvalidInput(f"team = {team!r:.60}: must be a Team, for instance Team.of({{'vehicle_2': agent}}, 'mine')")
     game = team.game(game)
     if game.shield is None:
         state, agents, actions = game.reset(alert), game.agents(guard_scripts(team.drivers)), np.zeros((alert.n, 0))

@@ -14,7 +14,7 @@ import numpy as np
 from ethbrake_marl.episode.functions import description_of
 from ethbrake_marl.episode.state import State
 from ethbrake_marl.errors import InvalidInput, unknown_name
-from ethbrake_marl.motion.layout import BRAKE_RATE, BRAKING, RELEASE_RATE, WEIGHT, Floats, Ints
+from ethbrake_marl.motion.layout import BRAKE_RATE, RELEASE_RATE, WEIGHT, Floats, Ints
 from ethbrake_marl.registry import Registry
 
 MOST_NEIGHBOURS = 64  # on each side
@@ -94,11 +94,11 @@ class Group(NamedTuple):
 
 
 def _build_up_s(state: State, body: int) -> Floats:
-    return state.car[:, BRAKING, body] / state.car[:, BRAKE_RATE, body]
+    return state.braking_capacity_mps2[:, body - 1] / state.car[:, BRAKE_RATE, body]
 
 
 def _release_s(state: State, body: int) -> Floats:
-    return state.car[:, BRAKING, body] / state.car[:, RELEASE_RATE, body]
+    return state.braking_capacity_mps2[:, body - 1] / state.car[:, RELEASE_RATE, body]
 
 
 def _weight_share(state: State, body: int) -> Floats:

@@ -84,7 +84,7 @@ class Kind(NamedTuple):
     amount: Callable[[Harm, int, Objective], Floats]  # (harm, vehicle from 0, what is written) -> [n]
     weights: Callable[[Floats, int, Objective], Floats] | None = None  # of sums: (car, vehicle, written) -> [n, N]
     function: Callable[..., Floats] | None = None  # of a registered objective
-    arguments: tuple[str, ...] = ()  # that a registered objective may have
+    arguments: tuple[str, ...] | type[float] = ()  # that a registered objective may have; float: any number
 
     @property
     def name(self) -> str:
@@ -149,8 +149,10 @@ def parse_objective(text: str) -> Objective:
         if colon:
             raise InvalidInput(f"objective {text!r}: {name} takes no argument")
         return Objective(kind)
+    if kind.arguments is float and parse_numeral(argument) is None:
+        raise InvalidInput(f"objective {text!r}: {name} needs a number, as in {name}:5")
     if kind.arguments:
-        if argument not in kind.arguments:
+        if isinstance(kind.arguments, tuple) and argument not in kind.arguments:
             raise unknown_name(f"argument of the objective {name}", argument, kind.arguments)
         return Objective(kind, argument=argument)
     numerals = [parse_numeral(part.strip()) for part in argument.split(",")]
@@ -273,11 +275,14 @@ def _lexicographic_sum(first_and_then: Sequence[Floats]) -> Floats:
     return FIRST_WEIGHT * first_and_then[0] + first_and_then[1]
 
 
-def register_objective(name: str, function: Callable[..., Floats], *, arguments: Sequence[str] = ()) -> None:
+def register_objective(
+    name: str, function: Callable[..., Floats], *, arguments: Sequence[str] | type[float] = ()
+) -> None:
     """Register an objective for scenarios and rewards. Entry points: ``ethbrake_marl.objectives``.
 
     ``function(harm, vehicle)`` returns what ``vehicle`` (from 0) should minimise, [n]; its docstring describes this
-    amount. With ``arguments`` the objective is written ``name:argument``, and the function gets the argument third.
+    amount. With ``arguments`` the objective is written ``name:argument``, and the function gets the argument third:
+    one of these texts, or with ``arguments=float`` any number.
     Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a
     docstring.
     """
@@ -286,14 +291,16 @@ def register_objective(name: str, function: Callable[..., Floats], *, arguments:
 
     def amount(harm: Harm, vehicle: int, objective: Objective) -> Floats:
         what = f"objective {name!r} of vehicle_{vehicle + 1}"
-        call_arguments = (harm, vehicle, objective.argument) if arguments else (harm, vehicle)
+        argument = float(objective.argument) if arguments is float else objective.argument
+        call_arguments = (harm, vehicle, argument) if arguments else (harm, vehicle)
         value = call_function(what, function, call_arguments, harm.whole.shape)
         if not np.isfinite(value).all():
             raise InvalidInput(f"{what}: its value is not finite in row {int(np.argmin(np.isfinite(value)))}")
         return value.astype(np.float64)
 
-    form = f"{name}:{'|'.join(arguments)}" if arguments else name
-    kind = Kind(form, meaning, amount, function=function, arguments=tuple(arguments))
+    listed = arguments if isinstance(arguments, type) else tuple(arguments)
+    form = f"{name}:{'|'.join(listed) if isinstance(listed, tuple) else 'NUMBER'}" if listed else name
+    kind = Kind(form, meaning, amount, function=function, arguments=listed)
     OBJECTIVES.add(name, kind, lambda registered: registered.function is function)
 
 

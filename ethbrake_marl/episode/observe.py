@@ -227,7 +227,7 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
             latency_left = max(c[OWN_LATENCY, i] - time, 0.0)
             own_stop = full_stop_m(w[SPEED, i], latency_left, capacity(c, BRAKING, i, time))
             value[OWN_SPEED], value[OWN_ACCELERATION], value[OWN_MASS] = w[SPEED, i], w[FORCE, i], c[MASS, i]
-            value[OWN_BRAKING], value[OWN_DRIVING] = c[BRAKING, i], c[DRIVING, i]
+            value[OWN_BRAKING], value[OWN_DRIVING] = capacity(c, BRAKING, i, time), capacity(c, DRIVING, i, time)
             value[OWN_LATENCY_LEFT], value[OWN_RESTITUTION] = latency_left, c[RESTITUTION, i]
             f = N_OWN
             for offset in offsets:
@@ -243,7 +243,8 @@ def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, p
                     room = gap + stop if front else stop - gap
                     near[NEAR_KNOWN], near[NEAR_GAP], near[NEAR_ACCELERATION] = 1.0, gap, w[FORCE, j]
                     near[NEAR_CLOSING_SPEED] = w[SPEED, i] - w[SPEED, j] if front else w[SPEED, j] - w[SPEED, i]
-                    near[NEAR_BRAKING], near[NEAR_MASS], near[NEAR_LATENCY_LEFT] = c[BRAKING, j], c[MASS, j], wait
+                    near[NEAR_BRAKING], near[NEAR_MASS] = capacity(c, BRAKING, j, time), c[MASS, j]
+                    near[NEAR_LATENCY_LEFT] = wait
                     near[NEAR_HIT] = w[HIT, i - 1 if front else i]
                     near[NEAR_STOPPING_MARGIN] = gap + stop - own_stop if front else gap + own_stop - stop
                     near[NEAR_FITTING_DECELERATION] = fitting_deceleration(w[SPEED, i], latency_left, room)

@@ -197,7 +197,7 @@ def next_of_series(car, scratch, now, first, last):
     after the other, the hardest impact first. It is known by a pair that had an impact at this moment: after a plastic
     impact at once no pair closes.
     """
-    if restitution(car, math.inf) > 0.0 or last - first < 2:
+    if car[RESTITUTION, 0] > 0.0 or last - first < 2:
         return -1
     hardest, again = first, False
     for p in range(first, last):

@@ -12,7 +12,7 @@ import yaml
 
 import ethbrake_marl as eb
 from ethbrake_marl.cli.app import run_command
-from ethbrake_marl.motion.layout import MASS
+from ethbrake_marl.motion.layout import FIRST, MASS
 from ethbrake_marl.worlds.explain import new_scenario_text
 from tests.training.tiny import TINY
 
@@ -263,3 +263,23 @@ def test_folder__makes_its_scenarios_known_by_name_and_to_the_command_line(
     added = [entry for entry in eb.list_scenarios() if entry not in before]
     assert [(entry.name, entry.origin) for entry in added] == [("coast-road", str(folder)), ("hills", str(folder))]
     assert eb.parallel_env(scenario="hills").reset(seed=1)[0] and {entry.origin for entry in before} == {"shipped"}
+
+
+def test_objective__has_a_number_as_argument() -> None:
+    """The function gets the number third; anything else is refused."""
+
+    def capped(harm, vehicle, most):
+        """Harm of all pairs, each at most a number."""
+        return np.minimum(harm.pairs, most).sum(axis=1)
+
+    eb.register_objective("capped", capped, arguments=float)
+    scenario, game = eb.open_game(eb.load_scenario("paper-random").replace(objective="capped:5"))
+    team = eb.Team.of({"vehicle_2": eb.make_agent("full_brake")}, "full_brake")
+    paid, impacts = np.zeros(100), 0.0
+    for step, state in eb.play(game, scenario.sample(100, seed=7), team):
+        paid -= 0.0 if step is None else step.reward[:, 1]
+        impacts = np.minimum(state.line[:, FIRST, :], 5.0).sum(axis=1)
+    np.testing.assert_allclose(paid, impacts, atol=1e-12)
+    assert paid.max() == 10.0
+    with pytest.raises(eb.EthBrakeError, match="capped needs a number, as in capped:5"):
+        scenario.replace(objective="capped:x")

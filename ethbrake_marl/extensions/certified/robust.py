@@ -19,7 +19,7 @@ from ethbrake_marl.episode.hold import hold
 from ethbrake_marl.episode.state import END, State, map_arrays, take
 from ethbrake_marl.errors import InvalidInput
 from ethbrake_marl.extensions.certified.uncertainty import parse_uncertainty
-from ethbrake_marl.motion.layout import BRAKING, GAP, IMPACTS, SPEED, Bools, Floats
+from ethbrake_marl.motion.layout import GAP, IMPACTS, SPEED, Bools, Floats
 from ethbrake_marl.registry import Part
 from ethbrake_marl.shields.fallbacks import constant_plans
 from ethbrake_marl.shields.shield import NamedShield
@@ -100,7 +100,7 @@ class RobustShield(StepShield):
         if states.n == n:
             return plans
         actions = np.repeat(CONSTANT_ACTIONS[:, np.newaxis], len(learners), axis=1)
-        commands = actions * states.car[:, np.newaxis, BRAKING, learners]
+        commands = actions * states.braking_capacity_mps2[:, np.newaxis, learners - 1]
         harm = hold(states, states.wanted, learners.tolist(), commands, states.clock[:, END], self.count)[0]
         best = harm.reshape(n, states.n // n, -1).max(axis=1).argmin(axis=1)
         return [*plans, constant_plans(game, actions[best])]
