@@ -217,7 +217,7 @@ class Drivers(NamedTuple):
 def _search_chunk(
     drivers: Drivers, worlds: State, weights: Floats, count: str, effort: Mapping[str, int], tell: Callable[[int], None]
 ) -> tuple[ProfilePool, dict[str, BorneHarm]]:
-    """All profiles (commands over time) that a search has tried, and the harm of each vehicle if agents drive.
+    """Pool of the best profiles (commands over time) of all searches, and the harm of each vehicle if agents drive.
 
     Each of several learners is first searched alone. Then every choice of weights is searched twice; the second search
     starts from the best profiles of all choices. ``effort``: budget and threads. ``tell`` is called with numbers of

@@ -149,7 +149,7 @@ class CudaVineModel(VineModel):
     def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
         """Simulate branches: in each, one learner's action is moved for some steps, then the policy continues.
 
-        Returns the reward gained, and the sum by which actions were really moved (they end at -1 and 1), [2, 2B].
+        Returns the discounted reward, and the sum by which actions were really moved (they end at -1 and 1), [2, 2B].
         Arguments [2B]: visited decision, learner, size of the move, and number of steps for which it lasts.
         """
         worlds, result = self.branches, torch.zeros(2, len(world), dtype=size.dtype, device=size.device)

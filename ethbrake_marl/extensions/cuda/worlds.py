@@ -1,4 +1,4 @@
-"""``Worlds``: many episodes on a GPU, as torch tensors that are never copied to the processor."""
+"""``Worlds``: many episodes on a GPU, as torch tensors that stay on the device."""
 
 from __future__ import annotations
 

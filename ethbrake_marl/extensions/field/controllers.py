@@ -224,10 +224,10 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``.
 
-    Its memory is the time at which it noticed a danger, [n] s: infinite without a danger, NaN before the first
-    decision. The reaction time begins at this time; for a danger at the first decision it begins at the alert, so it
-    overlaps with the latency. The reaction ends with the danger, unless ``law.stays``; the next danger starts a new
-    reaction.
+    Its memory is the time of the danger to which it reacts, [n] s: infinite if there is none, NaN before the first
+    decision. The reaction time begins when the agent notices the danger; for a danger at the first decision it begins
+    at the alert, so it overlaps with the latency. The reaction ends with the danger, unless ``law.stays``; the next
+    danger starts a new reaction.
     """
 
     knows = MESSAGES

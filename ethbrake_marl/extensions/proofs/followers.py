@@ -45,8 +45,8 @@ LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)
 def value_at(line, time):
     """Value at ``time`` of a piecewise linear function with two bends.
 
-    ``line`` is (start, slope, turn 1, bend 1, turn 2, bend 2); the function is ``start + slope t + bend_1 max(t -
-    turn_1, 0) + bend_2 max(t - turn_2, 0)``.
+    ``line`` is (start, slope, turn 1, bend 1, turn 2, bend 2). The function is a straight line to which each bend adds
+    ``bend * max(time - turn, 0)``.
     """
     start, slope, turn, bend, other_turn, other_bend = line
     return start + slope * time + bend * max(time - turn, 0.0) + other_bend * max(time - other_turn, 0.0)
