@@ -1,1 +1,1 @@
-"""Shields for incomplete knowledge: ``robust`` for uncertain quantities, ``estimated`` for values not received yet."""
+"""Shields that do not know the true world: ``robust`` reckons with ranges, ``estimated`` with what was received."""

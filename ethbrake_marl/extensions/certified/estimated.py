@@ -1,8 +1,9 @@
 """What one vehicle can know of its line: its *median line*, made from its messages and the scenario's ranges.
 
-A value of another vehicle that has not been received is the median of its range. The line is simulated beside the
-episode, from the alert on, with the vehicle's own actions; the others follow their scripts. Where the vehicle receives
-or measures something else than the line foretold, received values replace assumed ones, and the rest goes on as before.
+A value of another vehicle that has not been received is the median of its range in the scenario. The median line is
+simulated in parallel with the episode, from the alert on, with the vehicle's own actions; the others follow their
+scripts. Where the vehicle receives or measures something that the median line did not predict, received values replace
+assumed ones; everything else continues unchanged.
 
 Nothing else of the true state is read, so what was not received cannot change the median line.
 """
@@ -78,7 +79,7 @@ OF_IMPACTS = [HIT, FIRST, TOTAL, IMPACTS]
 class News(NamedTuple):
     """What a vehicle has received of each body. A body is *located* if its place and speed have been received.
 
-    Body 0 is the obstacle, whose place is known to all who know the place of Vehicle 1.
+    Body 0 is the obstacle; a vehicle knows its place as soon as it knows the place of Vehicle 1.
     """
 
     pieces: Bools  # [n, N + 1, PIECES] what has been received (``messages.links``)
@@ -88,19 +89,20 @@ class News(NamedTuple):
 
     @property
     def with_force(self) -> Bools:
-        """Whether a body is located and its acceleration has been received, [n, N + 1]."""
+        """Whether a body is located and its acceleration has also been received, [n, N + 1]."""
         return self.located & self.pieces[:, :, P_ACCELERATION]
 
     def fresh(self, state: State) -> Bools:
-        """Whether a body is located by a sample of the present, [n, N + 1]."""
+        """Whether a body is located by a sample taken at the present time of ``state``, [n, N + 1]."""
         return self.located & (self.at_s >= state.time_s[:, np.newaxis])
 
     def speeds_and_ways(
         self, speed: Floats, wanted: Floats, onset: Floats, limit: Floats, time_s: Floats
     ) -> tuple[Floats, Floats]:
-        """Speeds (m/s) at ``time_s`` [n, 1], and ways (m) driven since the samples, without contact, [n, N + 1] each.
+        """Speeds (m/s) at ``time_s`` [n, 1], and ways (m) driven since the newest samples, [n, N + 1] each.
 
-        Bodies that are not located keep their ``speed``. Others, arguments of ``move_on``.
+        Contacts are left out. Bodies that are not located keep their ``speed`` [n, N + 1]. From ``onset`` (s after the
+        alert) on, the others accelerate with ``wanted`` (m/s2) up to the speed ``limit`` (m/s), [n, N + 1] each.
         """
         speed, way = np.where(self.located, self.sample[:, SAMPLE_SPEED], speed), np.zeros(speed.shape)
         move_on(speed, way, wanted, onset - self.at_s, limit, np.where(self.located, time_s - self.at_s, 0.0))
@@ -108,7 +110,10 @@ class News(NamedTuple):
 
 
 class MedianLine(NamedTuple):
-    """The line that the vehicle ``body`` assumes before it has received anything."""
+    """The line that the vehicle ``body`` assumes before it has received anything.
+
+    Every quantity is the median of its range in the scenario.
+    """
 
     body: int
     alert: State  # [1] at the alert
@@ -117,9 +122,9 @@ class MedianLine(NamedTuple):
 
     @classmethod
     def of(cls, scenario: Scenario, body: int) -> MedianLine:
-        """Line of a scenario in which every quantity has its median.
+        """Median line of the vehicle ``body`` in a scenario.
 
-        Raises ``InvalidInput`` for a mixture of scenarios, and for other vehicles with unknown commands.
+        Raises ``InvalidInput`` for a mixture of scenarios, and if the commands of another vehicle cannot be predicted.
         """
         check_predictable(scenario, body)
         N = scenario.vehicles
@@ -132,8 +137,8 @@ class MedianLine(NamedTuple):
     def commands(self, car: Floats, wanted: Floats) -> Floats:
         """Commands of all bodies, [n, N + 1] m/s2 (body 0: the obstacle).
 
-        Scripts follow their rules, other learners brake fully, and the vehicle itself keeps ``wanted`` [n, N + 1].
-        ``car``: as in ``State``.
+        Scripted vehicles do what their scripts command, other learners brake fully, and the vehicle ``self.body`` keeps
+        its command in ``wanted`` [n, N + 1]. ``car``: as in ``State``.
         """
         wanted = wanted.copy()
         for vehicle, role in enumerate(self.roles, 1):
@@ -142,10 +147,10 @@ class MedianLine(NamedTuple):
         return wanted
 
     def at_alert(self, alert: State, state: State) -> State:
-        """Median lines at the alert.
+        """Median lines at the alert, one for each world of ``alert``.
 
-        They use what ``state`` shows at the first decision. Vehicles of which everything is known by then start as in
-        the true worlds ``alert``, and so does the gap between two of them.
+        They contain what the vehicle knows at the first decision, ``state``. Vehicles of which everything is known by
+        then start as in the true worlds ``alert``, and so does the gap between two of them.
         """
         news = self.received(state)
         known = np.asarray(news.pieces[:, :, :P_INTENT].all(axis=2))
@@ -160,6 +165,7 @@ class MedianLine(NamedTuple):
         return alert._replace(line=line, car=car, wanted=self.commands(car, alert.wanted))
 
     def received(self, state: State) -> News:
+        """What the vehicle has received of each body until the time of ``state``, the true state."""
         if MESSAGES_KEY in state.memories:
             pieces, sample = known_pieces(state, self.body), newest_samples(state, self.body)
         else:
@@ -173,9 +179,10 @@ class MedianLine(NamedTuple):
         return News(pieces, sample, located, np.where(located, sample[:, AT], 0.0))
 
     def corrected(self, state: State, median: State) -> tuple[State, Bools]:
-        """Median lines after news, and whether they had foretold it, [n].
+        """Median lines after news, and whether they had predicted all of it, [n].
 
-        ``state``: the truth now. ``median``: the lines now; they are corrected where they are contradicted.
+        ``state``: the true state. ``median``: the present median lines; those that the true state contradicts are
+        corrected.
         """
         foretold = self.agrees(state, median)
         rows = (~foretold).nonzero()[0]
@@ -184,9 +191,9 @@ class MedianLine(NamedTuple):
         return median, foretold
 
     def agrees(self, state: State, median: State) -> Bools:
-        """Whether the vehicle would have received and measured the same in the ``median`` line, [n].
+        """Whether everything that the vehicle has received and measured is the same in the ``median`` line, [n].
 
-        ``state``: the truth now.
+        ``state``: the true state now.
         """
         news = self.received(state)
         far = (
@@ -200,9 +207,9 @@ class MedianLine(NamedTuple):
         return np.asarray(~((far & news.pieces[:, :, :P_INTENT]).any(axis=(1, 2)) | struck.any(axis=1)))
 
     def message_contents(self, state: State, sample: Floats) -> Floats:
-        """What a state's messages say of all bodies, [n, N + 1, PIECES - 1]: all quantities but the intent.
+        """All quantities of each body that its messages can contain, except the intent, [n, N + 1, PIECES - 1].
 
-        ``sample``: as in ``News``. A place is the distance (m) from this vehicle.
+        ``sample``: as in ``News``. Places are distances (m) from this vehicle.
         """
         car = state.car[:, [BRAKING, OWN_LATENCY, MASS]].copy()
         car[:, :, 0] = 0.0
@@ -211,11 +218,12 @@ class MedianLine(NamedTuple):
         return np.concatenate([motion, car], axis=1).transpose(0, 2, 1)
 
     def with_received(self, state: State, median: State) -> State:
-        """Median lines with received values in place of assumed ones; ``state`` is the truth now.
+        """Median lines in which received values replace assumed ones; ``state`` is the true state now.
 
-        A received place and speed are moved on to the present by the sender's script, without contact. A sender that
-        was not accelerating reacts no earlier than at that time. A vehicle with an unknown place keeps its distance to
-        this vehicle, within the order of the line. This vehicle measures its own motion and its own impacts.
+        A received place and speed are extrapolated to the present by the sender's script, without contact. A sender
+        that was not accelerating is taken to react no earlier than at the time of its sample. A vehicle with an unknown
+        place keeps its distance to this vehicle, as far as the order of the line allows. This vehicle's own motion and
+        impacts are measured.
         """
         body, news = self.body, self.received(state)
         line, car = median.line.copy(), median.car.copy()
@@ -234,18 +242,20 @@ class MedianLine(NamedTuple):
         return median._replace(line=line, car=car, wanted=wanted)
 
     def onsets(self, news: News, car: Floats) -> Floats:
-        """Time at which each vehicle begins to react, [n, N + 1] s after the alert; of those not located, as before.
+        """Time from which each vehicle reacts, as this vehicle assumes, [n, N + 1] s after the alert.
 
-        ``car``: as in ``State``, with the received values.
+        Vehicles that are not located keep their latencies. ``car``: as in ``State``, with the received values.
         """
         later = np.maximum(np.maximum(car[:, OWN_LATENCY], self.news_s), news.at_s)
         accelerates = news.with_force & (news.sample[:, SAMPLE_FORCE] != 0.0)
         return np.where(accelerates, news.at_s, np.where(news.located, later, car[:, LATENCY]))
 
     def gaps(self, news: News, way: Floats, median: State, state: State) -> Floats:
-        """Gaps ahead of all vehicles (m), the obstacle's first, as in the row GAP of ``State.line``.
+        """Gaps ahead of all vehicles as this vehicle estimates them, [n, N + 1] m, as in the row GAP of ``State.line``.
 
-        ``way`` [n, N + 1] (m): what vehicles have driven since their newest samples. ``state``: the truth now.
+        Positions come from the newest samples in ``news`` plus ``way`` [n, N + 1] (m), the distance driven since then;
+        unknown ones come from ``median``. Between two vehicles with samples of the present, the gap is that of the true
+        state ``state``.
         """
         body, gaps = self.body, median.line[:, GAP].copy()
         place = np.zeros(way.shape)  # distance from this vehicle (m)
@@ -263,9 +273,11 @@ class MedianLine(NamedTuple):
         return gaps
 
     def forces(self, news: News, wanted: Floats, onset: Floats, median: State, state: State) -> Floats:
-        """Acceleration of each body by its brakes or engine, [n, N + 1] m/s2; after its ``onset`` (s) it is ``wanted``.
+        """Estimated acceleration of each body by its brakes or engine, [n, N + 1] m/s2.
 
-        ``state``: the truth now.
+        It is 0 before the ``onset`` of a body (s after the alert) and its command ``wanted`` (m/s2) afterwards, unless
+        a sample of the present contains it. Bodies that are not located keep their value in ``median``. ``state``: the
+        true state.
         """
         reacting = np.where((onset <= 0.0) | (onset < state.time_s[:, np.newaxis]), wanted, 0.0)
         force = np.where(news.located, reacting, median.line[:, FORCE])
@@ -275,7 +287,10 @@ class MedianLine(NamedTuple):
 
 
 def check_predictable(scenario: Scenario, body: int) -> None:
-    """Raise ``InvalidInput`` for a mixture of scenarios, and for vehicles beside ``body`` with unknown commands."""
+    """Raise ``InvalidInput`` if the vehicle ``body`` cannot predict the line.
+
+    It cannot in a mixture of scenarios, if messages contain errors, or if the commands of another vehicle are unknown.
+    """
     where = f"scenario {scenario.name!r}: estimated agents and shields need"
     if scenario.members:
         names = ", ".join(member.name for member in scenario.members)
@@ -289,9 +304,10 @@ def check_predictable(scenario: Scenario, body: int) -> None:
 
 
 def without_channel(game: Game, median: State) -> tuple[Game, State]:
-    """Game and median lines in which every vehicle knows everything, for agents that drive there.
+    """Game and median lines in which every vehicle knows everything, for agents that drive in median lines.
 
-    A median line does not say when the truth would be received, so each vehicle's own latency ends when it reacts.
+    A median line does not say when true values would be received, so each vehicle's own latency (without the wait for
+    the alert) ends when the vehicle reacts.
     """
     car = median.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
@@ -302,7 +318,7 @@ def without_channel(game: Game, median: State) -> tuple[Game, State]:
 def in_order(place: Floats, known: Bools) -> Floats:
     """Places (m), [n, vehicles], raised where they would decrease from one vehicle to the next.
 
-    An unknown place is first lowered to the next ``known`` one, if it is beyond it.
+    An unknown place that lies beyond the next ``known`` one is first lowered to it.
     """
     limit = np.where(known, place, np.inf)[:, ::-1]
     within = np.minimum(place, np.minimum.accumulate(limit, axis=1)[:, ::-1])
@@ -311,7 +327,7 @@ def in_order(place: Floats, known: Bools) -> Floats:
 
 @large
 def move_on(speed, way, wanted, onset, limit, age):
-    """Move vehicles on by ``age`` (s) without contact: from ``onset`` (s) on they accelerate with ``wanted`` (m/s2).
+    """Advance vehicles by ``age`` (s) without contact: from ``onset`` (s) on they accelerate with ``wanted`` (m/s2).
 
     All arrays are [n, N + 1]; ``speed`` (m/s, at most ``limit``) and ``way`` (m) are overwritten.
     """

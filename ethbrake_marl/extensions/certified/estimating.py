@@ -1,7 +1,7 @@
 """Shields and E-V2X-BM that use only what their vehicle has received: they decide in its median line (``estimated``).
 
-They promise nothing: the true line may do more harm than the bound in the median line. The info ``trusted`` is false
-once something was received or measured that the median line had not foretold.
+They guarantee nothing: the true line may do more harm than the bound in the median line. The info ``trusted`` is false
+once something was received or measured that the median line had not predicted.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class MedianMemory(NamedTuple):
 
 
 class EstimatedShield(StepShield):
-    """The step shield of one learner in its median line (``estimated.MedianLine``). It promises nothing.
+    """The step shield of one learner, in the line that its vehicle estimates (``estimated.MedianLine``). No guarantee.
 
-    Its bound is that of the plan in the median line, and may rise when that line is corrected.
+    Its bound is the harm of the plan in the median line, and may rise when that line is corrected.
 
     Args:
         drivers: body -> agent, as for ``StepShield``.
@@ -74,7 +74,7 @@ class EstimatedShield(StepShield):
         return applied, memory._replace(members=memory.members._replace(median=after))
 
     def possible_states(self, state: State, memory: StepShieldMemory) -> State:
-        """Median lines, with the present memories of the agents in ``state``."""
+        """Median lines in place of the true states, with the present memories of the agents in ``state``."""
         median: State = memory.members.median
         agent_memories = {body: state.memories[body] for body in self.drivers if body in state.memories}
         return median._replace(memories={**median.memories, **agent_memories})
@@ -83,7 +83,10 @@ class EstimatedShield(StepShield):
         return super().rolled_out(*without_channel(game, state), plans, most)
 
     def plan_again(self, game: Game, memory: StepShieldMemory, median: State, rows: Ints) -> StepShieldMemory:
-        """In the worlds ``rows``, replace the plan in ``memory`` by the cheapest of itself and newly made plans."""
+        """Memory in which the worlds ``rows`` have the cheapest of their present plan and new plans.
+
+        ``median``: the corrected median lines of these worlds.
+        """
         plan, price = memory.plan.copy(), memory.price.copy()
         plan[rows], price[rows] = self.cheapest(game, median, [plan[rows], *self.plans(game, median, median, median)])
         return memory._replace(plan=plan, price=price)
@@ -93,10 +96,11 @@ class EstimatedShield(StepShield):
 
 
 class EstimatedEpisodeShield(EpisodeShield):
-    """Algorithm 1 (*hybrid*) in the median line: the first decision chooses the policy or E-V2X-BM for the episode.
+    """The paper's Algorithm 1 (*hybrid*) in the median line: the first decision chooses the driver of the episode.
 
-    ``drivers``: body -> agent, as for ``StepShield``. ``harm_count``: the harm that is compared. ``bound``: how H* is
-    computed, ``coupled`` or ``pairwise``, as for ``EpisodeShield``.
+    It chooses the policy or E-V2X-BM. ``drivers``: body -> agent, as for ``StepShield``. ``harm_count``: the harm that
+    is compared. ``bound``: how the harm H* of E-V2X-BM is computed, ``coupled`` or ``pairwise``, as for
+    ``EpisodeShield``.
     """
 
     knows = ESTIMATED
@@ -124,9 +128,10 @@ class ChoiceMemory(NamedTuple):
 
 
 class EstimatedEV2XBM:
-    """E-V2X-BM in the median line; it chooses a new deceleration when received values differ from this line's.
+    """E-V2X-BM, the best constant deceleration, computed in the line that the vehicle estimates (median line).
 
-    ``is_pairwise``: use the paper's closed form, not a simulation of the line. ``count`` is the harm that is minimised.
+    It chooses a new deceleration when received values differ from the median line. ``is_pairwise``: use the paper's
+    closed form instead of a simulation of the line. ``count``: the harm that is minimised.
     """
 
     knows = ESTIMATED
@@ -144,6 +149,10 @@ class EstimatedEV2XBM:
         return ChoiceMemory(median, np.full(alert.n, np.nan))
 
     def act(self, state: State, memory: ChoiceMemory, body: int) -> tuple[Floats, ChoiceMemory]:
+        """Commands [n] m/s2, and the memory with the corrected median line.
+
+        A deceleration is kept until the median line is corrected.
+        """
         wanted = memory.median.wanted.copy()
         wanted[:, body] = state.wanted[:, body]
         foretold = hold_commands(memory.median._replace(wanted=wanted), state.time_s)
@@ -158,9 +167,9 @@ class EstimatedEV2XBM:
 
 
 def differ(first_line: State, second_line: State) -> Bools:
-    """Whether two lines differ in speeds, gaps or parameters of vehicles, [n].
+    """Whether two lines differ in a speed, a gap or a parameter of a vehicle, [n].
 
-    Latencies that are over are ignored.
+    Latencies that are already over are ignored.
     """
     parts = []
     for line in (first_line, second_line):

@@ -57,10 +57,10 @@ class Uncertainty(NamedTuple):
         return ",".join(interval.text for interval in self.intervals)
 
     def members(self, alert: State) -> State:
-        """Members of worlds at the alert, M rows for each world: itself, then the corners of its box.
+        """Possible worlds, M rows for each world of ``alert``: the world itself, then the corners of its box.
 
-        Corner k takes the high end of number i where bit i of k is 1. Raises ``InvalidInput`` if an interval does not
-        fit the worlds, and for more than ``MOST_CORNERS`` corners.
+        Corner k takes the upper end of uncertain number i where bit i of k is 1, otherwise the lower end. Raises
+        ``InvalidInput`` if an interval does not fit the worlds, and for more than ``MOST_CORNERS`` corners.
         """
         sides = self.sides(alert)
         if 2 ** len(sides) > MOST_CORNERS:
@@ -75,7 +75,7 @@ class Uncertainty(NamedTuple):
         return members.take(np.arange(members.n).reshape(-1, alert.n).T.ravel())
 
     def draw(self, alert: State, rng: np.random.Generator, *, corners: bool = False) -> State:
-        """One random world from each world's box: uniform in the whole box, or one of its ``corners``.
+        """One random world for each world of ``alert``: uniform in its box, or one of the box's ``corners``.
 
         The *box* contains all worlds whose quantities are in the intervals.
         """
@@ -84,9 +84,9 @@ class Uncertainty(NamedTuple):
         return worlds_at(alert, sides, np.round(shares) if corners else shares)
 
     def sides(self, alert: State) -> list[Side]:
-        """Uncertain numbers of the worlds, one for each vehicle or pair; an interval of width 0 makes none.
+        """Uncertain numbers of the worlds: one for each interval and each vehicle or pair to which it applies.
 
-        Raises ``InvalidInput`` if an interval does not fit the worlds.
+        An interval of width 0 gives none. Raises ``InvalidInput`` if an interval does not fit the worlds.
         """
         sides = []
         for interval in self.intervals:
@@ -116,18 +116,19 @@ class Uncertainty(NamedTuple):
 
 
 def values_of(alert: State, key: str) -> Floats:
-    """Nominal values of a quantity such as ``gaps_m``, [n, N + 1]: one column per body (0: the obstacle).
+    """Nominal values of a quantity such as ``gaps_m``, [n, N + 1]: one column for each body (0: the obstacle).
 
-    Column 0 and the last gap have no meaning.
+    Column 0 and, of gaps, the last column have no meaning.
     """
     return alert.line[:, OF_LINE[key]] if key in OF_LINE else alert.car[:, OF_CAR[key]]
 
 
 def worlds_at(alert: State, sides: list[Side], shares: Floats) -> State:
-    """Worlds whose uncertain numbers ``sides`` are at ``shares`` [n, d] of their intervals: 0 lowest, 1 highest.
+    """Worlds in which each uncertain number lies at a share of its interval: 0 is the lower end, 1 the upper end.
 
-    A vehicle that brakes fully does so with the new capacity. Without a V2X channel, a vehicle that reacts later also
-    learns everything later. Raises ``InvalidInput`` if a script's command exceeds a capacity.
+    ``sides``: the d uncertain numbers. ``shares`` [n, d]: the shares. A vehicle that brakes fully does so with its new
+    capacity. Without a V2X channel, a vehicle that reacts later also learns everything later. Raises ``InvalidInput``
+    if a script's command exceeds the vehicle's new capacity.
     """
     line, car, know, wanted = alert.line.copy(), alert.car.copy(), alert.know.copy(), alert.wanted.copy()
     for (key, body, low, high), at in zip(sides, shares.T, strict=True):
@@ -150,8 +151,8 @@ def worlds_at(alert: State, sides: list[Side], shares: Floats) -> State:
 def parse_uncertainty(text: object) -> Uncertainty:
     """Read intervals ``quantity=half-width``, separated by commas or colons, as in ``EXAMPLE``.
 
-    A half-width is a number in the quantity's unit, or a percentage of the nominal value. ``.vehicle_2`` or ``.pair_1``
-    after the quantity limits the interval to one vehicle or pair. Raises ``InvalidInput`` for any other text.
+    A half-width is a number in the quantity's unit, or a percentage of the nominal value. The ending ``.vehicle_2`` or
+    ``.pair_1`` of the quantity limits the interval to one vehicle or pair. Raises ``InvalidInput`` for any other text.
     """
     form = f"must be quantity=half-width, for instance {EXAMPLE}"
     if not isinstance(text, str):

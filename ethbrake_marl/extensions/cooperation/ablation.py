@@ -1,8 +1,9 @@
-"""An ablation: train teams at every level with several seeds, drive the same worlds with all, search the optimum.
+"""An ablation: train teams at every level of cooperation, drive the same worlds with all, search the joint optimum.
 
 The *joint optimum* of a level is, in each world, the least known harm or cost that its learners can cause together. It
-depends on worlds, learners and scripts, but not on what the learners know or minimise, so levels that differ only in
-this share one search. A level also uses the best commands of every other level whose commands its learners can give.
+depends on worlds, learners and scripts, but not on what the learners know or minimise. Levels that differ only in what
+learners know or minimise therefore share one search. A level also uses the best commands of every other level whose
+commands its learners can give.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ STEP_ROUNDING = 1e-9  # part of a step by which decisions of two levels may diff
 
 @dataclass(frozen=True)
 class Ablation:
+    """Plan of an ablation: the levels to compare, how teams are trained, and in which worlds they are compared."""
+
     folder: Path  # of all results
     levels: tuple[Level, ...]
     recipes: tuple[TrainingRecipe, ...]  # each has its scheme for several learners
@@ -82,6 +85,10 @@ class Ablation:
         return tuple(f"{recipe.name}-{recipe.scheme}" for recipe in self.recipes)
 
     def jobs(self) -> Iterator[tuple[Level, str, Job]]:
+        """Every training of the ablation: level, name of the algorithm (recipe and scheme), and job.
+
+        A level with one learner is trained without a scheme, because schemes are for several learners.
+        """
         for seed in range(self.seeds):
             for recipe, algorithm in zip(self.recipes, self.algorithms, strict=True):
                 for level in (level for level in self.levels if level.scenario.learners):
@@ -122,9 +129,9 @@ class LevelResult(NamedTuple):
 
 
 def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
-    """Start or continue all trainings, ``jobs`` at a time. Return False if Ctrl-C stopped one.
+    """Start or continue all trainings, ``jobs`` at a time. Return False if Ctrl-C stopped a training.
 
-    Raises ``InvalidInput`` if a training's folder contains anything else.
+    Raises ``InvalidInput`` if the folder of a training contains anything else.
     """
     all_jobs = [job for _, _, job in plan.jobs()]
     for job_number, finished in enumerate(run_each(((job.finish,) for job in all_jobs), jobs), 1):
@@ -135,6 +142,7 @@ def train_all(plan: Ablation, jobs: int, tell: OnProgress) -> bool:
 
 
 def measure(plan: Ablation, tell: OnProgress) -> list[LevelResult]:
+    """Drive all worlds at every level with every trained team; one result for each level and algorithm."""
     trained: dict[Any, list[Job]] = {}
     for level, name, job in plan.jobs():
         trained.setdefault((level.name, name), []).append(job)
@@ -152,6 +160,11 @@ def measure(plan: Ablation, tell: OnProgress) -> list[LevelResult]:
 
 
 def driven(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs: Any) -> LevelResult:
+    """Results of one level if the teams that ``jobs`` have trained drive its worlds.
+
+    Full braking of all learners is measured for comparison. Without jobs, only the scripts drive. ``algorithm``: name
+    for the results.
+    """
     scenario, measures = level.scenario, []
     named = {f"{algorithm} seed {seed}": f"team@{job.folder}" for seed, job in enumerate(jobs)}
     teams = teams_of(named, scenario) if named else {"scripts": Team("scripts", {})}
@@ -180,15 +193,17 @@ def driven(level: Level, drawn_worlds: DrawnWorlds, algorithm: str | None, jobs:
 
 
 def minimised_amount(declared: Declared, count: str, game: Game, alert: State, last: State) -> MeasureValue:
-    """What the training minimises, as a mean over the learners, [n]: the objective ``declared`` in ``count``.
+    """What the training minimises: the objective ``declared`` in ``count``, as a mean over the learners, [n].
 
-    A measure, once the first two arguments are given; ``alert`` is unused.
+    It is a measure once its first two arguments are bound; ``alert`` is unused.
     """
     vehicle_amounts = amounts(objectives_of(declared, last.vehicles), None, last, count)
     return np.asarray(vehicle_amounts[:, game.settings.learners - 1].mean(axis=1))
 
 
 class Answer(NamedTuple):
+    """Best commands of one level and harm of its trained teams, with all that another level needs to use them."""
+
     scenario: Scenario
     game: Game
     worlds: State  # at the alert, in which the joint optimum was searched, [m]
@@ -197,7 +212,11 @@ class Answer(NamedTuple):
 
 
 def with_optima(plan: Ablation, measured: Sequence[LevelResult], threads: int, tell: OnProgress) -> list[LevelResult]:
-    """Add the joint optimum to the results of each level with a learner. Finished parts of the search are read back."""
+    """Results with the joint optimum added at each level that has a learner.
+
+    Levels whose worlds, learners and scripts are the same share one search. Finished parts of a search are read from
+    files.
+    """
     tables: dict[bytes, BestHarmTable] = {}
     answers: dict[str, Answer] = {}
     for level_result in measured:
@@ -229,7 +248,10 @@ def _tell_progress(tell: OnProgress, name: str, finished: int, total: int) -> No
 
 
 def least_known(answer: Answer, answers: Iterable[Answer], count: str) -> Floats:
-    """Least known harm in each world of ``answer``, [m] m2/s2. ``answers`` are the results of all levels."""
+    """Least known harm in each world of ``answer``, [m] m2/s2, among the commands of all ``answers``.
+
+    Commands of another level count only in worlds in which the learners of ``answer`` can give them (``can_imitate``).
+    """
     best = np.full(answer.worlds.n, np.inf)
     for original in answers:
         can = can_imitate(answer, original)
@@ -248,11 +270,11 @@ def least_known(answer: Answer, answers: Iterable[Answer], count: str) -> Floats
 
 
 def can_imitate(imitator: Answer, original: Answer) -> Bools:
-    """Whether the learners of ``imitator`` can give the commands of the learners of ``original``, [m].
+    """Whether the learners of ``imitator`` can give the commands of the learners of ``original``, in each world, [m].
 
-    They can if each learner of ``original`` learns in ``imitator``, the other vehicles of ``imitator`` have the same
-    roles, lines and latencies are the same, and each decision time of ``original`` is also one of ``imitator``. Only
-    ``imitator`` may have an obstacle, because the commands are simulated again in its worlds.
+    They can if each learner of ``original`` learns in ``imitator``, the scripted vehicles of ``imitator`` have the same
+    roles in both, lines and latencies are the same, and each decision time of ``original`` is also a decision time of
+    ``imitator``. Only ``imitator`` may have an obstacle, because the commands are simulated again in its worlds.
     """
     imitator_scenario, original_scenario = imitator.scenario, original.scenario
     scripted = [name for name, role in imitator_scenario.roles.items() if role != "learner"]

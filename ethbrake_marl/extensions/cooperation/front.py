@@ -1,8 +1,8 @@
-"""The front of a list of worlds: for each choice of weights, the least weighted harm and the harm of each vehicle.
+"""The Pareto front of harm: for each choice of weights, the least weighted harm and the harm of each vehicle.
 
-A point of the front is the mean harm of each vehicle over the worlds, for one choice of weights. A search finds these
-points; they approximate the convex part of the Pareto front, without a proof that no better ones exist. N vehicles, W
-choices of weights.
+A *choice of weights* has one weight for the harm of each vehicle. A point of the front is the mean harm of each vehicle
+over the worlds, for one choice of weights. A search finds these points; they approximate the convex part of the Pareto
+front, without a proof that no better ones exist. N vehicles, W choices of weights.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ OnSearch = Callable[[int, int], None]  # called with the number of finished sear
 
 
 class Front(NamedTuple):
-    """The harm of each vehicle in n worlds, with the best commands for each of W choices of weights."""
+    """The harm of each vehicle in n worlds, under the best commands for each of W choices of weights."""
 
     weights: Floats  # [W, N] weights of the vehicles' harm
     harm_count: str  # count that is weighted (``episode.counts``)
@@ -48,16 +48,16 @@ class Front(NamedTuple):
 
     @property
     def amounts(self) -> Floats:
-        """Weighted harm of each world, [W, n] m2/s2."""
+        """Weighted harm of each world under the best commands for each choice of weights, [W, n] m2/s2."""
         return np.stack(
             [weighted_harm(harm, row) for harm, row in zip(self.borne[self.harm_count], self.weights, strict=True)]
         )
 
 
 def weighted_harm(borne: Floats, weights: Floats) -> Floats:
-    """Weighted harm ``N sum_i w_i h_i / sum_i w_i``, [...] m2/s2, as of the objective ``weighted``.
+    """Weighted harm ``N sum_i w_i h_i / sum_i w_i``, [...] m2/s2, the same as in the objective ``weighted``.
 
-    ``borne`` [..., N] is the harm h of each vehicle, ``weights`` [N].
+    ``borne`` [..., N] is the harm h_i of each vehicle (m2/s2), ``weights`` [N] are the w_i.
     """
     total, weight_sum = np.zeros(borne.shape[:-1]), 0.0
     for i, weight in enumerate(weights.tolist()):
@@ -85,7 +85,7 @@ def weight_grid(vehicles: int, steps: int) -> Floats:
 
 
 def _divisions(vehicles: int, steps: int) -> list[list[int]]:
-    """All ways to divide ``steps`` parts among the vehicles; from one way to the next, one part moves."""
+    """All ways to divide ``steps`` parts among the vehicles; consecutive ways differ in the place of one part."""
     if vehicles == 1:
         return [[steps]]
     divisions: list[list[int]] = []
@@ -96,15 +96,18 @@ def _divisions(vehicles: int, steps: int) -> list[list[int]]:
 
 
 def corners(vehicles: int) -> Floats:
-    """Choice of weights for each vehicle, [N, N]: 1 for this vehicle, ``SLIGHT`` for the others.
+    """One choice of weights for each vehicle, [N, N]: weight 1 for this vehicle, ``SLIGHT`` for all others.
 
-    The others' harm decides only between commands under which this vehicle has almost the same harm.
+    The harm of the others therefore decides only between commands under which this vehicle has almost the same harm.
     """
     return np.where(np.eye(vehicles) == 1.0, 1.0, SLIGHT)
 
 
 def weight_table(rows: Sequence[Sequence[Any]]) -> Floats:
-    """Choices of weights as an array, [W, N]. Raises ``InvalidInput`` for unequal rows and what is no number."""
+    """Choices of weights as an array, [W, N].
+
+    Raises ``InvalidInput`` for rows of different lengths, and for a weight that is not a number.
+    """
     numbers = all(isinstance(weight, int | float) and not isinstance(weight, bool) for row in rows for weight in row)
     if not numbers or len({len(row) for row in rows}) != 1:
         text = "; ".join(",".join(map(str, row)) for row in rows)
@@ -125,10 +128,10 @@ def search_front(
 ) -> Front:
     """Search every world for the commands with the least weighted harm, for every choice of weights.
 
-    This harm is at most that of ``FRONT_CONSTANTS`` constant commands, of the shipped profiles of this world, of
-    ``agents``, of every shipped policy, and of the results for all other choices. With several learners it is also at
-    most what the same search finds for each of them alone, while the others brake fully, if all decide at the same
-    times. A world's result depends on no other world.
+    The weighted harm is at most that of ``FRONT_CONSTANTS`` constant commands, of the shipped profiles of this world,
+    of ``agents``, of every shipped policy, and of the results for all other choices. With several learners that all
+    decide at the same times, it is also at most what the same search reaches with each of them alone, while the others
+    brake fully. A world's result depends on no other world.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.extensions.cooperation import search_front
@@ -141,15 +144,15 @@ def search_front(
         scenario: its learners are controlled.
         worlds: n worlds at the alert.
         weights: weights of the vehicles' harm, [W, N].
-        count: what is weighted (``episode.counts``).
-        budget: number of profiles that are tried for each world and choice of weights.
+        count: count of harm that is weighted: ``first``, ``total`` or ``honest``.
+        budget: number of profiles (commands over time) that are tried for each world and choice of weights.
         threads: number of threads.
-        agents: names of agents that also drive all learners, with each choice of weights as the scenario's
+        agents: names of agents to compare. Each drives all learners, with each choice of weights as the scenario's
             ``harm_weight`` and the objective ``preference``.
-        on_progress: called with the number of finished searches and of all: two for each world and choice, and with
-            several learners two more for each of them.
+        on_progress: called with the number of finished searches and of all searches: two for each world and choice,
+            and, with several learners, two more for each learner.
 
-    Raises ``InvalidInput`` for weights that are no table of numbers with a column for each vehicle, or cannot be a
+    Raises ``InvalidInput`` if the weights are no table of numbers with a column for each vehicle, or cannot be a
     ``harm_weight``.
 
     """
@@ -187,7 +190,7 @@ def _join_chunks(parts: Sequence[BorneHarm]) -> BorneHarm:
 
 
 class Drivers(NamedTuple):
-    """The learners of a game, and who may drive them under each choice of weights."""
+    """The learners of a game, and the agents that may drive them under each choice of weights."""
 
     game: Game
     preferring: Sequence[tuple[Game, Mapping[str, Team]]]  # for each choice: the game with these weights, and agents
@@ -195,6 +198,11 @@ class Drivers(NamedTuple):
 
     @staticmethod
     def of(scenario: Scenario, weights: Floats, names: Sequence[str], count: str) -> Drivers:
+        """Learners of ``scenario``, with the agents ``names`` for each row of ``weights`` [W, N].
+
+        With several learners, each of them alone is included, with the agents that can drive it. ``count``: the harm
+        that agents minimise.
+        """
         chosen = [scenario.replace(harm_weight=row.tolist(), objective="preference") for row in weights]
         teams = [make_teams(names, variant, harm_count=count) for variant in chosen]
         preferring = [(open_game(variant)[1], some) for variant, some in zip(chosen, teams, strict=True)]
@@ -209,7 +217,12 @@ class Drivers(NamedTuple):
 def _search_chunk(
     drivers: Drivers, worlds: State, weights: Floats, count: str, effort: Mapping[str, int], tell: Callable[[int], None]
 ) -> tuple[ProfilePool, dict[str, BorneHarm]]:
-    """All profiles that were found in some worlds, and the harm of each vehicle if agents drive."""
+    """Pool of the best profiles (commands over time) of all searches, and the harm of each vehicle if agents drive.
+
+    Each of several learners is first searched alone. Then every choice of weights is searched twice; the second search
+    starts from the best profiles of all choices. ``effort``: budget and threads. ``tell`` is called with numbers of
+    finished searches.
+    """
     pool = ProfilePool(problem_of(drivers.game, worlds, count=count), count)
     driven, problem = _try_known_commands(pool, worlds, weights, drivers.preferring), pool.problem
     starts: list[list[Profiles]] = [[*starting_profiles(problem, worlds)] for _ in weights]
@@ -231,7 +244,11 @@ def _search_chunk(
 def _try_known_commands(
     pool: ProfilePool, worlds: State, weights: Floats, preferring: Sequence[tuple[Game, Mapping[str, Team]]]
 ) -> dict[str, BorneHarm]:
-    """Add constant commands, the shipped profiles and those of agents; return the harm if the agents drive."""
+    """Add known profiles to ``pool``: constant commands, the shipped profiles, and the commands of agents.
+
+    Returns the harm of each vehicle if the agents drive, agent -> count -> [W, n, N] m2/s2. ``preferring``: for each
+    choice of weights, the game and its agents.
+    """
     problem = pool.problem
     constants = problem.constant(problem.even_grid(FRONT_CONSTANTS))
     for q in range(FRONT_CONSTANTS):
@@ -254,7 +271,10 @@ def _try_known_commands(
 
 
 def observes_weights(team: Team) -> bool:
-    """Whether commands may depend on the weights of harm: no if there are only policies without this feature."""
+    """Whether the commands of a team may depend on the weights of harm.
+
+    False only if every driver is a policy that does not observe the weights, and there is no shield.
+    """
     policies = [getattr(agent, "policy", None) for agent in team.drivers.values()]
     feature_names = [() if policy is None else policy.observation.names for policy in policies]
     return team.shield is not None or any(
@@ -263,12 +283,15 @@ def observes_weights(team: Team) -> bool:
 
 
 class ProfilePool:
+    """Profiles (commands over time) that have been tried in n worlds, with the harm of each vehicle."""
+
     def __init__(self, problem: Problem, count: str) -> None:
         self.problem, self.count = problem, count
         self.profiles: list[Profiles] = []
         self.borne: dict[str, list[Floats]] = {harm_count: [] for harm_count in COUNTS}
 
     def add(self, profiles: Profiles) -> BorneHarm:
+        """Simulate profiles and store them; return the harm of each vehicle, count -> [n, N] m2/s2."""
         self.profiles.append(profiles)
         last = self.problem.follow(profiles)
         for count, harms in self.borne.items():
@@ -276,13 +299,17 @@ class ProfilePool:
         return {count: harms[-1] for count, harms in self.borne.items()}
 
     def choice(self, weights: Floats) -> Ints:
-        """Number of the profile with the least weighted harm in each world, [n]; ties: the least harm."""
+        """Number of the profile with the least weighted harm in each world, [n].
+
+        Among equal profiles, the one with the least total over the vehicles. ``weights`` [N].
+        """
         borne = np.stack(self.borne[self.count])
         amounts = weighted_harm(borne, weights)
         least = amounts.min(axis=0)
         return np.asarray(np.where(amounts == least, borne.sum(axis=2), np.inf).argmin(axis=0))
 
     def best(self, weights: Floats) -> Profiles:
+        """The profile with the least weighted harm in each world. ``weights`` [N]."""
         chosen, rows = self.choice(weights), np.arange(self.problem.n)
         numbers = np.unique(chosen)
         ends, commands = zip(*Profiles.pad([self.profiles[k] for k in numbers]), strict=True)
@@ -290,7 +317,7 @@ class ProfilePool:
         return Profiles(np.stack(ends)[place, rows], np.stack(commands)[place, rows])
 
     def least(self, weights: Floats) -> BorneHarm:
-        """Each vehicle's harm under the best profiles for all ``weights`` [W, N]: count -> [W, n, N]."""
+        """Harm of each vehicle under the best profiles for each row of ``weights`` [W, N]: count -> [W, n, N] m2/s2."""
         chosen, rows = [self.choice(row) for row in weights], np.arange(self.problem.n)
         return {count: np.stack([np.stack(harms)[k, rows] for k in chosen]) for count, harms in self.borne.items()}
 
@@ -298,10 +325,10 @@ class ProfilePool:
 def least_largest(
     scenario: Scenario, worlds: State, front: Front, *, budget: int = FRONT_BUDGET, threads: int = 1
 ) -> BorneHarm:
-    """Search for commands that minimise the largest harm of a vehicle; return each vehicle's harm.
+    """Search for the commands that minimise the largest harm of a vehicle (maximin).
 
-    It is count -> [n, N] m2/s2. The largest harm is at most that under any profile of ``front``, which was searched in
-    the same worlds.
+    Returns the harm of each vehicle under them, count -> [n, N] m2/s2. The largest harm is at most that under any
+    profile of ``front``, which must come from the same worlds.
     """
     game, parts = open_game(scenario)[1], []
     for first in range(0, worlds.n, FRONT_CHUNK):

@@ -47,8 +47,9 @@ def front_results(
     """Content of ``front.json``: the front, full braking, maximin, and the agents.
 
     Means have 95 % intervals over worlds, or over recordings. For each choice of weights, ``ratio`` is an agent's mean
-    weighted harm divided by the front's (null if that is 0), ``above`` the difference. ``beside``: results beside the
-    front, name -> count -> harm of each vehicle, [n, N] m2/s2; it contains ``full_brake``.
+    weighted harm divided by that of the front (null if the front's is 0), ``above`` the difference of both. ``beside``:
+    results to compare with the front, name -> count -> harm of each vehicle, [n, N] m2/s2; it must contain
+    ``full_brake``.
     """
     by = clusters_of(columns_of(drawn_worlds))
     return {
@@ -94,8 +95,9 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
 
     A point is the mean harm of all vehicles for one choice of weights. The first reference point is full braking
     (``full_brake`` [n, N] m2/s2), so only points count that are better for every vehicle. The second has, for each
-    vehicle, the larger of this and of its largest mean harm on the front. ``share``: an agent's hypervolume divided by
-    the front's, None if that is 0. Empty for more than ``MOST_DIMENSIONS`` vehicles.
+    vehicle, its mean harm under full braking or its largest mean harm on the front, whichever is larger. ``share``: an
+    agent's hypervolume divided by the front's, None if the front's is 0. The result is empty for more than
+    ``MOST_DIMENSIONS`` vehicles.
     """
     if len(full_brake.T) > MOST_DIMENSIONS:
         return []
@@ -119,10 +121,10 @@ def hypervolumes(front: Front, full_brake: Floats) -> list[Json]:
 
 
 def hypervolume(points: Floats, reference: Floats) -> float:
-    """Exact volume of the region between ``points`` [Q, N], which dominate it, and ``reference`` [N].
+    """Exact volume of the region that ``points`` [Q, N] dominate, up to the point ``reference`` [N].
 
-    Smaller coordinates are better. A point is ignored unless all its coordinates are below the reference point's. The
-    region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
+    Smaller coordinates are better. A point is ignored unless all its coordinates are below those of the reference
+    point. The region is cut into slices along the last coordinate (Zitzler 1999, "hypervolume by slicing objectives").
 
     >>> import numpy as np
     >>> from ethbrake_marl.extensions.cooperation.front_results import hypervolume
@@ -147,9 +149,10 @@ def full_braking(scenario: Scenario, drawn_worlds: DrawnWorlds) -> BorneHarm:
 
 
 def front_sheet(results: Json) -> Sheet:
-    """Table with one row for each choice of weights, and for each result beside the front.
+    """Table with one row for each choice of weights, then one for each result that is compared with the front.
 
-    Its columns are each vehicle's mean of what is weighted, the line's mean of every count, and each agent's ``ratio``.
+    Its columns are each vehicle's mean of the harm that is weighted, the line's mean of every count of harm, and each
+    agent's ``ratio``.
     """
     count, agents = results["harm_count"], results["agents"]
 
@@ -193,7 +196,7 @@ def hypervolume_sheet(results: Json) -> Sheet:
 
 @in_our_style
 def front_figure(results: Json) -> Figure:
-    """Draw one point for each choice of weights: the line's mean harm against that of the vehicle that bears most.
+    """Draw one point for each choice of weights: mean harm of the line against that of the vehicle that bears most.
 
     ``results``: the content of ``front.json``.
     """

@@ -1,7 +1,7 @@
-"""The levels that an ablation compares: scenarios with the same vehicles, gaps and speeds.
+"""The levels of cooperation that an ablation compares: scenarios with the same vehicles, gaps and speeds.
 
-They may differ in who learns, who has which information, whose harm counts, and whether an obstacle is ahead. A *sweep*
-compares copies of one level that differ in the value of one key.
+Levels may differ in who learns, who has which information, whose harm counts, and whether an obstacle is ahead. A
+*sweep* compares copies of one level that differ in the value of one key.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ class Swept(NamedTuple):
 
 
 class Level(NamedTuple):
+    """One scenario of an ablation, and the name of the level with which it is compared."""
+
     name: str  # of the scenario; in a sweep followed by the swept value, such as ``cooperation-3-pair-social-15``
     scenario: Scenario
     before: str | None = None  # name of the level with which it is compared
@@ -72,9 +74,9 @@ class Level(NamedTuple):
 
 
 def read_levels(names: Sequence[str], settings: CommandSettings) -> list[Level]:
-    """Load the levels of an ablation; each is compared with the previous one.
+    """Load the levels of an ablation; each is compared with the previous level.
 
-    Raises ``InvalidInput`` for fewer than two levels, or one given twice.
+    Raises ``InvalidInput`` for fewer than two levels, or if a level is repeated.
     """
     levels: list[Level] = []
     for name in names:
@@ -88,10 +90,10 @@ def read_levels(names: Sequence[str], settings: CommandSettings) -> list[Level]:
 
 
 def sweep_levels(name: str, sweep: str, settings: CommandSettings, recipes: Sequence[TrainingRecipe]) -> list[Level]:
-    """One level for each value of a sweep, in ascending order; each is compared with the previous one.
+    """One level for each value of a sweep, in ascending order; each is compared with the previous level.
 
-    Raises ``InvalidInput`` if the key is not a scenario's, if a setting or a recipe sets it too, or if its values make
-    levels that cannot be compared.
+    Raises ``InvalidInput`` if the key does not belong to a scenario, if a setting or a recipe also sets it, or if
+    levels with different values of the key cannot be compared.
     """
     values, levels = parse_sweep(sweep), list[Level]()
     key = values[0].key
@@ -126,8 +128,8 @@ def parse_sweep(text: str) -> list[Swept]:
     """Read a sweep ``KEY=LOW..HIGH:STEP`` or ``KEY=A,B,...``; return its values in ascending order.
 
     A word may precede the numbers, as in ``objective=social:0..90:15``. Numbers and ranges may be mixed. Raises
-    ``InvalidInput`` for any other text, a range that its step does not divide, a repeated number, and fewer than 2 or
-    more than ``MOST_VALUES`` numbers.
+    ``InvalidInput`` for any other text, a range whose length is not a multiple of its step, a repeated number, and
+    fewer than 2 or more than ``MOST_VALUES`` numbers.
     """
     key, equals, values = (part.strip() for part in text.partition("="))
     match = WORD.match(values)
@@ -157,8 +159,9 @@ def parse_sweep(text: str) -> list[Swept]:
 def common_worlds(levels: Sequence[Level], episodes: int, seed: int) -> list[DrawnWorlds]:
     """Draw the worlds of each level; world k has the same line of vehicles at all levels.
 
-    Only obstacles, weights of harm and, with different ``v2x``, latencies may differ; ``InvalidInput`` names any other
-    difference. If a sweep varies a key of the vehicles, worlds k share only their random numbers.
+    Levels may differ only in obstacles, weights of harm and, with different ``v2x``, latencies. Raises ``InvalidInput``
+    for any other difference. If a sweep varies a key of the vehicles, world k has the same random numbers at all
+    levels, but other vehicles.
     """
     drawn_by_level = [level.scenario.draw(episodes, seed) for level in levels]
     if not levels[0].same_vehicles:

@@ -43,13 +43,13 @@ Json = dict[str, Any]
 
 
 def comparison(measured: Sequence[LevelResult], searched: int) -> Json:
-    """Comparison as plain data.
+    """Comparison of the levels as plain data.
 
     - ``levels``: results of each level and algorithm;
     - ``steps``: for each algorithm, the change of harm from each level's ``before`` to the level;
     - ``undertrained``: a sentence that names the levels whose trained policies do worse than full braking, if any.
 
-    The joint optimum is known only in the first ``searched`` worlds; comparisons with it use only these.
+    The joint optimum is known only in the first ``searched`` worlds; comparisons with it use only these worlds.
     """
     steps = []
     for algorithm in dict.fromkeys(result.algorithm for result in measured if result.algorithm is not None):
@@ -125,7 +125,10 @@ def _beside_optimum(result: LevelResult, count: str, searched: int) -> Json:
 
 
 def _change(before: LevelResult, after: LevelResult, algorithm: str) -> Json:
-    """How harm differs between two levels. Seed k is compared with seed k, or with an only seed."""
+    """Difference in harm between two levels, as plain data.
+
+    Seed k is compared with seed k; a level with a single seed is compared with every seed of the other level.
+    """
     entry: Json = {"algorithm": algorithm}
     for word, result in (("from", before), ("to", after)):
         entry |= {f"{word}_{key}" if key != "level" else word: value for key, value in level_key(result).items()}
@@ -147,6 +150,7 @@ def _borne_columns(result: LevelResult, column: str) -> list[Floats]:
 
 
 def write_ablation(plan: Ablation, measured: Sequence[LevelResult]) -> tuple[Json, list[Path]]:
+    """Write ``ablation.json``, ``ablation.csv`` and the figure; return the results and the paths of the files."""
     recipes = zip(plan.algorithms, plan.recipes, strict=True)
     swept, machine = plan.levels[0].swept, this_machine()
     results = {
@@ -169,6 +173,10 @@ def write_ablation(plan: Ablation, measured: Sequence[LevelResult]) -> tuple[Jso
 
 
 def conditions(plan: Ablation, number: int) -> str:
+    """Sentences that say how results were made: recipes, seeds, worlds, intervals, search of the joint optimum.
+
+    ``number``: number of worlds over which the means are.
+    """
     recipes = ", ".join(
         f"{name} (rewarded for {IN_WORDS[recipe.reward.harm_count]})"
         for name, recipe in zip(plan.algorithms, plan.recipes, strict=True)
@@ -187,7 +195,7 @@ def conditions(plan: Ablation, number: int) -> str:
 
 
 def levels_csv(measured: Sequence[LevelResult], searched: int) -> str:
-    """CSV text with one row per level, algorithm and seed: the mean over worlds of each column of an evaluation.
+    """CSV text with one row for each level, algorithm and seed: the mean over worlds of each column of an evaluation.
 
     The columns ``searched_*`` are means over the first ``searched`` worlds.
     """
@@ -211,6 +219,7 @@ SheetColumns = list[tuple[Column, str]]
 
 
 def tables(results: Json) -> list[Sheet]:
+    """Tables for each count of harm: levels, distance to the joint optimum, and steps between levels."""
     swept, levels = results["settings"]["swept"], results["levels"]
     several = len(results["settings"]["recipes"]) > 1
     algorithm: SheetColumns = [(Column("Algorithm", text=True), "algorithm")] if several else []
@@ -242,7 +251,10 @@ def tables(results: Json) -> list[Sheet]:
 
 
 def sheet(title: str, rows: Sequence[Json], columns: SheetColumns) -> Sheet:
-    """Table. A column's path says where its values are: ``first harm`` means ``row["first"]["harm"]``."""
+    """Table with one row for each mapping of ``rows``. Each column has a path to its values in a row.
+
+    The path ``first harm`` means ``row["first"]["harm"]``.
+    """
     cells: list[list[Any]] = []
     for row in rows:
         cells.append([])

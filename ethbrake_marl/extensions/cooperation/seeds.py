@@ -2,7 +2,7 @@
 
 The bootstrap resamples the seeds of each argument, and the worlds (or recordings) of all arguments together.
 ``values``, ``baseline``, ``worst`` and ``best`` are [seeds, worlds], for the same worlds; the numbers of seeds may
-differ. ``clusters`` has the name of each world's recording, [worlds]; None: all worlds are independent.
+differ. ``clusters`` contains the name of each world's recording, [worlds]; None: all worlds are independent.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ CONFIDENCE = 0.95
 def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None) -> Estimate:
     """Mean over seeds and worlds of ``values``, or of ``values - baseline``, [seeds, worlds] each.
 
-    There is no interval for only one world or recording, or if all values are 0 without a baseline. A share (truth
-    values without a baseline) always has one that contains Wilson's interval, because bootstrap intervals of nearly
-    constant values are too narrow.
+    The estimate has no interval if there is only one world or recording, or if all values are 0 and there is no
+    baseline. A share (truth values without a baseline) always has an interval, which contains Wilson's, because
+    bootstrap intervals of nearly constant values are too narrow.
     """
     array = np.atleast_2d(np.asarray(values))
     sides = [array, np.zeros((1, array.shape[1])) if baseline is None else np.atleast_2d(baseline)]
@@ -49,8 +49,8 @@ def mean_over_seeds(values: Any, baseline: Any = None, clusters: Clusters = None
 def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clusters = None) -> Estimate | None:
     """Share of the possible reduction ``(mean(worst) - mean(values)) / (mean(worst) - mean(best))``.
 
-    All are [seeds, worlds]. None if ``mean(best) >= mean(worst)``, or if at least 5 % of the resamples leave almost
-    nothing to reduce.
+    All arguments are [seeds, worlds]. The result is None if ``mean(best) >= mean(worst)``, or if at least 5 % of the
+    resamples leave almost nothing to reduce.
     """
     sides = [np.atleast_2d(array) for array in (values, worst, best)]
     reached, high, low = (float(side.mean(axis=0).mean()) for side in sides)
@@ -72,9 +72,10 @@ def share_over_seeds(values: Floats, worst: Floats, best: Floats, clusters: Clus
 def _interval(
     sides: Sequence[Floats], of: Callable[[Floats], Floats], clusters: Clusters
 ) -> tuple[float, float] | None:
-    """Confidence interval of a statistic ``of`` the arguments' means, [resamples, arguments].
+    """Confidence interval of a statistic; None if there is only one world or recording.
 
-    ``sides``: the arguments, [seeds, worlds] each. None for only one world or recording.
+    ``sides``: arguments of the statistic, [seeds, worlds] each. ``of``: the statistic, a function of the arguments'
+    means [resamples, arguments].
     """
     cluster = np.arange(sides[0].shape[1]) if clusters is None else np.unique(clusters, return_inverse=True)[1]
     if cluster.max() == 0:
@@ -85,6 +86,10 @@ def _interval(
 
 
 def _resampled_means(sides: Sequence[Floats], cluster: Ints) -> Floats:
+    """Means of the arguments in random resamples of worlds (or recordings) and seeds, [RESAMPLES, arguments].
+
+    ``cluster`` [worlds]: number of each world's recording. All arguments have the same resampled worlds.
+    """
     worlds, number, rng = len(cluster), int(cluster.max()) + 1, np.random.default_rng(0)
     means, chunk = np.empty((RESAMPLES, len(sides))), max(1, RESAMPLES_AT_ONCE // worlds)
     for begin in range(0, RESAMPLES, chunk):

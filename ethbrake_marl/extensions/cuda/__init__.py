@@ -1,4 +1,4 @@
-"""Episodes and training on NVIDIA's GPUs, with the bits of a processor: one world in each thread."""
+"""Episodes and training on NVIDIA GPUs, with the same bits as on a processor: one GPU thread for each world."""
 
 from __future__ import annotations
 

@@ -20,14 +20,14 @@ THREADS_PER_BLOCK = 128  # threads that a GPU starts together
 
 
 class Kernel(NamedTuple):
-    """``kernels.play_world`` for n worlds, one thread for each: its GPU form and its processor form."""
+    """The function ``kernels.play_world`` for n worlds, one thread for each: its GPU form and its processor form."""
 
     size: tuple[int, ...]  # bodies, learners, features, neighbours in view
     mine: ThreadMemory  # memory of one thread, arrays
 
     @property
     def name(self) -> str:
-        """Name of the stored machine code: everything that decides it, except the sources."""
+        """Name of the stored machine code. It contains everything that decides the code, except the sources."""
         return "-".join(["play", *map(str, self.size)])
 
     def thread(self) -> Callable[..., None]:
@@ -44,7 +44,10 @@ class Kernel(NamedTuple):
 
 
 def device_named(name: str) -> torch.device:
-    """Torch device: ``cpu``, ``cuda`` or ``cuda:1``. Raises ``InvalidInput`` if it cannot run the kernels."""
+    """Torch device for a name such as ``cpu``, ``cuda`` or ``cuda:1``.
+
+    Raises ``InvalidInput`` if the device cannot run the kernels.
+    """
     try:
         device = torch.device(name)
     except (RuntimeError, TypeError):
@@ -65,7 +68,7 @@ class TooLittleMemory(InvalidInput):
 def enough_memory(what: str) -> Iterator[None]:
     """Context manager: too little memory raises ``TooLittleMemory``, whose message begins with ``what``.
 
-    If such managers are nested, the outermost one's message is used.
+    If such managers are nested, the message is that of the outermost one.
     """
     try:
         yield
@@ -77,6 +80,7 @@ def enough_memory(what: str) -> Iterator[None]:
 
 
 def _check_gpu(index: int) -> None:
+    """Raise ``InvalidInput`` with advice if torch cannot use GPU number ``index``, or the GPU is too old."""
     if torch.version.cuda is None:
         raise InvalidInput(
             f"device = 'cuda': the installed torch {torch.__version__} is not built for NVIDIA's GPUs; install a build"
@@ -105,11 +109,12 @@ def as_arrays(arguments: Any) -> Any:
 
 
 def empty_arrays(arguments: Any) -> Any:
-    """Arguments of a kernel with empty arrays on the processor in place of tensors, to compile the kernel."""
+    """Arguments of a kernel, with empty arrays on the processor instead of tensors, to compile the kernel."""
     return _map_tensors(arguments, lambda tensor: torch.empty((0,) * tensor.dim(), dtype=tensor.dtype).numpy())
 
 
 def _map_tensors(argument: Any, array_of: Callable[[Tensor], Any]) -> Any:
+    """The argument with ``array_of`` applied to each tensor; tuples are mapped part by part."""
     if isinstance(argument, Tensor):
         return array_of(argument)
     if isinstance(argument, tuple):
@@ -119,7 +124,7 @@ def _map_tensors(argument: Any, array_of: Callable[[Tensor], Any]) -> Any:
 
 
 def cells_of(argument: Any) -> Iterator[Any]:
-    """Arguments of a kernel in the form that code compiled by numba expects.
+    """Arguments of a kernel as the C values that code compiled by numba expects.
 
     An array becomes two unused pointers, its number of entries, the size of an entry in bytes, its address, shape and
     strides in bytes. A tuple becomes its parts.
@@ -171,7 +176,7 @@ class _Driver:
         return function
 
     def check(self, call: str, *arguments: Any) -> None:
-        """Call a function of the driver. Raises ``InvalidInput`` with the driver's reason if it fails."""
+        """Call a function of the driver. Raises ``InvalidInput`` with the driver's reason if the call fails."""
         code = getattr(self.cuda, call)(*arguments)
         if code:
             text = ctypes.c_char_p()

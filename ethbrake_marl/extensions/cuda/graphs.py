@@ -12,9 +12,10 @@ WARM_UP = 3  # calls before the graph is recorded, in which torch and the driver
 
 
 class Graphed:
-    """A function whose arguments have the same shapes in every call. It must not wait for the device.
+    """A function of tensors that a GPU repeats as one CUDA graph. Its arguments have the same shapes in every call.
 
-    On a GPU the next call overwrites the result. On a processor the function is called as it is.
+    The function must not wait for the device. On a GPU the next call overwrites the result. On a processor the function
+    is called as it is.
     """
 
     def __init__(self, function: Callable[..., Any], device: torch.device) -> None:
@@ -35,6 +36,7 @@ class Graphed:
         return self.result
 
     def _beside(self, *tensors: Tensor) -> Any:
+        """Result of the function on a second CUDA stream, as CUDA requires before a graph is recorded."""
         main, beside = torch.cuda.current_stream(), new_stream()
         beside.wait_stream(main)
         with torch.cuda.stream(beside):

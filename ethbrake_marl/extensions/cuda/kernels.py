@@ -30,7 +30,7 @@ FINE, NO_ACTION, PHYSICS_FAILED = 0, 1, 2
 
 
 class StoredEpisodes(NamedTuple):
-    """Episodes, as in ``State``, with the index of the world last."""
+    """Episodes of n worlds: the arrays of ``State``, with the index of the world last."""
 
     line: Any  # [LINE_ROWS, B, n]
     car: Any  # [CAR_ROWS, B, n]
@@ -40,6 +40,8 @@ class StoredEpisodes(NamedTuple):
 
 
 class Results(NamedTuple):
+    """Results of one launch in n worlds."""
+
     out: Any  # [OUT_ROWS, n] rows as in `Step.out`
     reward: Any  # [n] of every learner
     observations: Any  # [n, L, F] float32
@@ -47,6 +49,8 @@ class Results(NamedTuple):
 
 
 class Ruling(NamedTuple):
+    """Settings of a game that a step needs, as in ``StepSettings``."""
+
     learners: Any  # [L]
     time_step_s: Any
     harm: Any
@@ -55,6 +59,8 @@ class Ruling(NamedTuple):
 
 
 class ViewArrays(NamedTuple):
+    """Arrays that say which features the learners observe, as in ``View.plan``."""
+
     offsets: Any
     role: Any
     obstacle: Any
@@ -63,6 +69,8 @@ class ViewArrays(NamedTuple):
 
 
 class ThreadMemory(NamedTuple):
+    """Working memory of one thread: one world, the actions in it, and the results of a step."""
+
     line: Any
     car: Any
     clock: Any
@@ -77,7 +85,7 @@ class ThreadMemory(NamedTuple):
 
 
 def memory_of(bodies: int, learners: int, features: int, neighbours: int) -> ThreadMemory:
-    """Memory of one thread, for a processor."""
+    """Working memory of one thread, as arrays on a processor."""
     return ThreadMemory(
         line=np.zeros((1, LINE_ROWS, bodies)),
         car=np.zeros((1, CAR_ROWS, bodies)),
@@ -95,6 +103,7 @@ def memory_of(bodies: int, learners: int, features: int, neighbours: int) -> Thr
 
 @large
 def load_world(t, stored, memory):
+    """Copy world t of ``stored`` to the memory of this thread."""
     for i in range(memory.wanted.shape[1]):
         for row in range(memory.line.shape[1]):
             memory.line[0, row, i] = stored.line[row, i, t]
@@ -109,6 +118,7 @@ def load_world(t, stored, memory):
 
 @large
 def save_world(t, stored, memory, is_new):
+    """Copy the world from the memory of this thread to world t of ``stored``; a new world with its constant arrays."""
     for i in range(memory.wanted.shape[1]):
         for row in range(memory.line.shape[1]):
             stored.line[row, i, t] = memory.line[0, row, i]
@@ -124,12 +134,12 @@ def save_world(t, stored, memory, is_new):
 
 @large
 def play_world(t, memory, stored, pool, following, actions, results, settings, view, mode):
-    """Advance world t by one step, or begin or only observe its episode, as ``mode`` says; then observe it.
+    """Do what ``mode`` says in world t: take a step, begin an episode, or nothing. Then observe the world.
 
-    ``memory`` is the memory of this thread. ``stored`` has the running episodes, ``pool`` the worlds from which they
-    begin; ``following`` [n] is the world of the pool in which each next episode begins. ``actions`` [n, L] float32 are
-    clipped to [-1, 1]. If one of them is NaN, nothing moves and ``results.status`` says so. ``settings``: a ``Ruling``.
-    ``view``: a ``ViewArrays``.
+    ``memory`` is the memory of this thread. ``stored`` contains the running episodes, ``pool`` the worlds in which
+    episodes begin; ``following`` [n] is the number of the world in the pool in which the next episode begins.
+    ``actions`` [n, L] float32 are clipped to [-1, 1]. If an action is NaN, nothing moves in this world and
+    ``results.status`` says so. ``settings``: a ``Ruling``. ``view``: a ``ViewArrays``.
     """
     load_world(t, stored, memory)
     is_new = mode == BEGIN
@@ -166,5 +176,6 @@ def play_world(t, memory, stored, pool, following, actions, results, settings, v
 
 @large
 def play_each(memory, stored, pool, following, actions, results, settings, view, mode, n):
+    """Call ``play_world`` for n worlds, one after the other, on a processor."""
     for t in range(n):
         play_world(t, memory, stored, pool, following, actions, results, settings, view, mode)

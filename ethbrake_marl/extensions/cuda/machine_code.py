@@ -1,7 +1,7 @@
-"""PTX of a kernel, the code that NVIDIA's driver compiles for its GPU: made without a GPU, and stored in the cache.
+"""PTX of a kernel (code that NVIDIA's driver compiles for its GPU): made without a GPU, and stored in the cache.
 
 Multiplications and additions are not fused (``fma=0``), so every operation rounds as on a processor, and a world has
-the same bits there and here.
+the same bits on both.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ PTX_VERSION = "8.4"  # every driver from 550 on reads it, and nothing here needs
 def ptx_of(
     name: str, kernel: Callable[[], Callable[..., None]], arguments: tuple[Any, ...], capability: tuple[int, int]
 ) -> str:
-    """PTX of a kernel, with the entry ``kernel``, for arguments of the types of ``arguments``.
+    """PTX of a kernel, compiled for the types of ``arguments``; its entry point has the name "kernel".
 
-    ``name``: all that decides the code, except the sources. ``kernel``: makes the kernel, if its code is not stored
-    yet. ``capability``: the GPU's compute capability. Raises ``MissingExtra`` if the code must be compiled and
-    numba-cuda is not installed.
+    The code is read from the cache if it is stored there. ``name``: key of the code in the cache; it must contain
+    everything that decides the code, except the sources. ``kernel``: function that makes the kernel, called only if the
+    code is not stored. ``capability``: the GPU's compute capability. Raises ``MissingExtra`` if the code must be
+    compiled and numba-cuda is not installed.
     """
     capability = min(capability, NEWEST)
     stamp = stamp_of(str(Path(__file__).with_name("threads.py")))
@@ -40,6 +41,10 @@ def ptx_of(
 
 
 def compile_kernel(kernel: Callable[..., None], arguments: tuple[Any, ...], capability: tuple[int, int]) -> str:
+    """PTX of a kernel for the types of ``arguments``, with the entry point "kernel".
+
+    Raises ``MissingExtra`` if numba-cuda is not installed.
+    """
     with naming_extras():
         import numba_cuda  # noqa: F401  # replaces numba.cuda
     import numba
@@ -56,7 +61,10 @@ def compile_kernel(kernel: Callable[..., None], arguments: tuple[Any, ...], capa
 
 @contextmanager
 def without_fma(capability: tuple[int, int]) -> Iterator[None]:
-    """Context manager in which numba-cuda does not fuse * and +, and needs no GPU. It has no option for either."""
+    """Context manager in which numba-cuda does not fuse * and +, and compiles without a GPU.
+
+    Two functions of numba-cuda are replaced, because it has no option for either.
+    """
     from numba.cuda import dispatcher
     from numba.cuda.cudadrv import nvvm
 

@@ -1,4 +1,4 @@
-"""The GPU kernel: each thread takes memory of its own, and calls ``kernels.play_world``.
+"""The GPU kernel: each thread allocates its own memory, and calls ``kernels.play_world``.
 
 numba's simulator runs it without a GPU. This module is imported only when needed, because numba.cuda is slow to import.
 """
@@ -14,7 +14,10 @@ from ethbrake_marl.extensions.cuda.kernels import ThreadMemory, play_world
 
 
 def play_thread(shapes: ThreadMemory) -> Callable[..., None]:
-    """GPU kernel that runs ``play_world`` in n threads. ``shapes`` of their memory are constants of its code."""
+    """GPU kernel that runs ``play_world`` in n threads.
+
+    ``shapes``: shapes of the arrays in a thread's memory; they are constants of the kernel's code.
+    """
     line, car, clock, know, wanted, proposed, scratch, out, rewards, value, shape_of_observations = shapes
 
     def play_worlds(

@@ -1,6 +1,6 @@
-"""The algorithm vine on a GPU: episodes, branches and the network's training run there.
+"""The training algorithm vine on a GPU: episodes, branches and the network's training run on the device.
 
-Random numbers are drawn on the processor, so they are the same as there.
+Random numbers are drawn on the processor, so they are the same as in a training on a processor.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from ethbrake_marl.training.training import Training
 
 
 class CudaVine(Vine):
-    """The algorithm vine on the recipe's device."""
+    """The algorithm vine on the device that the recipe names."""
 
     def new_model(self, training: Training, environment: EthBrakeVecEnv) -> CudaVineModel:
         """New model, with the same random weights as on a processor.
 
-        Raises ``InvalidInput`` for minibatches of different sizes, for what ``Worlds`` refuses, and for more worlds
-        than the device has memory for.
+        Raises ``InvalidInput`` if ``batch_size`` does not divide ``tried``, for games that ``Worlds`` refuses, and for
+        more worlds than the device has memory for.
         """
         recipe = training.recipe
         assert isinstance(recipe, VineRecipe)
@@ -60,8 +60,8 @@ def sizes(recipe: VineRecipe) -> str:
 class CudaVineModel(VineModel):
     """Model of vine on a GPU. It visits decisions in ``worlds``, and tries other actions in ``branches``.
 
-    The environment that the training has built for Stable-Baselines3 is not stepped. n: worlds; L: learners; B: tried
-    decisions; D: visited decisions of one learner, n_steps n.
+    The environment that the training has built for Stable-Baselines3 is not stepped. n: worlds; L: learners; F:
+    features; B: tried decisions; D: visited decisions of one learner, n times n_steps.
     """
 
     def __init__(self, training: Training, environment: EthBrakeVecEnv, device: str) -> None:
@@ -92,7 +92,7 @@ class CudaVineModel(VineModel):
         return super()._get_torch_save_params()[0], [*episodes, "worlds.following", "worlds.results.observations"]
 
     def _update_learning_rate(self, optimizers: Any) -> None:
-        """Set the learning rate in its old place in memory, where a CUDA graph reads it."""
+        """Set the learning rate in the same memory as before, because a CUDA graph reads it there."""
         (group,) = optimizers.param_groups
         rate = group["lr"]
         super()._update_learning_rate(optimizers)
@@ -104,12 +104,16 @@ class CudaVineModel(VineModel):
             return super().learn(*arguments, **options)
 
     def act(self, observations: Tensor) -> Tensor:
+        """Actions of the policy, [n, L] in [-1, 1], for ``observations`` [n, L, F]."""
         outputs: Tensor = self.policy.learning(observations.flatten(0, 1))
         return outputs.clamp(-1.0, 1.0).view(observations.shape[:2])
 
     @torch.no_grad()
     def collect(self, callback: BaseCallback) -> tuple[Tensor, StoredEpisodes]:
-        """Drive all worlds for ``n_steps`` decisions; return observations [D L, F], and the states at the decisions."""
+        """Drive all worlds for ``n_steps`` decisions.
+
+        Returns the observations [D L, F], and the states at these decisions.
+        """
         worlds = self.worlds
         for step in range(self.recipe.n_steps):
             rows = slice(step * worlds.n, (step + 1) * worlds.n)
@@ -122,13 +126,17 @@ class CudaVineModel(VineModel):
         return self.seen.flatten(0, 1), self.visited
 
     def improve(self, observations: Any, states: Any) -> None:
-        """Measure gradients at some of the decisions that ``collect`` visited, and update the actor with them."""
+        """Update the actor with gradients measured at some of the decisions that ``collect`` visited.
+
+        ``observations`` [D L, F]: observations at all visited decisions.
+        """
         self.train_actor(self.measure(observations))
 
     @torch.no_grad()
     def measure(self, observations: Tensor) -> TrialResults:
-        """Draw visited decisions; simulate a branch with a higher and one with a lower action than the policy's.
+        """Measured gradients at randomly drawn visited decisions.
 
+        At each, two branches are simulated: one with a higher and one with a lower action than the policy's.
         ``observations`` [D L, F]: observations at all visited decisions.
         """
         place = self.worlds.device
@@ -139,9 +147,10 @@ class CudaVineModel(VineModel):
         return TrialResults(sample, self.policy.learning(sample)[:, 0], self.measured_gradient(gained, moved))
 
     def play_here(self, world: Tensor, learner: Tensor, size: Tensor, steps: Tensor) -> Tensor:
-        """Simulate branches; return what learners gained and how far their actions were moved, [2, 2B].
+        """Simulate branches: in each, one learner's action is moved for some steps, then the policy continues.
 
-        Arguments [2B]: visited decision, learner, distance of the action, and number of steps for which it is moved.
+        Returns the discounted reward, and the sum by which actions were really moved (they end at -1 and 1), [2, 2B].
+        Arguments [2B]: visited decision, learner, size of the move, and number of steps for which it lasts.
         """
         worlds, result = self.branches, torch.zeros(2, len(world), dtype=size.dtype, device=size.device)
         observations, mask, discount = worlds.put(self.visited, world), learner[:, None] == self.each_learner, 1.0
@@ -157,5 +166,6 @@ class CudaVineModel(VineModel):
         return result
 
     def descend(self, observations: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+        """Loss of one gradient step of the actor, repeated as a CUDA graph."""
         loss: Tensor = self.descended(observations, target, weight)
         return loss.clone()

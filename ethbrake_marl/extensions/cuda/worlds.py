@@ -1,4 +1,4 @@
-"""``Worlds``: many episodes on a GPU, as torch tensors, without copies to the processor."""
+"""``Worlds``: many episodes on a GPU, as torch tensors that stay on the device."""
 
 from __future__ import annotations
 
@@ -46,10 +46,10 @@ class Stepped(NamedTuple):
 
 
 class Worlds:
-    """n episodes on one device, with the bits of ``Game.step``.
+    """n episodes on one device, with the same bits as ``Game.step``.
 
-    An episode that ends is replaced, in the same step, by one in the next world of a pool, which is drawn in advance.
-    An example is in docs/extensions/cuda.md.
+    An episode that ends is replaced, in the same step, by an episode in the next world of a pool, which is drawn in
+    advance. An example is in docs/extensions/cuda.md.
     """
 
     def __init__(
@@ -73,13 +73,13 @@ class Worlds:
             device: ``cuda``, ``cuda:1``, or ``cpu``, where the same code runs slowly.
             seed: seed of the training worlds.
             learners: vehicles that learn, as for ``open_game``.
-            reward: as for ``open_game``, of terms that the compiled step knows.
+            reward: as for ``open_game``, but only with terms that the compiled step computes.
             observation: features of the groups own, front_K, rear_K, role and obstacle.
 
-        Raises ``InvalidInput`` for what no kernel computes: scripts that look at the state, messages, another physics,
-        features and terms of the reward with functions of Python, learners with different views; for a device that
-        cannot run kernels; and for more worlds than it has memory for. Raises ``MissingExtra`` if the kernels must be
-        compiled and numba-cuda is missing.
+        Raises ``InvalidInput`` for what no kernel computes: scripts that look at the state, messages, replaced physics,
+        a shield, features and reward terms that are Python functions, learners that observe different features; for a
+        device that cannot run kernels; and for more worlds than the device has memory for. Raises ``MissingExtra`` if
+        the kernels must be compiled and numba-cuda is missing.
 
         """
         check_whole_number("n", n, 1)
@@ -119,6 +119,7 @@ class Worlds:
         return torch.zeros(*shape, dtype=kind, device=self.device)
 
     def stored(self, state: State) -> StoredEpisodes:
+        """Arrays of a state as tensors on the device, with the index of the world last."""
         arrays = (state.line, state.car, state.clock, state.know, state.wanted)
         return StoredEpisodes(*(torch.from_numpy(np.moveaxis(array, 0, -1).copy()).to(self.device) for array in arrays))
 
@@ -129,7 +130,7 @@ class Worlds:
         return observations
 
     def reset(self) -> Tensor:
-        """Begin all episodes, in the first n worlds of the pool; return the observations, [n, L, F]."""
+        """Begin all episodes, in the first n worlds of the pool; return the observations, [n, L, F] float32."""
         torch.arange(self.n, out=self.following)
         self.following.remainder_(self.pool.wanted.shape[1])
         self.results.status.zero_()
@@ -140,8 +141,8 @@ class Worlds:
         """Take one step in all episodes.
 
         ``actions`` [n, L] float32 are clipped to [-1, 1]. With ``renew=False``, an episode that has ended stays as it
-        is, and its reward and harm are 0. Errors in a world are stored for ``check``, so that no step waits for the
-        device. Raises ``InvalidInput`` for a tensor of another shape, type or device.
+        is, and its reward and harm are 0. Raises ``InvalidInput`` for a tensor of another shape, type or device. Other
+        errors, such as an action that is NaN, are stored for ``check``, so that no step waits for the device.
         """
         shape, right = self._no_actions.shape, (torch.float32, torch.strided)
         if not (isinstance(actions, Tensor) and actions.shape == shape and (actions.dtype, actions.layout) == right):
@@ -155,7 +156,7 @@ class Worlds:
         return Stepped(observations, reward, *ends, out[FIRST_HARM], out[TOTAL_HARM])
 
     def put(self, stored: StoredEpisodes, rows: Tensor) -> Tensor:
-        """Continue from the episodes ``rows`` [n] of ``stored``; return the observations, [n, L, F].
+        """Replace the running episodes by the episodes ``rows`` [n] of ``stored``; return the observations, [n, L, F].
 
         Raises ``InvalidInput`` for another number of rows, and for worlds with another number of vehicles.
         """
@@ -177,14 +178,14 @@ class Worlds:
         self.kernel.launch(self.device, self.n, *self.arguments(actions, mode))
 
     def state(self) -> State:
-        """Episodes as the core's ``State`` on the processor."""
+        """The running episodes as the core's ``State``, on the processor."""
         line, car, clock, know, wanted = (np.moveaxis(array.cpu().numpy(), -1, 0).copy() for array in self.now)
         return State(line, car, clock, know, wanted, {})
 
     def check(self) -> None:
         """Raise an error for the first world in which a step has failed since the last ``reset``.
 
-        ``InvalidInput`` for an action that is NaN, ``PhysicsError`` if a check of the physics failed.
+        The error is ``InvalidInput`` for an action that is NaN, and ``PhysicsError`` if a check of the physics failed.
         """
         if not bool(self.results.status.any()):
             return
@@ -198,7 +199,7 @@ class Worlds:
 
 
 def check_runs(game: Game) -> None:
-    """Raise ``InvalidInput`` if a game has something that GPU kernels do not compute."""
+    """Raise ``InvalidInput`` if a game contains something that GPU kernels do not compute."""
     what = f"scenario {game.name!r} in kernels for a GPU"
     for body, script in game.scripts.items():
         name = getattr(script, "name", type(script).__name__)
@@ -235,7 +236,10 @@ def check_runs(game: Game) -> None:
 
 
 def kernel_of(game: Game, bodies: int, device: torch.device) -> tuple[Ruling, ViewArrays, Kernel]:
-    """Kernel ``play`` and its constant arguments. ``bodies``: number of bodies, vehicles and obstacle."""
+    """Settings and features of a game as constant arguments of the kernel ``play_world``, and this kernel.
+
+    ``bodies``: number of bodies (the vehicles and the obstacle).
+    """
     on = partial(torch.tensor, device=device)
     settings, plan = game.settings, game.views[int(game.settings.learners[0])].plan
     ruling = Ruling(

@@ -36,9 +36,9 @@ class Parameters:
 
 
 class KnownMotion(NamedTuple):
-    """What one vehicle knows in n worlds: its own motion, and the motion of what is ahead: a vehicle or the obstacle.
+    """What one vehicle knows in n worlds: its own motion, and the motion of the vehicle or obstacle ahead.
 
-    If nothing is ahead, or nothing is known of it, the gap is infinite.
+    If nothing is ahead, or the vehicle knows nothing of it, the gap is infinite.
     """
 
     gap_m: Floats  # [n] gap to the vehicle or obstacle ahead
@@ -50,7 +50,10 @@ class KnownMotion(NamedTuple):
 
     @classmethod
     def of(cls, state: State, body: int, step_s: float) -> KnownMotion:
-        """What vehicle ``body`` knows. ``state``: the worlds as the vehicle estimates them."""
+        """What the vehicle ``body`` knows.
+
+        ``state``: the worlds as this vehicle estimates them. ``step_s``: time until the next decision (s).
+        """
         line, ahead = state.line, body - 1
         is_known = state.know[:, body, ahead] <= state.time_s if ahead else line[:, GAP, 0] < FAR_M
         front, force = np.where(is_known, line[:, [SPEED, FORCE], ahead].T, 0.0)
@@ -70,11 +73,11 @@ class KnownMotion(NamedTuple):
 
     @property
     def headway_s(self) -> Floats:
-        """Gap ahead / own speed, [n] s; infinite if the own speed is not above 0."""
+        """Gap ahead divided by the vehicle's own speed, [n] s; infinite if this speed is not above 0."""
         return np.where(self.speed_mps > 0.0, self.gap_m / np.where(self.speed_mps > 0.0, self.speed_mps, 1.0), np.inf)
 
     def built_up(self, wanted_mps2: Floats, rate_mps3: float) -> Floats:
-        """Command ``wanted_mps2``, with its deceleration growing by at most ``rate_mps3``, [n] m/s2."""
+        """The command ``wanted_mps2``, but with a deceleration that grows by at most ``rate_mps3``, [n] m/s2."""
         return np.maximum(wanted_mps2, np.minimum(self.own_mps2, 0.0) - rate_mps3 * self.step_s)
 
 
@@ -123,13 +126,13 @@ def _human_notices(motion: KnownMotion, p: Parameters) -> Bools:
 
 
 def _share(distance: Floats, safe: Floats, unsafe: Floats) -> Floats:
-    """Danger [n]: 0 for a ``distance`` above ``safe``, 1 below ``unsafe``, and linear in between."""
+    """Danger [n]: 0 where ``distance`` is above ``safe``, 1 where it is below ``unsafe``, and linear in between."""
     between = (safe - distance) / np.where(safe > unsafe, safe - unsafe, 1.0)
     return np.where(distance > safe, 0.0, np.where(distance < unsafe, 1.0, between))
 
 
 def fuzzy_criteria(motion: KnownMotion, p: Parameters) -> tuple[Floats, Floats]:
-    """The proactive and the critical criterion of UN R157's fuzzy safety model, [n] each: danger from 0 to 1.
+    """Proactive and critical criterion of the fuzzy safety model of UN R157, [n] each: danger from 0 to 1.
 
     ``p``: parameters of the law ``r157_fsm``.
     """
@@ -168,6 +171,8 @@ def _aeb(motion: KnownMotion, p: Parameters) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Law:
+    """A controller from the literature: its formula, with the default parameters and the source."""
+
     about: str  # name of the controller
     source: str  # publication of the formula
     parameters: Mapping[str, float]  # default value of each parameter, in SI units
@@ -219,9 +224,10 @@ LAWS: dict[str, Law] = {
 class Controller:
     """Agent that follows a ``Law``.
 
-    Its memory is the time at which it noticed a danger, [n] s: infinite if it has noticed none, NaN before the first
-    decision. The reaction time begins then or, for a danger at the first decision, at the alert, so it overlaps with
-    the latency. The reaction ends with the danger, unless ``law.stays``; the next danger starts a new one.
+    Its memory is the time of the danger to which it reacts, [n] s: infinite if there is none, NaN before the first
+    decision. The reaction time begins when the agent notices the danger; for a danger at the first decision it begins
+    at the alert, so it overlaps with the latency. The reaction ends with the danger, unless ``law.stays``; the next
+    danger starts a new reaction.
     """
 
     knows = MESSAGES
@@ -231,6 +237,7 @@ class Controller:
         self.name, self.law, self.parameters, self.step_s = name, law, Parameters(**parameters), step_s
 
     def check(self, game: Game, body: int) -> None:
+        """Raise ``InvalidInput`` if the time step of the game is not the one for which the controller was made."""
         step_s = game.settings.time_step_s
         if not math.isclose(step_s, self.step_s):
             raise InvalidInput(
@@ -242,6 +249,11 @@ class Controller:
         return np.full(alert.n, np.nan)
 
     def act(self, state: State, memory: Floats, body: int) -> tuple[Floats, Floats]:
+        """Commands of the vehicle ``body``, [n] m/s2, and the new memory.
+
+        If the law notices dangers, the vehicle coasts without one. Between perception and the end of the reaction time
+        it decelerates by at least ``release`` (m/s2).
+        """
         motion, p = KnownMotion.of(state, body, self.step_s), self.parameters
         command = self.law.command(motion, p)
         if self.law.notices is not None:

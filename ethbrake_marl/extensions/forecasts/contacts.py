@@ -1,10 +1,9 @@
-"""The feature groups ``contact`` and ``contact_far``: a vehicle's next impacts if it brakes fully, coasts, or drives
-fully.
+"""The feature groups ``contact`` and ``contact_far``: a vehicle's next impacts if it brakes, coasts or drives fully.
 
 A forecast simulates, for ``FORECAST_S``, the unbroken row of known vehicles around the observer. The observer's command
-takes effect after its latency. Every other vehicle keeps its force, with two exceptions: one without a force brakes
-fully after its latency, and one whose brakes build up is taken to brake fully, since its force does not show its
-command.
+takes effect after its latency. Every other vehicle keeps the present force of its brakes or engine, with two
+exceptions: a vehicle without a force brakes fully after its latency, and a vehicle whose brakes build up is taken to
+brake fully, since its force does not show its command.
 """
 
 from __future__ import annotations
@@ -84,11 +83,11 @@ CONTACT_FAR = tuple(feature for command, held in FORECAST_COMMANDS.items() for f
 
 @kernel
 def known_line(line, car, know, time, i, observer_line, parameters, commands):
-    """Copy a world at ``time`` (s) as body i knows it, with assumed commands of the others.
+    """Copy a world as body i knows it, with assumed commands of the others; return the first and last known body.
 
-    Return the first and last known body. ``line``, ``car`` and ``know`` of the world, as in ``State``, are copied to
-    ``observer_line`` and ``parameters``; the ``commands`` [N + 1] are in m/s2. Unknown bodies are at rest and out of
-    reach.
+    ``line``, ``car`` and ``know`` of the world at ``time`` (s), as in ``State``, are copied to ``observer_line`` and
+    ``parameters``. The assumed commands (m/s2) are written to ``commands`` [N + 1]. Unknown bodies are at rest and out
+    of reach.
     """
     first, last = i, i
     while first > 1 and time >= know[i, first - 1]:
@@ -116,10 +115,10 @@ def known_line(line, car, know, time, i, observer_line, parameters, commands):
 
 @large
 def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out):
-    """Write the unscaled features ``contact`` and ``contact_far`` to ``out`` [n, observers, F].
+    """Write the features ``contact`` and ``contact_far``, before scaling, to ``out`` [n, observers, F].
 
-    Returns the row of a world whose simulation failed, or -1. ``line``, ``car``, ``clock``, ``know``: as in ``State``.
-    ``observers``: their bodies. ``memory``: arrays that are overwritten.
+    Returns the index of a world in which the simulation failed, or -1. ``line``, ``car``, ``clock``, ``know``: as in
+    ``State``. ``observers``: numbers of the observing bodies. ``memory``: arrays that are overwritten.
     """
     scratch, here, observer_line, parameters, commands = memory
     near, failed = 3 * PER_COMMAND, -1
@@ -146,10 +145,11 @@ def forecast_worlds(line, car, clock, know, observers, time_step_s, memory, out)
 
 @kernel
 def write_features(scratch, has_impact, i, first, last, time_step_s, value):
-    """Write the features of one forecast for body i to ``value``; they are 0 for a pair that is not known.
+    """Write the features of one forecast for body i to ``value``; features of an unknown pair are 0.
 
-    ``scratch``: results of the simulation. ``has_impact``: whether it had an impact. ``first``, ``last``: known bodies.
-    An impact exactly at the end of a time step belongs to this step, as in the episode.
+    ``scratch``: results of the simulation. ``has_impact``: whether the simulation contains an impact. ``first``,
+    ``last``: first and last known body. An impact exactly at the end of a time step belongs to this step, as in the
+    episode.
     """
     for side in range(2):
         p, impact = i - 1 + side, value[side * PER_SIDE : (side + 1) * PER_SIDE]
@@ -170,6 +170,10 @@ def write_features(scratch, has_impact, i, first, last, time_step_s, value):
 
 
 def _forecasts(state: State, observers: Ints, time_step_s: float) -> Floats:
+    """Features ``contact`` and ``contact_far`` before scaling, [n, observers, F].
+
+    Raises ``PhysicsError`` if a simulation fails.
+    """
     check_exact(state, "a forecast of contacts")
     bodies = state.wanted.shape[1]
     out = np.empty((state.n, len(observers), len(CONTACT) + len(CONTACT_FAR)))

@@ -1,7 +1,7 @@
 """Measures ``injury_CURVE``: expected injuries if the same impacts happened in 1,000 lines of vehicles.
 
-The sum over the vehicles, each with its largest change of speed; ``injury_CURVE_2`` is that of Vehicle 2 alone. A
-vehicle without an impact has no injury, even if it is pushed.
+Injuries are added over the vehicles, each with its largest change of speed; ``injury_CURVE_2`` counts Vehicle 2 alone.
+A vehicle without an impact has no injury, even if it is pushed.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ethbrake_marl.registry import Part
 
 
 class Injuries:
-    """Watches each vehicle's largest change of speed by one impact, at its front and rear."""
+    """Measure that watches each vehicle's largest change of speed by one impact, at its front and at its rear."""
 
     def __init__(self, curve: str, game: Game, alert: State) -> None:
         self.curve, self.changes = curve, np.zeros((alert.n, 2, alert.vehicles))
@@ -28,7 +28,7 @@ class Injuries:
         self.changes = np.maximum(self.changes, speed_changes(before, after))
 
     def result(self, last: State) -> MeasureValue:
-        """Injuries of the line, and of each vehicle, [n]."""
+        """Expected injuries in 1,000 lines: of the whole line, and of each vehicle, [n] each."""
         injuries = expected_injuries(self.changes, self.curve)
         return {"": injuries.sum(axis=1), **{f"{i + 1}": column for i, column in enumerate(injuries.T)}}
 

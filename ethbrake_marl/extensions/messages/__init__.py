@@ -1,1 +1,1 @@
-"""Messages between vehicles: what they contain, how old they are, and what a vehicle makes of them."""
+"""Messages between vehicles: what they contain, how old they are, and what a vehicle concludes from them."""

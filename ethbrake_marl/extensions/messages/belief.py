@@ -1,4 +1,4 @@
-"""What one vehicle believes: the state of the line according to its messages and sensors."""
+"""What one vehicle knows and estimates: the state of the line according to its messages and sensors."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ def known_pieces(state: State, observer: int) -> Bools:
     """Whether the body ``observer`` knows each quantity in ``PIECES`` of each body, [n, N + 1, PIECES].
 
     *Pieces* are the quantities that a message can contain, such as speed and intent (the newest command). Body 0 is the
-    obstacle. The observer knows what the messages of a vehicle contain, its intent only after the first message; and
-    place, speed and acceleration of a neighbour in sight. Of itself and of the obstacle it knows everything.
+    obstacle. The observer knows what a vehicle's messages contain, but its intent only after its first message. It also
+    knows place, speed and acceleration of a neighbour in sight, and everything of itself and of the obstacle.
     """
     memory: MessageMemory = state.memories[MESSAGES_KEY]
     time = state.time_s[:, np.newaxis]
@@ -73,11 +73,11 @@ def known_pieces(state: State, observer: int) -> Bools:
 
 
 def belief_of(state: State, observer: int) -> State:
-    """State as the body ``observer`` estimates it. What it does not know is NaN, except gaps.
+    """State as the body ``observer`` estimates it. Unknown quantities are NaN, except gaps.
 
-    Old samples are moved on to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which it
-    knows nothing. ``wanted`` has the newest intents (commands received). Gaps add up to the distances of bodies with a
-    known place.
+    Old samples are extrapolated to the present (``links.estimate_worlds``). ``know`` is infinite for a body of which
+    the observer knows nothing. ``wanted`` contains the newest intents (commands) that it has received. Gaps add up to
+    the distances between bodies with a known place.
     """
     known = known_pieces(state, observer)
     news = newest_samples(state, observer)
@@ -95,7 +95,8 @@ def belief_of(state: State, observer: int) -> State:
 def predictable_belief_of(state: State, observer: int) -> State:
     """State as the body ``observer`` estimates it, without the vehicles that it cannot predict.
 
-    It can predict a vehicle of which it knows all quantities but the intent. For the others ``know`` is infinite.
+    It can predict a vehicle of which it knows all quantities, except perhaps the intent. For the others ``know`` is
+    infinite.
     """
     known = known_pieces(state, observer)
     line, predictable = (
@@ -112,10 +113,10 @@ def _known_if(state: State, observer: int, holds: Bools) -> Floats:
 
 
 def ages_s(state: State) -> Floats:
-    """Age of the newest sample that body i has of body j, [n, N + 1, N + 1] s; infinite if it has none.
+    """Age of the newest sample that body i has of body j, [n, N + 1, N + 1] s; infinite if i has none.
 
-    Body 0 is the obstacle. Without periodic messages it is 0, because then i knows the present state, from
-    ``state.know`` on.
+    Body 0 is the obstacle. Without periodic messages all ages are 0, because body i then knows the present state, from
+    the time ``state.know`` on.
     """
     memory: MessageMemory = state.memories[MESSAGES_KEY]
     if not memory.is_periodic:
@@ -133,10 +134,11 @@ def require_pieces(
     needs: Sequence[str] = LOOK_AHEAD,
     senders: Sequence[int] | None = None,
 ) -> None:
-    """Raise ``InvalidInput`` if messages lack a quantity that ``who``, the agent of the vehicles ``observers``, needs.
+    """Raise ``InvalidInput`` if messages lack a quantity that an agent needs.
 
-    ``needs``: names in ``PIECES``. ``senders``: vehicles whose messages are needed; None: all. An agent of several
-    vehicles needs their messages, too.
+    ``who``: words for the agent, which controls the vehicles ``observers``. ``needs``: names in ``PIECES``.
+    ``senders``: vehicles whose messages are needed; None: all. An agent that controls one vehicle does not need that
+    vehicle's messages; an agent of several needs the messages of its own vehicles, too.
     """
     senders = range(1, state.vehicles + 1) if senders is None else senders
     for sender in senders if MESSAGES_KEY in state.memories else ():

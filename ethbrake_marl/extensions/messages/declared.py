@@ -1,4 +1,4 @@
-"""The keys ``persistence`` and ``tells`` of a scenario's ``v2x``."""
+"""The keys ``persistence`` and ``tells`` of ``v2x``: whether messages are repeated, and what they contain."""
 
 from __future__ import annotations
 
@@ -52,6 +52,10 @@ class Messages(Extension):
     }
 
     def read(self, key: str, value: Any) -> Any:
+        """Value of the key as plain data. Raises an error for any other value.
+
+        ``persistence`` is ``first`` or ``periodic``; ``tells`` a list of names in ``PIECES``, or vehicle -> list.
+        """
         if key == "persistence":
             require(value in ("first", "periodic"), (key,), value, "must be first or periodic")
             return value
@@ -70,7 +74,7 @@ class Messages(Extension):
         return read if by_name else read[""]
 
     def uses(self, v2x: V2X) -> tuple[str, ...]:
-        """Keys of ``v2x`` that messages after the first use. Raises an error for keys without effect."""
+        """Keys of ``v2x`` that have an effect on messages after the first. Raises an error for keys without effect."""
         tells = _value(v2x, "tells")
         right = "needs a channel with separate messages; use a preset that generates messages, such as nominal"
         sent = v2x.hears != "none" and v2x.timing != "latency"
@@ -83,7 +87,7 @@ class Messages(Extension):
         return _is_periodic(v2x) and v2x.loss_begins > 0.0
 
     def check(self, scenario: Scenario) -> None:
-        """Raise an error for contents of unknown vehicles, and for a delay of too many time steps."""
+        """Raise an error for contents of unknown vehicles, and if a message is under way for too many time steps."""
         v2x, tells = scenario.v2x, _value(scenario.v2x, "tells")
         for name in tells if isinstance(tells, Mapping) else ():
             right = f"unknown vehicle; this scenario has vehicle_1 ... vehicle_{scenario.vehicles}"
@@ -96,6 +100,11 @@ class Messages(Extension):
         require(count <= MOST_SAMPLES, ("v2x",), v2x, right)
 
     def at_alert(self, scenario: Scenario, numbers: Numbers, unheard: Bools, n: int) -> MessageMemory:
+        """Memory of the message channel for n worlds at the alert.
+
+        ``numbers`` draws random numbers. ``unheard`` [n or 1, N, N]: whether vehicle i never receives messages of
+        vehicle j.
+        """
         N, v2x = scenario.vehicles, scenario.v2x
         heard_s, seen_s = v2x.heard_and_seen(numbers(PER_LINK * N * N, NEWS), unheard)
         channel: Floats = np.zeros((n, CHANNEL_COLUMNS))

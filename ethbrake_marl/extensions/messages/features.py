@@ -1,4 +1,4 @@
-"""Features of a neighbour from its messages: ``age``, ``intent``, and ``PIECE_known`` for each of their quantities."""
+"""Features of a neighbour from its messages: ``age``, ``intent``, and ``PIECE_known`` for each quantity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ethbrake_marl.registry import Part
 
 
 def age(state: State, body: int, neighbour: int) -> Floats:
-    """Age of the newest sample received from the neighbour; 0 if its present state, or nothing, is known."""
+    """Age of the newest sample received from the neighbour; 0 if its present state is known, or nothing of it."""
     if MESSAGES_KEY not in state.memories:
         return np.zeros(state.n)
     ages = ages_s(state)[:, body, neighbour]
@@ -23,7 +23,7 @@ def age(state: State, body: int, neighbour: int) -> Floats:
 
 
 def intent(state: State, body: int, neighbour: int) -> Floats:
-    """Command that the neighbour chose at its last decision, if its messages contain it; else 0."""
+    """Command that the neighbour chose at its last decision, if its messages contain it; otherwise 0."""
     return state.wanted[:, neighbour] if MESSAGES_KEY in state.memories else np.zeros(state.n)
 
 

@@ -1,4 +1,4 @@
-"""The layer of messages: vehicles observe what they believe, and scripts act on it."""
+"""The layer of messages: vehicles observe what they know and estimate, and scripts act on it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ NEEDS = {  # feature of a neighbour -> pieces without which it reads 0
 
 
 class MessagesLayer(Layer):
-    """Lets a vehicle see what it believes, according to the ``Memory`` of messages in the state."""
+    """Lets a vehicle see only what it knows and estimates, according to the ``MessageMemory`` in the state."""
 
     stage = 1
 
@@ -67,7 +67,7 @@ class MessagesLayer(Layer):
         return belief_of(state, body)
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Bodies (0: obstacle) that vehicle ``body`` does not fully know at its first decision, [n, N + 1]."""
+        """Bodies (0: obstacle) of which vehicle ``body`` does not know everything at its first decision, [n, N + 1]."""
         memory: MessageMemory = alert.memories[MESSAGES_KEY]
         unseen = memory.seen_s[:, body] > alert.car[:, LATENCY, body, np.newaxis]
         lacks = ~memory.contents[:, :, [P_BRAKING, P_LATENCY, P_MASS]].all(axis=2)
@@ -75,10 +75,10 @@ class MessagesLayer(Layer):
         return np.asarray(lacks | (old & unseen))
 
     def infos(self, state: State) -> dict[str, Any]:
-        """Infos of messages: name -> [n, N], one value for each vehicle that acts.
+        """Infos of messages: name -> [n, N], one value for each vehicle.
 
-        ``known_from_s_vehicle_2``: time from which a vehicle acts on news of Vehicle 2 (s; infinite: never).
-        ``age_s_vehicle_2``: age of its newest sample of Vehicle 2, with periodic messages (s; infinite: none).
+        ``known_from_s_vehicle_2``: time from which the vehicle reacts to messages of Vehicle 2 (s; infinite: never).
+        ``age_s_vehicle_2``: age of its newest sample of Vehicle 2, only with periodic messages (s; infinite: none).
         """
         infos: dict[str, Any] = {}
         reports = {"known_from_s": state.know}
@@ -103,9 +103,10 @@ def _remembering(state: State, memory: MessageMemory) -> State:
 
 
 class BelievedView(LayeredView):
-    """A view of what the observer estimates. A feature is 0 if it needs a quantity that the observer does not know.
+    """Observations of what a vehicle estimates. A feature is 0 if it needs a quantity that the vehicle does not know.
 
-    Feature groups of other packages show a vehicle only if the observer knows all of its quantities but the intent.
+    Feature groups of other packages show a vehicle only if the observer knows all of its quantities, except perhaps the
+    intent.
     """
 
     def __init__(self, layer: Layer, view: View) -> None:
@@ -137,20 +138,23 @@ class BelievedView(LayeredView):
 
 
 class Believer(LayeredScript):
-    def begin(self, alert: State, body: int) -> Any:
-        """Memory of the script at the alert. Raises ``InvalidInput`` if it will not know what it needs.
+    """A script that acts on what its vehicle knows from messages and sensors."""
 
-        A script may have ``needs_ahead``: quantities of the vehicle ahead that messages must contain until it is in
-        sight.
+    def begin(self, alert: State, body: int) -> Any:
+        """Memory of the script at the alert.
+
+        Raises ``InvalidInput`` if the vehicle may never learn what the script needs. A script may have ``needs_ahead``:
+        quantities of the vehicle ahead that messages must contain unless that vehicle comes into sight.
         """
         if self.needs_ahead and body > 1 and np.isinf(alert.memories[MESSAGES_KEY].seen_s[:, body, body - 1]).any():
             require_pieces(alert, [body], f"agent {self.name!r}", self.needs_ahead, [body - 1])
         return super().begin(alert, body)
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Commands of the script, [n] m/s2, and its new memory; it acts on what vehicle ``body`` knows.
+        """Commands of the script, [n] m/s2, and its new memory.
 
-        Raises ``InvalidInput`` for a script that needs more.
+        Raises ``InvalidInput`` if a command is not finite because the script needs a quantity that messages do not
+        contain.
         """
         commands, memory = super().act(state, memory, body)
         if not np.isfinite(commands).all():

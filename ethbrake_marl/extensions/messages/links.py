@@ -1,9 +1,10 @@
 """Messages on the links between vehicles: their samples, which message arrives when, and where its sender may be now.
 
-A vehicle samples itself at the alert and at every decision, also at those before the first one. On each link a message
-is sent once per period, and used after a delay; it contains the newest sample of its sender. A link is good or bad
-(Gilbert-Elliott model): with each message after the first, a good link turns bad with probability p, and a bad one good
-with probability r. What is sent over a bad link is lost. A neighbour in sight is measured at every decision.
+A vehicle records a *sample* of its own motion at the alert and at every decision, also at those before the first one.
+On each link a message is sent once per period, and used after a delay; it contains the newest sample of its sender. A
+link is good or bad (Gilbert-Elliott model): with each message after the first, a good link turns bad with probability
+p, and a bad one good with probability r. Messages over a bad link are lost. A neighbour in sight is measured at every
+decision.
 """
 
 from __future__ import annotations
@@ -67,7 +68,10 @@ SAME_MOMENT_S = 1e-9  # two moments that are closer are the same (s)
 
 
 class MessageMemory(NamedTuple):
-    """What the vehicles of n worlds have sent and received. In arrays of links, [.., i, j] is what i has of body j."""
+    """What the vehicles of n worlds have sent and received.
+
+    In arrays [..., N + 1, N + 1], the entry [..., i, j] is what body i has received from, or knows of, body j.
+    """
 
     contents: Bools  # [n, N + 1, PIECES] whether messages of a body contain the piece
     heard_s: Floats  # [n, N + 1, N + 1] when the first message can be used (s); infinite: never
@@ -84,7 +88,10 @@ class MessageMemory(NamedTuple):
 
 
 def samples_kept(delay_s: float, time_step_s: float) -> int:
-    """Number of samples to store so that a delayed message finds its own: those of one delay, and three more."""
+    """Number of samples to store so that a delayed message still finds the sample that it contains.
+
+    These are the samples of one delay, and three more.
+    """
     return math.ceil(delay_s / time_step_s - SAME_MOMENT_S) + 3
 
 
@@ -112,7 +119,7 @@ def memory_at_alert(
 def present(state: State) -> Floats:
     """Sample that each body would send now, [n, SAMPLE_ROWS, N + 1] (body 0: the obstacle).
 
-    Places are relative to Vehicle 1. The intent of a vehicle is its last command; 0 before it knows of the alert.
+    Places are relative to Vehicle 1. The intent of a vehicle is its last command, or 0 before it knows of the alert.
     """
     sample = np.zeros((state.n, SAMPLE_ROWS, state.vehicles + 1))
     latency, time = state.car[:, LATENCY], state.time_s[:, np.newaxis]
@@ -124,9 +131,10 @@ def present(state: State) -> Floats:
 
 
 def begin_messages(alert: State, start_s: Floats, time_step_s: float, sent: Callable[[State], State]) -> MessageMemory:
-    """Memory at the first decision, ``start_s`` [n], with what has been received since the alert.
+    """Memory at the first decision, ``start_s`` [n] (s), with what has been received since the alert.
 
-    Until then vehicles execute ``alert.wanted``. ``sent``: the state that vehicles send and measure, from the true one.
+    Until then vehicles execute ``alert.wanted``. ``sent``: function from the true state to the state that vehicles send
+    and measure.
     """
     memory, line = _writable_copy(alert.memories[MESSAGES_KEY]), alert.line.copy()
     force = np.where(alert.car[:, LATENCY] <= 0.0, alert.wanted, 0.0)
@@ -144,7 +152,7 @@ def begin_messages(alert: State, start_s: Floats, time_step_s: float, sent: Call
 
 
 def after_step(before: State, after: State, sent: Callable[[State], State]) -> MessageMemory:
-    """Return the memory after a step, with what has been received in it; ``sent``: as for ``begin_messages``."""
+    """Memory after a step, with what was received during the step. ``sent``: as for ``begin_messages``."""
     memory = _writable_copy(before.memories[MESSAGES_KEY])
     _, way = _advanced(before._replace(wanted=after.wanted), after.time_s)
     _sample(memory, sent(after), way, after.time_s > before.time_s)
@@ -156,7 +164,10 @@ def _writable_copy(memory: MessageMemory) -> MessageMemory:
 
 
 def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
-    """State at ``until_s`` [n], and the way of Vehicle 1, [n] m: how much nearer a fixed post is."""
+    """State at ``until_s`` [n], and the way of Vehicle 1 until then, [n] m.
+
+    The way is the amount by which the gap to the obstacle, or to a post far ahead, falls.
+    """
     line = state.line.copy()
     line[line[:, GAP, 0] >= FAR_M, GAP, 0] = FRONT_POST_M
     after = hold_commands(state._replace(line=line), until_s)
@@ -164,7 +175,7 @@ def _advanced(state: State, until_s: Floats) -> tuple[State, Floats]:
 
 
 def _sample(memory: MessageMemory, state: State, way_m: Floats, rows: Bools) -> None:
-    """Add a sample in the worlds ``rows`` (a mask [n]) to ``memory`` and receive what arrives, in place.
+    """Add a sample of ``state`` to ``memory`` in the worlds ``rows`` (a mask [n]), and receive what arrives, in place.
 
     ``way_m`` [n]: way of Vehicle 1 since the last sample.
     """
@@ -177,7 +188,7 @@ def _sample(memory: MessageMemory, state: State, way_m: Floats, rows: Bools) -> 
 
 
 def newest_samples(state: State, observer: int) -> Floats:
-    """Newest sample of each body that the body ``observer`` has, [n, SAMPLE_ROWS, N + 1]."""
+    """Newest sample that the body ``observer`` has of each body, [n, SAMPLE_ROWS, N + 1]."""
     memory: MessageMemory = state.memories[MESSAGES_KEY]
     if not memory.is_periodic:
         return present(state)
@@ -187,6 +198,7 @@ def newest_samples(state: State, observer: int) -> Floats:
 
 
 def estimated_line(state: State, observer: int, known: Bools, news: Floats) -> Floats:
+    """Array ``State.line`` as the body ``observer`` estimates it; arguments: as for ``estimate_worlds``."""
     line, bodies, aged = state.line.copy(), known.shape[1], state.memories[MESSAGES_KEY].is_periodic
     working = np.empty(bodies), np.empty(bodies, np.bool_)
     estimate_worlds(observer, state.time_s.copy(), state.car[:, LIMIT].copy(), known, news, aged, line, *working)
@@ -197,8 +209,8 @@ def estimated_line(state: State, observer: int, known: Bools, news: Floats) -> F
 def receive_worlds(rows, time, channel, seen_s, samples, links, news):
     """Receive all messages that can be used by ``time`` [n] (s), and measure vehicles in sight, in the worlds ``rows``.
 
-    ``rows`` is a mask [n]; the other arguments are arrays of ``MessageMemory``, of which ``links`` and ``news`` are
-    changed.
+    ``rows`` is a mask [n]. The other arguments are arrays of ``MessageMemory``; ``links`` and ``news`` are changed in
+    place.
     """
     bodies = news.shape[3]
     for k in range(len(rows)):
@@ -220,9 +232,10 @@ def receive_worlds(rows, time, channel, seen_s, samples, links, news):
 
 @kernel
 def take_sample(samples, news, i, j, sent, rows):
-    """Copy the newest sample of body j from ``sent`` (s) or before to i's ``news``: its first ``rows`` rows.
+    """Copy rows of a sample of body j to what body i has received: the newest sample taken at ``sent`` (s) or before.
 
-    One world: ``samples`` [L, SAMPLE_ROWS, N + 1], newest first; ``news`` [SAMPLE_ROWS, N + 1, N + 1].
+    Only the first ``rows`` rows are copied. One world: ``samples`` [L, SAMPLE_ROWS, N + 1], newest first; ``news``
+    [SAMPLE_ROWS, N + 1, N + 1] is changed.
     """
     for s in range(samples.shape[0]):
         if samples[s, AT, j] <= sent + SAME_MOMENT_S:
@@ -235,7 +248,7 @@ def take_sample(samples, news, i, j, sent, rows):
 def loss_number(key, link, number):
     """Random number in [0, 1) that decides whether message ``number`` of a link is lost: a SplitMix64 hash.
 
-    ``key``: of the world, as in ``Memory.channel``. ``link``: number of the link.
+    ``key``: random key of the world, the column KEY of ``MessageMemory.channel``. ``link``: number of the link.
     """
     z = np.uint64(key) ^ (np.uint64(link + 1) * np.uint64(0x9E3779B97F4A7C15))
     z ^= np.uint64(number + 1.0) * np.uint64(0xD1342543DE82EF95)
@@ -250,8 +263,8 @@ def loss_number(key, link, number):
 def moved_on(speed, force, limit, duration):
     """Speed (m/s) and way (m) of a vehicle after ``duration`` (s) under a constant force, without contact.
 
-    ``force``: acceleration (m/s2). ``limit``: speed up to which it drives (m/s). A vehicle that moves backward brakes
-    to rest, whatever the sign of its force.
+    ``force``: acceleration (m/s2). ``limit``: speed up to which the vehicle drives (m/s). A vehicle that moves backward
+    brakes to rest, whatever the sign of its force.
     """
     if speed >= 0.0:
         after, way, _ = solo(speed, force, 0.0, limit, duration)
@@ -263,13 +276,13 @@ def moved_on(speed, force, limit, duration):
 
 @large
 def estimate_worlds(observer, time, limit, known, news, aged, line, place, fresh):
-    """Overwrite ``line``, the true one (``State.line``), by the line as the body ``observer`` estimates it.
+    """Overwrite the true ``line`` (``State.line``) by the line as the body ``observer`` estimates it.
 
-    From the newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], it continues to ``time`` [n] (s) with the
-    same force, up to the speed ``limit`` [n, N + 1] (m/s), and without contact. Between two samples of the present the
-    gap is the true one. A place that is not ``known`` [n, N + 1, PIECES] is the place of the next body towards the
-    observer; an unknown speed or force is 0. If news may be old (``aged``), the observer knows of no impact between
-    others. ``place`` and ``fresh`` [N + 1]: memory, overwritten.
+    The newest sample of each body, ``news`` [n, SAMPLE_ROWS, N + 1], is extrapolated to ``time`` [n] (s) with a
+    constant force, up to the speed ``limit`` [n, N + 1] (m/s), and without contact. Between two samples of the present
+    the gap is the true one. If the place of a body is not ``known`` [n, N + 1, PIECES], the place of the next body
+    towards the observer is used; an unknown speed or force is 0. If samples may be old (``aged``), the observer knows
+    of no impact between other vehicles. ``place`` and ``fresh`` [N + 1]: memory, overwritten.
     """
     bodies = line.shape[2]
     for k in range(len(time)):

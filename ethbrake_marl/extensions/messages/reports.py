@@ -1,8 +1,9 @@
 """Noisy and false reports: the key ``reports`` of a scenario's ``v2x``.
 
-Every vehicle sees the others' speeds with an error ``bias_mps + noise_mps z``, where z is a standard normal number for
-each world, vehicle and decision. The ``liar`` also seems neither to brake nor to drive. Messages contain these errors,
-so that an old message keeps its own; gaps, and what a vehicle measures of itself, are exact.
+Every vehicle sees the other vehicles' speeds with an error ``bias_mps + noise_mps z``, where z is a standard normal
+number for each world, vehicle and decision. The ``liar`` also seems neither to brake nor to drive. Messages contain
+these errors, so an old message keeps the error it was sent with. Gaps, and what a vehicle measures of itself, are
+exact.
 """
 
 from __future__ import annotations
@@ -34,7 +35,10 @@ MOST_MPS = 50.0  # largest noise and bias
 
 @large
 def chances(keys, steps, out):
-    """Write random numbers in [0, 1) to ``out`` [n, N], one for each vehicle, from the ``keys`` and ``steps`` [n]."""
+    """Write a random number in [0, 1) for each world and vehicle to ``out`` [n, N].
+
+    It is a hash of the world's key in ``keys`` [n], the vehicle, and the number of the decision in ``steps`` [n].
+    """
     for k in range(out.shape[0]):
         for i in range(out.shape[1]):
             out[k, i] = loss_number(keys[k], i, steps[k])
@@ -42,7 +46,7 @@ def chances(keys, steps, out):
 
 @dataclass(frozen=True)
 class ReportsLayer(Layer):
-    """Lets a vehicle see the others' speeds with errors."""
+    """Lets a vehicle see the others' speeds with errors, and the liar as if it neither braked nor drove."""
 
     noise_mps: float = 0.0  # standard deviation
     bias_mps: float = 0.0
@@ -63,7 +67,10 @@ class ReportsLayer(Layer):
 
 
 class Reports(Extension):
-    """Extension that the key ``reports`` of ``v2x`` switches on."""
+    """Errors in what vehicles report and measure of each other (key ``reports`` of ``v2x``).
+
+    The errors are noise and bias of speeds, and one vehicle that lies about its acceleration and intent.
+    """
 
     name = NAME
     schemas: Mapping[str, dict[str, Any]] = {
@@ -95,6 +102,7 @@ class Reports(Extension):
     }
 
     def read(self, key: str, value: Any) -> Any:
+        """Value of the key ``reports`` as plain data. Raises an error for unknown keys and for numbers out of range."""
         right = "must be a mapping, such as {noise_mps: 0.5, bias_mps: 1, liar: vehicle_1}"
         require(isinstance(value, Mapping) and len(value) > 0, (key,), value, right)
         for name, content in value.items():
@@ -117,7 +125,7 @@ class Reports(Extension):
         return "noise_mps" in _value(v2x)
 
     def check(self, scenario: Scenario) -> None:
-        """Refuse an unknown liar."""
+        """Raise an error if the ``liar`` is no vehicle of the scenario."""
         liar = _value(scenario.v2x).get("liar")
         if liar is not None:
             check_vehicle(liar, scenario.vehicles, ("v2x", NAME, "liar"), liar)

@@ -6,11 +6,11 @@ controlled vehicle; the *rear pair* is the controlled and the rear vehicle. The 
 the controlled vehicle with either neighbour. The *extreme command* is full drive after a first contact with the front
 vehicle, and full braking after a first contact with the rear vehicle.
 
-Shared names. Index l is the front vehicle, f the controlled vehicle, r the rear vehicle; v is a speed (m/s), a > 0 a
-braking capacity and u >= 0 a driving capacity (m/s2). Time 0 is the moment at which the controlled vehicle may act;
-times are in s after it.
+Arguments with the same name mean the same in all files. Index l is the front vehicle, f the controlled vehicle, r the
+rear vehicle; v is a speed (m/s), a > 0 a braking capacity and u >= 0 a driving capacity (m/s2). Time 0 is the moment at
+which the controlled vehicle may act; times are in s after it.
 
-- ``at``: one world at time 0, [COLUMNS] of ``line``.
+- ``at``: one world at time 0 as a row of numbers, [LINE_COLUMNS]; the file ``line`` names the columns.
 - ``kind``: neighbour of the first contact, ``FRONT_FIRST`` or ``REAR_FIRST``.
 - ``time``: time of the contact.
 - ``early``, ``late``: earliest and latest time of the first contact.

@@ -1,7 +1,7 @@
 """Can the controlled vehicle avoid contact with both neighbours? One trajectory decides.
 
-The *largest trajectory* is farther ahead at every time than any other that stays behind the front vehicle. Contact with
-the rear vehicle can be avoided if and only if the rear vehicle stays behind the largest trajectory.
+The *largest trajectory* stays behind the front vehicle, and is farther ahead at every time than any other that does.
+Contact with the rear vehicle can be avoided if and only if the rear vehicle stays behind the largest trajectory.
 
 docs/internals/proofs/avoidable-contact.md derives every formula.
 """
@@ -53,7 +53,7 @@ PROVEN_FOR = "9c34cfada8195d65"  # digest of the physics; docs/internals/model.m
 
 
 class Avoidability(NamedTuple):
-    """Whether the controlled vehicle can avoid all contact, in each of ``n`` worlds, and how."""
+    """Whether, and how, the controlled vehicle can avoid all contact in each of n worlds."""
 
     # [n] 0: contact is avoidable. 1, early: a pair has contact before the controlled vehicle may act. 2, front: even
     # full braking leads to contact with the front vehicle. 3, rear: the rear vehicle reaches the largest trajectory.
@@ -67,22 +67,26 @@ class Avoidability(NamedTuple):
 
     @property
     def avoidable(self) -> Bools:
-        """Whether some commands avoid all contact, and therefore every impact, [n]."""
+        """Whether some command of the controlled vehicle avoids all contact, and therefore every impact, [n]."""
         return np.asarray(self.reason == AVOIDABLE)
 
     @property
     def reason_name(self) -> NDArray[np.str_]:
-        """Why contact is unavoidable, [n]: ``early``, ``front`` or ``rear``; empty if it is avoidable."""
+        """Why contact is unavoidable, [n] texts; empty where it is avoidable.
+
+        ``early``: a pair touches before the vehicle may act. ``front``: full braking still reaches the front vehicle.
+        ``rear``: the rear vehicle reaches the largest trajectory.
+        """
         return np.array(REASONS)[self.reason]
 
 
 @kernel
 def spare_gap(gap, v_l, a_l, v_f, a_f):
-    """Smallest gap (m) if follower and leader brake fully from now on; negative: they make contact.
+    """Smallest gap (m) between follower and leader if both brake fully from now on; negative: they make contact.
 
     If the follower comes to rest last, it is the gap at rest. Otherwise the gap is smallest when both speeds are equal,
-    or now if the leader is at least as fast. ``gap``: now (m). v (m/s), a (m/s2): speed and braking capacity of leader
-    (l) and follower (f).
+    or now if the leader is at least as fast. ``gap``: present gap (m). v (m/s), a (m/s2): speed and braking capacity of
+    leader (l) and follower (f).
     """
     if v_f * a_l >= v_l * a_f:
         return gap - max(0.0, v_f * v_f / (2.0 * a_f) - v_l * v_l / (2.0 * a_l))
@@ -93,11 +97,12 @@ def spare_gap(gap, v_l, a_l, v_f, a_f):
 
 @kernel
 def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
-    """Time (s) for which a vehicle can drive with ``u`` (m/s2) before it must brake fully to stay behind the leader.
+    """Longest time (s) for which a follower can drive and then still stay behind the leader by full braking.
 
-    Also return when the gap becomes 0 (s), and whether both vehicles still move then: if so, ``a_f > a_l`` and they are
-    equally fast; otherwise the follower comes to rest behind the standing leader. Both times are infinite if the
-    follower never moves. Other arguments: as for ``spare_gap``, whose result must be at least 0.
+    Returned with it: the time (s) at which the gap becomes 0, and whether both vehicles still move at this moment. If
+    they do, ``a_f > a_l`` and both are equally fast; otherwise the follower comes to rest behind the standing leader.
+    Both times are infinite if the follower never moves. ``u``: acceleration of the drive (m/s2). Other arguments: as
+    for ``spare_gap``, whose result must be at least 0.
     """
     w, closing, relief = v_f - v_l, u + a_l, a_f - a_l
     if relief > 0.0 and v_l > 0.0:
@@ -121,7 +126,10 @@ def drive_before_braking(gap, v_l, a_l, v_f, a_f, u):
 
 @large
 def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
-    """The same as ``drive_before_braking``, for a follower with the speed limit ``limit`` (m/s)."""
+    """Results of ``drive_before_braking`` for a follower with a speed limit.
+
+    ``limit``: speed (m/s) up to which the follower drives. Other arguments: as for ``drive_before_braking``.
+    """
     cap = time_to_limit(v_f, u, limit)
     if cap > 0.0:
         drive, touch, moving = drive_before_braking(gap, v_l, a_l, v_f, a_f, u)
@@ -136,10 +144,10 @@ def largest_behind(gap, v_l, a_l, v_f, a_f, u, limit):
 
 @kernel
 def lowest_while_coasting(at):
-    """Smallest gap (m) to the rear vehicle until the controlled vehicle, which coasts, may act.
+    """Smallest gap (m) of the rear pair while the controlled vehicle coasts, until it may act.
 
-    ``at``: the world at the alert (``line``). The gap is a convex function of time: it is smallest when both are
-    equally fast, or at the start or end.
+    ``at``: one world at the alert (columns: file ``line``). The gap is a convex function of time: it is smallest when
+    both vehicles are equally fast, or at the start or end.
     """
     w = at[V_R] - at[V_F]
     if w <= 0.0:
@@ -151,16 +159,16 @@ def lowest_while_coasting(at):
 
 @kernel
 def had_impact(gap, closing):
-    """Whether a pair with this gap (m) and closing speed (m/s) has or had an impact."""
+    """Whether a pair with this gap (m) and closing speed (m/s) has an impact now or has had one."""
     return gap < -ROUNDING_M or (gap <= 0.0 and closing > TOUCH_MPS)
 
 
 @kernel
 def plan_behind(at, ahead, v_l, out):
-    """Plan (``plans``) of the largest trajectory of the world ``at`` (``line``).
+    """Plan (see the file ``plans``) of the largest trajectory: drive fully, brake fully, follow the front vehicle.
 
-    Also write the columns DRIVE, TOUCH and FOLLOW of ``out`` (``decide``). The vehicle drives as hard as it can, then
-    brakes fully, then follows the front vehicle, which is ``ahead`` (m) at the start and has the speed ``v_l`` (m/s).
+    Also writes the columns DRIVE, TOUCH and FOLLOW of ``out`` (see ``decide``). ``at``: one world (columns: file
+    ``line``). At the start of the plan the front vehicle is ``ahead`` (m) and has the speed ``v_l`` (m/s).
     """
     if at[GAP_L] < FAR_M:
         out[DRIVE], out[TOUCH], moving = largest_behind(ahead, v_l, at[A_L], at[V_F], at[A_F], at[U_F], at[LIMIT_F])
@@ -171,11 +179,11 @@ def plan_behind(at, ahead, v_l, out):
 
 @large
 def decide(at, out):
-    """Write whether contact is avoidable in the world ``at`` (``line``) to ``out`` [VERDICT].
+    """Decide whether contact is avoidable in one world; write the verdict to ``out`` [VERDICT].
 
-    Its columns: REASON; MARGIN (m); SPARE, the gap ahead that full braking leaves (m); DRIVE and TOUCH, end of the
-    drive and of the full braking after it (s after the *start*, from which the vehicle may act); FOLLOW, the command
-    after that (m/s2).
+    ``at``: the world (columns: file ``line``). Columns of ``out``: REASON; MARGIN (m); SPARE, gap ahead that is left
+    after full braking (m); DRIVE and TOUCH, end of the drive and of the full braking after it (s after the vehicle may
+    act); FOLLOW, command after TOUCH (m/s2).
     """
     start, v_f, v_l, ahead = at[ONSET_F], at[V_F], 0.0, FAR_M
     out[REASON], out[MARGIN], out[SPARE] = AVOIDABLE, math.inf, math.inf
@@ -220,13 +228,13 @@ def decide_worlds(rows, out):
 def avoidability(state: State, body: int = 2) -> Avoidability:
     """Decide for every world whether the vehicle ``body`` (1: Vehicle 1) can avoid all contact from now on.
 
-    If it cannot, all its commands lead to contact, but not always to an impact (``LowerBound.impact_proven``). Proven
-    for Vehicle 2 of three vehicles and for either of two; all others brake fully from their latencies on. An overlap of
-    at most 1e-12 m in the computed motion is a rounding error, not contact.
+    If it cannot, all its commands lead to contact, but not always to an impact (``LowerBound.impact_proven``). The
+    proof covers Vehicle 2 of three vehicles, and either of two vehicles; all others brake fully from their latencies
+    on. An overlap of at most 1e-12 m in the computed motion is a rounding error, not contact.
 
-    Raises ``InvalidInput`` under other physics than ``PROVEN_FOR``, for any other line, if brakes build up, if the
-    front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if Vehicle 1
-    could reach an obstacle before any contact.
+    Raises ``InvalidInput`` for any other line, if the physics has another digest than ``PROVEN_FOR``, if brakes build
+    up, if the front vehicle may brake only after the controlled vehicle may act, if a vehicle moves backward, or if
+    Vehicle 1 could reach an obstacle before any contact.
     """
     _check_covered(state, body)
     out, rows = np.empty((state.n, VERDICT)), rows_of(state, body)
@@ -242,8 +250,8 @@ def avoidability(state: State, body: int = 2) -> Avoidability:
 def _check_covered(state: State, body: int) -> None:
     """Raise ``InvalidInput`` unless the proof covers these worlds; ``body``: the controlled vehicle.
 
-    An obstacle that Vehicle 1 does not reach under full braking is allowed: only a push could bring it there, and a
-    push begins with an impact.
+    An obstacle is allowed if Vehicle 1 does not reach it under full braking: only a push could bring Vehicle 1 there,
+    and a push begins with an impact.
     """
     check_exact(state, "a proof")
     if physics_digest() != PROVEN_FOR:

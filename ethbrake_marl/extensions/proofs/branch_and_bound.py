@@ -28,10 +28,11 @@ CELL_COLUMNS = 5
 
 @large
 def gentlest_between(kind, at, early, late):
-    """Lower bound (m/s) on the closing speed of first contacts between ``early`` and ``late``.
+    """Lower bound (m/s) on the closing speed of first contacts between ``early`` and ``late`` (s).
 
-    The smallest closing speed falls with the time, with one exception: if the leader brakes harder than the controlled
-    vehicle, it rises by at most the difference of the braking capacities in each second. Arguments: see ``proofs``.
+    The later the contact, the smaller its smallest closing speed, with one exception: if the leader brakes harder than
+    the controlled vehicle, the smallest closing speed rises, in each second by at most the difference of the braking
+    capacities. Arguments: package ``proofs``.
     """
     least = gentlest(kind, at, late)[0]
     if kind == FRONT_FIRST and at[A_L] > at[A_F] and early * at[A_L] < at[V_L]:
@@ -43,7 +44,8 @@ def gentlest_between(kind, at, early, late):
 def decision_around(at, early, late):
     """Start and end (s) of the decision step that contains both times, ``early`` and ``late`` (s).
 
-    If there is none, or if commands may change at any time, return ``late`` twice. ``at``: one world (``line``).
+    Both results are ``late`` if no step contains both, or if commands may change at any time. ``at``: one world
+    (columns: file ``line``).
     """
     step = at[TIME_STEP]
     if step <= 0.0:
@@ -61,7 +63,7 @@ def command_deviation(kind, at, early, late, softest, hard, begin):
     Braking makes a contact with the front vehicle gentle, but driving softens the impact from behind that follows; at
     the rear it is the other way round. The command is the same in the whole decision step, which starts at ``begin``
     (s), so it cannot be the best one both before and after the contact. ``softest`` is the smallest closing speed (m/s)
-    of a first contact between ``early`` and ``late`` under any command. Other arguments: see ``proofs``.
+    of a first contact between ``early`` and ``late`` under any command. Other arguments: package ``proofs``.
     """
     command_range = at[U_F] + at[A_F]
     turn = gentlest(kind, at, early)[1]
@@ -79,9 +81,9 @@ def command_deviation(kind, at, early, late, softest, hard, begin):
 
 @large
 def harm_of(kind, at, early, late, soft, hard, floor):
-    """Lower bound (m2/s2) on the harm of the first contacts in a cell.
+    """Lower bound (m2/s2) on the harm of all first contacts in a *cell*: a range of times and of closing speeds.
 
-    The cell contains the times ``early`` to ``late`` and the closing speeds ``soft`` to ``hard``. Arguments: see
+    The times are ``early`` to ``late`` (s), the closing speeds ``soft`` to ``hard`` (m/s). Other arguments: package
     ``proofs``.
     """
     begin, end = decision_around(at, early, late)
@@ -94,9 +96,9 @@ def harm_of(kind, at, early, late, soft, hard, floor):
 
 @large
 def put_cell(kind, at, floor, cells, count, least, early, late, soft, hard):
-    """Add a cell to ``cells``, after the first ``count``, and return the new number of cells.
+    """Write a cell (a set of first contacts) to row ``count`` of ``cells``; return the new number of cells.
 
-    Its bound is at least ``least`` (m2/s2). Other arguments: as for ``harm_of``.
+    The stored bound of the cell is at least ``least`` (m2/s2). Other arguments: as for ``harm_of``.
     """
     cell = cells[count]
     cell[HARM] = max(harm_of(kind, at, early, late, soft, hard, floor), least)
@@ -106,6 +108,7 @@ def put_cell(kind, at, floor, cells, count, least, early, late, soft, hard):
 
 @kernel
 def lowest(cells, count):
+    """Row of the cell with the smallest bound among the first ``count`` cells, and this bound (m2/s2)."""
     row = 0
     for k in range(1, count):
         if cells[k, HARM] < cells[row, HARM]:
@@ -115,10 +118,10 @@ def lowest(cells, count):
 
 @large
 def halve_cell(kind, at, floor, count, row, cells):
-    """Split the cell in ``row`` of ``cells``, of which ``count`` are in use, into two halves.
+    """Split the cell in ``row`` of ``cells`` into two halves; ``count`` cells are in use.
 
-    Return the new number of cells, and the bound (m2/s2) for one first contact in the cell; the smallest bound of all
-    first contacts is at most this. Other arguments: see ``proofs``.
+    Returns the new number of cells, and the bound (m2/s2) of one first contact in the cell; the smallest bound of all
+    first contacts is at most this one. Other arguments: package ``proofs``.
     """
     cell = cells[row]
     harm, early, late, soft, hard = cell[HARM], cell[EARLY], cell[LATE], cell[SOFT], cell[HARD]
@@ -144,9 +147,9 @@ def halve_cell(kind, at, floor, count, row, cells):
 
 @large
 def least_contact_harm(kind, at, first, last, floor, best, enough, cells):
-    """Lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``first`` to ``last`` (s).
+    """Lower bound (m2/s2), at most ``best``, on the harm of all first contacts from ``first`` to ``last`` (s).
 
-    Arguments: see ``proofs``.
+    Found by branch and bound, as described at the top of this file. Arguments: package ``proofs``.
     """
     for k in range(_FIRST_SAMPLES):
         time = first + (last - first) * k / (_FIRST_SAMPLES - 1)
@@ -173,9 +176,10 @@ def least_contact_harm(kind, at, first, last, floor, best, enough, cells):
 
 @kernel
 def next_split(kind, at, time, last):
-    """Next time (s) of a decision or of the front vehicle's standstill after ``time``; at most ``last``.
+    """Next time (s) after ``time`` at which a decision is made or the front vehicle comes to rest; at most ``last``.
 
-    The standstill counts only if the first contact is in front (``kind``). ``at``: one world (``line``).
+    The front vehicle's rest counts only if the first contact is with it (``kind``). ``at``: one world (columns: file
+    ``line``).
     """
     until = last
     if at[TIME_STEP] > 0.0:

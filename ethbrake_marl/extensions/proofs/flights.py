@@ -20,13 +20,13 @@ from ethbrake_marl.motion.compiling import kernel, large
 
 @kernel
 def flight_lead(pair, opening, flight):
-    """*Lead* of a flight: the speed (m/s) that the controlled vehicle gains, minus what it gives up for it.
+    """*Lead* of a flight: the speed (m/s) that the controlled vehicle gains, minus the speed that it gives up.
 
-    The gain is its speed minus the speed of the centre of mass. For a flight of L seconds (``flight``) with the opening
-    speed o, the lead is ``share (press L - o) - G``. G is the speed (m/s) that the vehicle must give up so that the two
-    stay apart for the time L: the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``, because in each
-    second it can give up at most ``reach``. The result is -inf if no command keeps the two apart for so long. ``pair``:
-    see the module.
+    The gain is its speed minus the speed of the centre of mass of the pair. For a flight of L seconds (``flight``) with
+    the opening speed o, the lead is ``share (press L - o) - G``. G is the speed (m/s) that the vehicle must give up so
+    that the two stay apart for the time L: the smallest G with ``G L - G^2 / (2 reach) >= (press L^2 / 2) - o L``,
+    because in each second it can give up at most ``reach``. The result is -inf if no command keeps the two apart for so
+    long. ``pair``: top of this file.
     """
     share, press, reach, _ = pair
     relative = share * (press * flight - opening)
@@ -40,9 +40,9 @@ def flight_lead(pair, opening, flight):
 
 @kernel
 def best_flight(pair, opening):
-    """Duration (s) of the flight with the largest lead among those that begin with ``opening`` (m/s).
+    """Duration (s) of the flight with the largest lead, for one speed of separation ``opening`` (m/s).
 
-    Infinite if a longer flight always has a larger lead. ``pair``: see the module.
+    The duration is infinite if a longer flight always has a larger lead. ``pair``: top of this file.
     """
     share, press, reach, _ = pair
     if press <= 0.0:
@@ -63,8 +63,8 @@ def best_flight(pair, opening):
 def lead(pair, opening, shortest, longest, lost):
     """Largest lead (m/s) of all flights that last from ``shortest`` to ``longest`` seconds.
 
-    It is the maximum over all opening speeds up to ``opening``: with a limited time, a smaller one may lead to more.
-    ``pair``, ``lost``: see the module.
+    The maximum is over all speeds of separation up to ``opening`` (m/s), because in a limited time a smaller one may
+    give a larger lead. ``pair``, ``lost``: top of this file.
     """
     share, press, reach, _ = pair
     if press <= 0.0:
@@ -86,10 +86,10 @@ def lead(pair, opening, shortest, longest, lost):
 
 @kernel
 def decays(pair):
-    """Whether ``reach`` limits the speed that the vehicle can gain in any flight.
+    """Whether ``reach`` limits the speed that the controlled vehicle can gain in any flight.
 
     False if the vehicle may gain speed by accelerating less now and bouncing more strongly later. ``pair``, with
-    ``reach``: see the module.
+    ``reach``: top of this file.
     """
     share, press, reach, bounce = pair
     if share <= 0.5:
@@ -103,15 +103,16 @@ def decays(pair):
 
 @large
 def largest_lead(pair, opening, lost, late, end, since, until):
-    """Upper bound (m/s) on the speed of the controlled vehicle minus the speed of the centre of mass.
+    """Upper bound (m/s) on the speed of the controlled vehicle minus the speed of the centre of mass of its pair.
 
     The centre of mass is taken to move as if the vehicle executed the extreme command from the first contact on. In
-    reality the command of the earlier decision still applies in the *window*, the rest of the decision step, from
+    reality the command of the earlier decision still applies in the *window*, the rest of the decision step from
     ``late`` to ``end``, and there the vehicle loses the speed ``lost``.
 
-    The bound is the maximum over three cases: the last flight before the contact with the neighbour outside the pair
-    begins with the first impact, within the window, or after it. That contact comes between ``since`` and ``until``.
-    Times are in s after the first contact. ``pair``, ``opening``: see the module.
+    The pair's last flight before the controlled vehicle touches its second neighbour, the one outside the pair, begins
+    with the first impact, within the window, or after it; the bound is the maximum over these three cases. The second
+    neighbour is touched between ``since`` and ``until``. Times are in s after the first contact. ``pair``, ``opening``:
+    top of this file.
     """
     share, press, reach, bounce = pair
     if since < end:
@@ -136,10 +137,10 @@ def largest_lead(pair, opening, lost, late, end, since, until):
 def widest_flight(share, slack, press, drive, bounce, closing, back, time):
     """Largest ``sqrt(p^2 + 2 press s)`` (m/s) in the flights from a partner that brakes harder.
 
-    p is the speed (m/s) at which vehicle and partner separate, s the gap (m) between them. Holds for ``time`` seconds;
-    infinite if no bound is known. ``slack``: braking capacity of the partner minus the vehicle's (m/s2). ``drive``: the
-    vehicle's largest acceleration (m/s2). ``closing``: closing speed of the first impact (m/s). ``back``: backward
-    speed of the vehicle after it (m/s). Other arguments: see the module.
+    p is the speed (m/s) at which vehicle and partner separate, s the gap (m) between them. The bound holds for ``time``
+    seconds; it is infinite if none is known. ``slack``: braking capacity of the partner minus the vehicle's (m/s2).
+    ``drive``: the vehicle's largest acceleration (m/s2). ``closing``: closing speed of the first impact (m/s).
+    ``back``: backward speed of the vehicle after this impact (m/s). Other arguments: top of this file.
     """
     if not slack > 0.0 or not bounce * bounce * press < slack:
         return math.inf

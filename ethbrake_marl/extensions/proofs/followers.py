@@ -1,4 +1,4 @@
-"""Lower bounds on the harm with the second neighbour after a first contact with the other neighbour.
+"""Lower bounds on the harm with the second neighbour after a first contact with the first neighbour.
 
 The time and the closing speed of the first contact determine the state of all three vehicles. After it the extreme
 command (full drive or full braking) is best for the centre of mass of the two vehicles in contact. The controlled
@@ -43,9 +43,10 @@ LEADS = (0.02, 0.05, 0.1, 0.2, 0.4)
 
 @kernel
 def value_at(line, time):
-    """Value at ``time`` of a piecewise linear function, a tuple (start, slope, turn, bend, turn, bend).
+    """Value at ``time`` of a piecewise linear function with two bends.
 
-    ``start + slope t + bend max(t - turn, 0) + bend max(t - turn, 0)``; each turn has its own bend.
+    ``line`` is (start, slope, turn 1, bend 1, turn 2, bend 2). The function is a straight line to which each bend adds
+    ``bend * max(time - turn, 0)``.
     """
     start, slope, turn, bend, other_turn, other_bend = line
     return start + slope * time + bend * max(time - turn, 0.0) + other_bend * max(time - other_turn, 0.0)
@@ -53,19 +54,19 @@ def value_at(line, time):
 
 @kernel
 def least_of_line(line, since, until):
-    """Smallest value of a piecewise linear function (see ``value_at``) from ``since`` to ``until``."""
+    """Smallest value of a piecewise linear function (``line``: see ``value_at``) from ``since`` to ``until``."""
     first, second = min(max(line[2], since), until), min(max(line[4], since), until)
     return min(value_at(line, since), value_at(line, until), value_at(line, first), value_at(line, second))
 
 
 @large
 def least_closing(line, pair, opening, lost, late, end, until):
-    """Smallest closing speed (m/s) of the controlled vehicle's contact with its second neighbour.
+    """Lower bound (m/s) on the closing speed of the controlled vehicle's contact with its second neighbour.
 
-    It is a difference v - d: v is the closing speed of the second neighbour relative to the centre of mass of the pair,
-    which ``line`` describes as a function of time (``value_at``; a bend may be negative); d, from ``largest_lead``, is
-    the largest difference between the controlled vehicle and this centre. ``until`` is the latest time of the contact.
-    Times are in s after the first contact. Other arguments: see ``flights``.
+    It is a difference v - d. v is the closing speed between the second neighbour and the centre of mass of the pair,
+    which ``line`` describes as a function of time (``value_at``). d, from ``largest_lead``, bounds the difference in
+    speed between the controlled vehicle and this centre. ``until`` is the latest time of the contact. Times are in s
+    after the first contact. Other arguments: file ``flights``.
     """
     best = least_of_line(line, 0.0, until) - largest_lead(pair, opening, lost, late, end, 0.0, until)
     for k in range(len(LEADS)):
@@ -80,9 +81,10 @@ def least_closing(line, pair, opening, lost, late, end, until):
 
 @kernel
 def rear_after(at, early):
-    """Rear vehicle's distance to the leader (m) and speed (m/s) at ``early``, and its onset (s after it).
+    """Rear vehicle at ``early`` (s): its distance to the leader (m), its speed (m/s) and its onset (s).
 
-    The *onset* is the time at which it begins to brake. Arguments: see ``proofs``.
+    The *onset* is the time from ``early`` until the rear vehicle begins to brake. The length of the controlled vehicle
+    does not count. ``at``: one world (columns: file ``line``).
     """
     speed, way = follower(at, early)
     return max(at[GAP_L] + at[GAP_R] + leader(at, early)[1] - way, 0.0), speed, max(at[ONSET_R] - early, 0.0)
@@ -93,12 +95,12 @@ def pushed_by_leader(at, early, late, closing, end, lack):
     """Lower bound (m/s) on the rear pair's closing speed after a first contact with the leader.
 
     1. The *block*, leader and controlled vehicle together, moves like its centre of mass: at first with ``speed`` and
-       the acceleration ``add_push``, until the leader stands at ``stand``.
-    2. The rear vehicle has reached the block by the time ``until``. 0 is returned if it need not.
+       the acceleration ``push``, until the leader stands at ``stand``.
+    2. The rear vehicle has reached the block by the time ``until``. The result is 0 if it need not reach the block.
     3. The bound is the speed at which the rear vehicle closes in on the block, minus the largest amount by which the
        controlled vehicle may then be faster than the block.
 
-    Arguments: see ``proofs``.
+    Arguments: package ``proofs``.
     """
     share, rest, press, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[U_F] + at[A_L], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -124,9 +126,10 @@ def pushed_by_leader(at, early, late, closing, end, lack):
 
 @large
 def held_by_leader(at, early, late, closing):
-    """Lower bound (m/s) on the rear pair's closing speed after a first contact with a harder braking leader.
+    """Lower bound (m/s) on the rear pair's closing speed after a first contact with a leader that brakes harder.
 
-    It holds because the controlled vehicle then stays near the leader. 0: none proven. Arguments: see ``proofs``.
+    It holds because the controlled vehicle then stays near the leader. 0: no bound is proven. Arguments: package
+    ``proofs``.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -162,7 +165,7 @@ def held_by_leader(at, early, late, closing):
 def after_front(at, early, late, closing, end, lack):
     """Lower bound (m2/s2) on the rear pair's squared closing speed after a first contact with the leader.
 
-    It is the largest of several lower bounds. Arguments: see ``proofs``.
+    It is the largest of several lower bounds, which hold under different conditions. Arguments: package ``proofs``.
     """
     share, rest, bounce = at[FRONT_SHARE], 1.0 - at[FRONT_SHARE], at[BOUNCE]
     behind, v_r, onset = rear_after(at, early)
@@ -183,9 +186,9 @@ def after_front(at, early, late, closing, end, lack):
 def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
     """Smallest squared closing speed (m2/s2) at which a braking vehicle (f) reaches the braking leader (l).
 
-    v is a speed (m/s), a a braking capacity (m/s2). f brakes with at most ``a_f``. ``gap`` and ``least_gap`` are the
-    largest and smallest possible gap (m); ``least_gap`` is used only if the leader brakes harder. The result is 0 if
-    contact is not certain.
+    v is a speed (m/s), a a braking capacity (m/s2). The vehicle f may also brake less than ``a_f``. ``gap`` and
+    ``least_gap`` are the largest and smallest possible gap (m); ``least_gap`` is used only if the leader brakes harder.
+    The result is 0 if contact is not certain.
     """
     squared = walk(gap, v_l, braking(0.0, a_l), v_f, braking(0.0, a_f), v_f / a_f)[2]
     if a_f < a_l:
@@ -196,11 +199,10 @@ def braking_after(gap, least_gap, v_l, a_l, v_f, a_f):
 
 @large
 def pushed_by_rear(at, early, late, closing, end, lack, gap):
-    """Lower bound (m/s) on the front pair's closing speed after the rear vehicle's first contact.
+    """Lower bound (m/s) on the front pair's closing speed after a first contact with the rear vehicle.
 
-    It follows from the motion of the centre of mass of rear and controlled vehicle. The controlled vehicle must brake
-    at least as hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m). Other arguments: see
-    ``proofs``.
+    It follows from the motion of the centre of mass of the rear pair. The controlled vehicle must brake at least as
+    hard as the rear vehicle. ``gap``: gap to the front vehicle at ``early`` (m). Other arguments: package ``proofs``.
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l = leader(at, early)[0]
@@ -220,9 +222,10 @@ def pushed_by_rear(at, early, late, closing, end, lack, gap):
 
 @large
 def after_rear(at, early, late, closing, end, lack):
-    """Lower bound (m2/s2) on the front pair's squared closing speed after the rear vehicle's first contact.
+    """Lower bound (m2/s2) on the front pair's squared closing speed after a first contact with the rear vehicle.
 
-    Arguments: see ``proofs``.
+    It is the larger of two lower bounds: one for braking alone, one for the push from behind. Arguments: package
+    ``proofs``.
     """
     share, rest, bounce = at[REAR_SHARE], 1.0 - at[REAR_SHARE], at[BOUNCE]
     v_l, way_l = leader(at, early)
@@ -244,7 +247,8 @@ def after_rear(at, early, late, closing, end, lack):
 def after(kind, at, early, late, closing, end, lack):
     """Lower bound (m2/s2) on the harm with the second neighbour that must follow a first contact.
 
-    Arguments: see ``proofs``.
+    ``kind`` says with which neighbour the first contact is, ``early`` to ``late`` (s) when, ``closing`` (m/s) with
+    which largest closing speed. Other arguments: package ``proofs``.
     """
     if kind == FRONT_FIRST:
         return after_front(at, early, late, closing, end, lack)

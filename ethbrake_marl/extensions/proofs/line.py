@@ -38,9 +38,9 @@ HALVINGS = 60
 
 @kernel
 def leader(at, time):
-    """Speed (m/s) and way (m) of the front vehicle at ``time`` if it brakes from now on without being pushed.
+    """Speed (m/s) and way (m) of the front vehicle at ``time`` if it brakes fully from now on and nothing pushes it.
 
-    ``time`` (s) counts from now. ``at``: one world (see the module).
+    ``time``: s from now. ``at``: one world (columns: top of this file).
     """
     speed, way, _ = solo(at[V_L], -at[A_L], 0.0, math.inf, time)
     return speed, way
@@ -48,18 +48,19 @@ def leader(at, time):
 
 @kernel
 def follower(at, time):
-    """Speed (m/s) and way (m) of the rear vehicle at ``time`` (s from now) if it is not pushed.
+    """Speed (m/s) and way (m) of the rear vehicle at ``time`` (s from now) if nothing pushes it.
 
-    It coasts until its latency has elapsed, then brakes fully. ``at``: one world (see the module).
+    It coasts until its latency has elapsed, then brakes fully. ``at``: one world (columns: top of this file).
     """
     speed, way, _ = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, time)
     return speed, way
 
 
 def rows_of(state: State, body: int, time_step_s: float = 0.0) -> Floats:
-    """One row ``at`` of numbers for each world, [n, COLUMNS]; the controlled vehicle is ``body`` (1: Vehicle 1).
+    """Worlds as the proofs use them: one row of numbers for each world, [n, LINE_COLUMNS].
 
-    ``time_step_s``: time between decisions; 0: commands may change at any time.
+    ``body``: the controlled vehicle (1: Vehicle 1). ``time_step_s``: time between decisions; 0: commands may change at
+    any time.
     """
     line, car, at = state.line, state.car, np.zeros((state.n, LINE_COLUMNS))
     onset = np.maximum(car[:, LATENCY] - state.time_s[:, np.newaxis], 0.0)

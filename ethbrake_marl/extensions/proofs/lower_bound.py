@@ -73,7 +73,10 @@ FRONT_BOUND, REAR_BOUND, COMBINED_BOUND, BOUNDS = range(4)
 
 
 class LowerBound(NamedTuple):
-    """Lower bounds on the harm of each world, [n] m2/s2: ``harm``, and its terms (``lower_bound``)."""
+    """Lower bounds on the harm of each world, [n] m2/s2: ``harm``, and the terms from which it is computed.
+
+    ``harm = early + max(front_pair + rear_pair, combined)`` (see ``lower_bound``).
+    """
 
     harm: Floats  # no command does less
     early: Floats  # harm before the controlled vehicle may act
@@ -83,15 +86,18 @@ class LowerBound(NamedTuple):
 
     @property
     def impact_proven(self) -> Bools:
-        """Whether every command certainly leads to an impact, [n]. False: not proven; it may still be unavoidable."""
+        """Whether it is proven that every command leads to an impact, [n].
+
+        False: an impact is not proven, but may be unavoidable.
+        """
         return np.asarray(self.harm > 0.0)
 
 
 @kernel
 def front_bound(at):
-    """Smallest squared closing speed (m2/s2) and the latest time (s) of the front pair's first contact.
+    """Smallest squared closing speed (m2/s2) and latest time (s) of the front pair's first contact.
 
-    The time is infinite if full braking avoids the contact. ``at``: one world (``line``).
+    The time is infinite if full braking avoids the contact. ``at``: one world (columns: file ``line``).
     """
     _, time, squared = behind_leader(at, braking(0.0, at[A_F]), at[V_F] / at[A_F])
     if at[A_F] < at[A_L] and at[V_F] < at[V_L]:
@@ -101,9 +107,10 @@ def front_bound(at):
 
 @kernel
 def rear_bound(at):
-    """Smallest squared closing speed (m2/s2) and the latest time (s) of the rear pair's first contact.
+    """Smallest squared closing speed (m2/s2) and latest time (s) of the rear pair's first contact.
 
-    Full drive attains both; the time is infinite if it avoids the contact. ``at``: one world (``line``).
+    Full drive attains both; the time is infinite if full drive avoids the contact. ``at``: one world (columns: file
+    ``line``).
     """
     _, time, squared = before_rear(at, driving_first(at, math.inf), rest_of_rear(at))
     return squared, time
@@ -111,11 +118,11 @@ def rear_bound(at):
 
 @large
 def last_first(kind, at, first, last):
-    """Latest time (s), at most ``last``, of a contact with one neighbour before any with the other.
+    """Latest time (s), at most ``last``, at which the first contact can be with the neighbour ``kind``.
 
-    By bisection, from ``first`` (s), at which it is possible. The later the contact in front, the shorter the vehicle
-    drives, so the rear vehicle comes nearer; the later the contact behind, the shorter it brakes, so it comes nearer to
-    the front vehicle. ``kind``, ``at``: see ``proofs``.
+    Found by bisection, from the time ``first`` (s), at which such a contact is possible. For a later contact in front
+    the vehicle drives for a shorter time, so the rear vehicle comes nearer; for a later contact behind it brakes for a
+    shorter time, so it comes nearer to the front vehicle. ``kind``, ``at``: package ``proofs``.
     """
     time = last
     for _ in range(HALVINGS + 1):
@@ -135,10 +142,11 @@ def last_first(kind, at, first, last):
 
 @large
 def last_meeting(at, first):
-    """Latest time (s) of a contact with the front vehicle, and the latest before any with the rear vehicle.
+    """Latest time (s) of a contact with the front vehicle, and the latest (s) before any contact with the rear vehicle.
 
     The third result is True if the first contact with the front vehicle may come arbitrarily late and at any closing
-    speed. ``first`` is the earliest time (s) of a contact with the front vehicle. ``at``: one world (``line``).
+    speed. ``first`` is the earliest time (s) of a contact with the front vehicle. ``at``: one world (columns: file
+    ``line``).
     """
     touches = spare_gap(at[GAP_L], at[V_L], at[A_L], at[V_F], at[A_F]) >= 0.0
     last = meet_front(at, 0.0)
@@ -150,9 +158,10 @@ def last_meeting(at, first):
 
 @large
 def soft_harm(kind, at, early, late, floor, best):
-    """Lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late``.
+    """Lower bound (m2/s2), at most ``best``, on the harm of first contacts from ``early`` to ``late`` (s).
 
-    The closing speed of these contacts may have any value. Arguments: see ``proofs``.
+    Unlike in ``least_contact_harm``, these contacts may have any closing speed from 0 on. Arguments: package
+    ``proofs``.
     """
     soft = 0.0
     while soft * soft < best:
@@ -166,7 +175,8 @@ def soft_harm(kind, at, early, late, floor, best):
 def outer_contact(at):
     """Time (s) and squared closing speed (m2/s2) at which the rear vehicle would reach the front vehicle.
 
-    As if the controlled vehicle were not there; infinite and 0 if never. ``at``: one world (``line``).
+    The controlled vehicle between them is left out. Infinite and 0 if they never meet. ``at``: one world (columns: file
+    ``line``).
     """
     rear = braking(at[ONSET_R], at[A_R])
     return walk(at[GAP_L] + at[GAP_R], at[V_L], braking(0.0, at[A_L]), at[V_R], rear, math.inf)[1:]
@@ -174,12 +184,12 @@ def outer_contact(at):
 
 @large
 def front_first(at, floor, best, enough, cells):
-    """Lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all three.
+    """Lower bound (m2/s2), at most ``best``, on the harm if the first contact is in front or of all three vehicles.
 
     In a contact of all three vehicles, the closing speeds of the two pairs add up to the closing speed of the rear
-    vehicle relative to the front vehicle, and the front pair's is at least the smallest possible one at this time. Such
-    a contact is covered only at times at which a first contact with the front vehicle is possible. Arguments: see
-    ``proofs``.
+    vehicle relative to the front vehicle, and the closing speed of the front pair is at least the smallest possible one
+    at this time. Such a contact is covered only at times at which a first contact with the front vehicle is possible.
+    Arguments: package ``proofs``.
     """
     first = meet_front(at, math.inf)
     if first == math.inf and at[GAP_L] <= TOUCHING_M:
@@ -206,7 +216,8 @@ def front_first(at, floor, best, enough, cells):
 def rear_first(at, floor, best, enough, cells):
     """Lower bound (m2/s2), at most ``best``, on the harm if the first contact is with the rear vehicle.
 
-    Arguments: see ``proofs``.
+    ``floor`` (m2/s2) is a known bound on the front pair's harm; the search may stop early once its result is at most
+    ``enough`` (m2/s2). Other arguments: package ``proofs``.
     """
     high = max(at[V_F] / at[A_F], rest_of_rear(at))
     first = meet_rear(at, high)
@@ -236,7 +247,7 @@ def rear_first(at, floor, best, enough, cells):
 
 @kernel
 def last_rest(at):
-    """Time (s) after which no more harm happens that the combined bound of the world ``at`` counts."""
+    """Time (s) after which no more harm happens that ``combined_bound`` counts, in the world ``at``."""
     stand = rest_of_rear(at)
     way = solo(at[V_R], -at[A_R], at[ONSET_R], math.inf, stand)[1]
     room = at[GAP_L] + at[V_L] * at[V_L] / (2.0 * at[A_L]) + at[GAP_R] - way
@@ -246,10 +257,10 @@ def last_rest(at):
 
 @large
 def combined_bound(at, until, front, rear, cells):
-    """Lower bound (m2/s2) on the harm of a world with unavoidable contact, first in front or behind.
+    """Lower bound (m2/s2) on the harm of both pairs together in a world with unavoidable contact.
 
     0 if some of the counted harm may come after the horizon ``until`` (s). ``front`` and ``rear`` are lower bounds on
-    the harm of each pair alone (m2/s2). ``at``, ``cells``: see ``proofs``.
+    the harm of each pair alone (m2/s2). ``at``, ``cells``: package ``proofs``.
     """
     if not last_rest(at) < until:
         return 0.0
@@ -266,11 +277,11 @@ def combined_bound(at, until, front, rear, cells):
 
 @large
 def bound_worlds(rows, until, has_front, has_rear, unavoidable, cells, out):
-    """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2).
+    """Write the bounds of n worlds to ``out`` [n, BOUNDS] (m2/s2): front pair, rear pair, both together.
 
-    ``rows`` [n, COLUMNS]: the worlds (``line``); harm after ``until`` [n] (s) does not count. ``has_front`` and
-    ``has_rear`` [n]: the neighbour exists, and the pair's next impact counts. ``unavoidable`` [n]: contact cannot be
-    avoided. ``cells``: memory, overwritten.
+    ``rows`` [n, LINE_COLUMNS]: the worlds (columns: file ``line``). Harm after ``until`` [n] (s) does not count.
+    ``has_front`` and ``has_rear`` [n]: whether this neighbour exists and the next impact with it counts.
+    ``unavoidable`` [n]: whether contact cannot be avoided. ``cells``: memory, overwritten.
     """
     for k in range(len(out)):
         for column in range(BOUNDS):
@@ -291,9 +302,9 @@ def lower_bound(
     """Proven lower bound on the harm of every episode, over all commands of the vehicle ``body`` from now on.
 
     ``harm = early + max(front_pair + rear_pair, combined)``; each term is lowered by the largest possible rounding
-    error (``rounding``). ``early`` includes what has already happened. ``combined`` is 0 where contact can be avoided.
-    Harm that may come only after ``horizon_s`` counts as 0. Proven for the lines of ``avoidability``, without an
-    obstacle.
+    error (``rounding``). ``early`` includes harm that has already happened. ``combined`` is 0 where contact can be
+    avoided. Harm that may come only after ``horizon_s`` counts as 0. The proof covers the lines that ``avoidability``
+    accepts, without an obstacle.
 
     Args:
         state: the n episodes now.
@@ -301,9 +312,9 @@ def lower_bound(
         count: ``first`` (of each pair only the first impact), ``total``, or ``honest``, which has the bound of
             ``total`` because the honest cost is never below total harm.
         horizon_s: time until which harm counts, s after the alert.
-        time_step_s: time between two decisions (s); the first is when the vehicle may act. The bound is larger than
-            with None, but holds only for commands that change at decisions, and takes ten times as long. None:
-            commands may change at any time.
+        time_step_s: time between two decisions (s); the first decision is when the vehicle may act. None: commands
+            may change at any time. With a time step the bound is larger, but holds only for commands that change at
+            decisions, and takes ten times as long.
 
     Raises ``InvalidInput`` where ``avoidability`` does, for an obstacle, an unknown count, a time step below
     ``LEAST_TIME_STEP_S``, and a horizon that is not finite or lies before the vehicle may act.
@@ -355,17 +366,17 @@ def _check_asked(state: State, start: Floats, count: str, horizon_s: float, time
 
 
 def rounding(state: State, body: int) -> Floats:
-    """Largest difference between a bound and the harm in the engine that rounding can cause, [n] m2/s2.
+    """Largest difference, caused by rounding, between a bound and the simulated harm, [n] m2/s2.
 
     A squared closing speed is ``D = w^2 + 2 b g``, with closing speed w, closing acceleration b and gap g. Let ``V`` be
     the largest speed in the line, ``G`` the sum of its gaps, ``A`` the largest closing acceleration and ``a`` the
-    weakest brakes. The term ``w^2`` of D is at most ``V^2``. No gap grows beyond ``G + V^2 / (2 a)``. Therefore all
-    terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
+    weakest braking capacity. The term ``w^2`` of D is at most ``V^2``. No gap grows beyond ``G + V^2 / (2 a)``.
+    Therefore all terms of D stay below ``S = V^2 (1 + A / a) + 2 A G``.
 
     In a segment of motion, the computation rounds each speed twice and each gap five times. In a round of impacts,
-    rounding changes each speed by up to 8 eps of the largest speed. Rounding in one of them changes D by at most
-    8 eps S (eps = 2^-52). These errors add up and do not multiply, because the proofs compare a motion only with the
-    formulas for this same motion. ``BOUND_EPS`` allows for 500 segments and rounds of impacts. This is enough: an
+    rounding changes each speed by up to 8 eps of the largest speed (eps = 2^-52). Rounding in one segment or round
+    changes D by at most 8 eps S. These errors add up and do not multiply, because the proofs compare a motion only with
+    the formulas for this same motion. ``BOUND_EPS`` allows for 500 segments and rounds of impacts. This is enough: an
     episode of 8 s has 80 steps, and the computation of the bound itself rounds a few hundred times.
 
     If the controlled vehicle may drive, V is at least its speed limit, and A includes its driving capacity.

@@ -1,4 +1,7 @@
-"""The measures ``avoidable`` and ``proven_harm``. They are computed only on request, since a proof is slow."""
+"""The measures ``avoidable`` and ``proven_harm``: what the proofs say of each world.
+
+They are computed only on request, because a proof is slow.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +32,7 @@ _bound_cache: dict[bytes, LowerBound] = {}  # of the worlds that were last asked
 
 
 def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
-    """Lower bound on the harm or honest cost of all commands that change at decisions, [n] m2/s2.
+    """Lower bound on the harm or honest cost, whatever the controlled vehicle commands at its decisions, [n] m2/s2.
 
     ``impact``: whether the bound is above 0. The result is the same for every agent.
     """
@@ -44,7 +47,10 @@ def proven_harm(game: Game, alert: State, last: State) -> MeasureValue:
 
 
 def _controlled_body(game: Game, alert: State, *, together: bool = False) -> int:
-    """Controlled vehicle, or 2 for Vehicles 2 and 3 together. Raises ``InvalidInput`` for other learners."""
+    """The only learner of the game, or 2 if Vehicles 2 and 3 learn and may be controlled ``together``.
+
+    Raises ``InvalidInput`` for any other learners, and if a vehicle that does not learn does not brake fully.
+    """
     learners = game.settings.learners.tolist()
     scripted_bodies = [body for body in range(1, alert.vehicles + 1) if body not in learners]
     if (

@@ -1,8 +1,8 @@
 """The gentlest first contact (smallest closing speed) of the controlled vehicle with a neighbour at a given time.
 
-The front vehicle already brakes; the rear vehicle coasts until its latency has elapsed, then brakes. ``drive`` is how
-long (s) a vehicle drives before it brakes, ``brake`` how long it brakes before it drives. Times count from the moment
-at which the controlled vehicle may act. Proofs: docs/internals/proofs/lower-bound.md.
+The front vehicle already brakes; the rear vehicle coasts until its latency has elapsed, then brakes. ``drive`` is the
+time (s) for which a vehicle drives before it brakes, ``brake`` the time for which it brakes before it drives. Times
+count from the moment at which the controlled vehicle may act. Proofs: docs/internals/proofs/lower-bound.md.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ _GUARD = 2.0**-46  # largest relative rounding error of positions; closing speed
 
 @large
 def gentlest_front(at, time):
-    """Smallest closing speed (m/s) of a contact with the front vehicle at ``time``, and its ``drive``.
+    """Smallest closing speed (m/s) of a contact with the front vehicle at ``time`` (s), and the drive before it (s).
 
-    To be at a place at a time with the smallest speed, drive first (for ``drive`` s) and then brake. ``at``: one world
-    (``line``).
+    To be at a place at a time with the smallest speed, a vehicle drives first and then brakes; the second result is how
+    long it drives. ``at``: one world (columns: file ``line``).
     """
     v_l, way = leader(at, time)
     place, v, u, a = at[GAP_L] + way, at[V_F], at[U_F], at[A_F]
@@ -59,9 +59,9 @@ def gentlest_front(at, time):
 
 @kernel
 def braked_then_driven(at, brake, time):
-    """Way (m) and speed (m/s) at ``time`` if the vehicle brakes first, at most to rest, and then drives.
+    """Way (m) and speed (m/s) at ``time`` (s) of a vehicle that brakes first, at most to rest, and then drives.
 
-    ``brake``: how long it brakes (s). ``at``: one world (``line``).
+    ``brake``: duration of the braking (s). ``at``: one world (columns: file ``line``).
     """
     v, u, a = at[V_F], at[U_F], at[A_F]
     braked = min(brake, v / a)
@@ -80,9 +80,9 @@ def braked_then_driven(at, brake, time):
 
 @large
 def braking_to_rear(at, time):
-    """Time (s) for which the vehicle must brake first to be in contact with the rear vehicle at ``time`` (s).
+    """Time (s) for which the vehicle must brake, before it drives, to meet the rear vehicle at ``time`` (s).
 
-    Then it drives. ``at``: one world (``line``).
+    ``at``: one world (columns: file ``line``).
     """
     place = follower(at, time)[1] - at[GAP_R]
     low, high = 0.0, time
@@ -97,10 +97,11 @@ def braking_to_rear(at, time):
 
 @large
 def gentlest(kind, at, time):
-    """Smallest closing speed (m/s) of a first contact at ``time``, and its ``drive`` or ``brake`` (s).
+    """Smallest closing speed (m/s) of a first contact at ``time`` (s), and the duration of the first phase (s).
 
-    To be at a place at a time with the largest speed, brake first and then drive. ``brake`` is infinite if the vehicle
-    reaches its speed limit by then. ``kind``, ``at``: see ``proofs``.
+    For a contact in front the vehicle drives first and then brakes: it arrives with the smallest possible speed. For a
+    contact behind it brakes first and then drives, and arrives with the largest; the duration is then infinite if it
+    reaches its speed limit. ``kind``, ``at``: package ``proofs``.
     """
     if kind == FRONT_FIRST:
         return gentlest_front(at, time)
@@ -111,11 +112,20 @@ def gentlest(kind, at, time):
 
 @kernel
 def behind_leader(at, plan, until):
+    """Smallest gap (m) to the front vehicle under a plan, time (s) and squared closing speed (m2/s2) of the contact.
+
+    ``at``: one world (columns: file ``line``). ``plan``: of the controlled vehicle, until ``until`` (s); see
+    ``plans.walk``.
+    """
     return walk(at[GAP_L], at[V_L], braking(0.0, at[A_L]), at[V_F], plan, until)
 
 
 @kernel
 def before_rear(at, plan, until):
+    """Smallest gap (m) to the rear vehicle under a plan, time (s) and squared closing speed (m2/s2) of the contact.
+
+    Arguments: as for ``behind_leader``.
+    """
     return walk(at[GAP_R], at[V_F], plan, at[V_R], braking(at[ONSET_R], at[A_R]), until)
 
 
@@ -131,41 +141,44 @@ def braking_first(at, brake):
 
 @kernel
 def rest_of_rear(at):
-    """Time (s) at which the rear vehicle of the world ``at`` comes to rest if nothing pushes it."""
+    """Time (s) at which the rear vehicle comes to rest if nothing pushes it.
+
+    ``at``: one world (columns: file ``line``).
+    """
     return at[ONSET_R] + at[V_R] / at[A_R]
 
 
 @large
 def meet_front(at, drive):
-    """Time (s) at which a vehicle that drives first, for ``drive`` s, meets the front vehicle; infinite: never.
+    """Time (s) at which the vehicle meets the front vehicle if it drives for ``drive`` s, then brakes; infinite: never.
 
-    Then it brakes. ``at``: one world (``line``).
+    ``at``: one world (columns: file ``line``).
     """
     return behind_leader(at, driving_first(at, drive), math.inf)[1]
 
 
 @large
 def meet_rear(at, brake):
-    """Time (s) at which a vehicle that brakes first, for ``brake`` s, meets the rear vehicle; infinite: never.
+    """Time (s) at which the rear vehicle meets the vehicle if it brakes for ``brake`` s, then drives; infinite: never.
 
-    Then it drives. ``at``: one world (``line``).
+    ``at``: one world (columns: file ``line``).
     """
     return before_rear(at, braking_first(at, brake), rest_of_rear(at))[1]
 
 
 @large
 def stays_ahead(at, drive, until):
-    """Whether a vehicle that drives for ``drive`` s, then brakes, avoids the rear one until ``until`` (s).
+    """Whether a vehicle that drives for ``drive`` s, then brakes, avoids the rear vehicle until ``until`` (s).
 
-    ``at``: one world (``line``).
+    ``at``: one world (columns: file ``line``).
     """
     return before_rear(at, driving_first(at, drive), until)[0] >= -AHEAD_M
 
 
 @large
 def stays_behind(at, brake, until):
-    """Whether a vehicle that brakes for ``brake`` s, then drives, avoids the front one until ``until`` (s).
+    """Whether a vehicle that brakes for ``brake`` s, then drives, avoids the front vehicle until ``until`` (s).
 
-    ``at``: one world (``line``).
+    ``at``: one world (columns: file ``line``).
     """
     return behind_leader(at, braking_first(at, brake), until)[0] >= -AHEAD_M

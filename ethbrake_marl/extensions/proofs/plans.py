@@ -15,15 +15,15 @@ from ethbrake_marl.motion.contact import contact
 
 @kernel
 def braking(onset, deceleration):
-    """Plan (see the module): coast until ``onset`` (s), then brake to rest with ``deceleration`` (m/s2)."""
+    """Plan (top of this file): coast until ``onset`` (s), then brake to rest with ``deceleration`` (m/s2)."""
     return 0.0, onset, 0.0, onset, 0.0, onset, -deceleration, math.inf
 
 
 @kernel
 def with_window(u, late, end, change, turn, step):
-    """Plan (see the module): accelerate with ``u``, plus ``step`` after ``turn``, plus ``change`` in a window.
+    """Plan (top of this file): accelerate with ``u``, plus ``step`` from ``turn`` on, plus ``change`` in a window.
 
-    The window is from ``late`` to ``end``. Accelerations in m/s2, times in s.
+    The window lasts from ``late`` to ``end``. Accelerations in m/s2, times in s.
     """
     second = u + step if turn < late else u + change
     third = u + step + change if turn < end else u
@@ -32,25 +32,29 @@ def with_window(u, late, end, change, turn, step):
 
 @kernel
 def time_to_limit(v, u, limit):
-    """Time (s) in which ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s); 0 without need or drive."""
+    """Time (s) in which the acceleration ``u`` (m/s2) raises the speed ``v`` to ``limit`` (m/s).
+
+    0 if ``v`` is not below ``limit``, or if ``u`` is not positive.
+    """
     return (limit - v) / u if u > 0.0 and v < limit else 0.0
 
 
 @kernel
 def drive_then_brake(v, u, limit, drive, deceleration):
-    """Plan (see the module): drive for ``drive`` seconds, then brake to rest.
+    """Plan (top of this file): drive for ``drive`` seconds, then brake to rest.
 
-    It drives with ``u`` (m/s2) from the speed ``v`` up to ``limit`` (m/s), and brakes with ``deceleration`` (m/s2).
+    The vehicle drives with ``u`` (m/s2) from the speed ``v`` up to ``limit`` (m/s), and brakes with ``deceleration``
+    (m/s2).
     """
     return u, min(time_to_limit(v, u, limit), drive), 0.0, drive, 0.0, drive, -deceleration, math.inf
 
 
 @kernel
 def brake_then_drive(v, u, limit, brake, deceleration):
-    """Plan (see the module): brake for ``brake`` seconds, at most to rest, then drive.
+    """Plan (top of this file): brake for ``brake`` seconds, at most to rest, then drive.
 
-    It brakes with ``deceleration`` (m/s2) from the speed ``v`` (m/s), and drives with ``u`` (m/s2) up to ``limit``
-    (m/s).
+    The vehicle brakes with ``deceleration`` (m/s2) from the speed ``v`` (m/s), and drives with ``u`` (m/s2) up to
+    ``limit`` (m/s).
     """
     cap = brake + time_to_limit(max(v - deceleration * brake, 0.0), u, limit)
     return -deceleration, brake, u, cap, 0.0, cap, 0.0, math.inf
@@ -58,9 +62,9 @@ def brake_then_drive(v, u, limit, brake, deceleration):
 
 @kernel
 def piece_at(plan, now, v):
-    """A plan's acceleration at ``now`` (m/s2), until when it lasts (s), and whether the vehicle stops then.
+    """Acceleration of a plan at ``now`` (m/s2), the time (s) until which it lasts, and whether the vehicle stops then.
 
-    ``plan``: see the module. ``v``: the vehicle's present speed (m/s).
+    ``plan``: top of this file. ``now``: s. ``v``: the vehicle's present speed (m/s).
     """
     k = 0
     while now >= plan[k + 1]:
@@ -76,12 +80,12 @@ def piece_at(plan, now, v):
 
 @large
 def walk(gap, v_front, front, v_rear, rear, until):
-    """Smallest gap of two vehicles (m), the time (s) of their first contact, and its squared closing speed.
+    """Smallest gap of two vehicles (m), time (s) of their first contact, and its squared closing speed (m2/s2).
 
-    They begin with ``gap`` (m), ``v_front`` and ``v_rear`` (m/s, at least 0), and follow the plans ``front`` and
-    ``rear`` until ``until`` (s), as if they could pass through each other: a negative smallest gap is the depth of
-    their overlap. Without contact the time is infinite and the square 0. A gap that reaches 0 and opens again is no
-    contact; one that reaches 0 and would become negative is, even at closing speed 0.
+    The vehicles begin with the gap ``gap`` (m) and the speeds ``v_front`` and ``v_rear`` (m/s, at least 0), and follow
+    the plans ``front`` and ``rear`` until ``until`` (s), as if they could pass through each other: a negative smallest
+    gap is the depth of their overlap. Without contact the time is infinite and the square 0. A gap that reaches 0 and
+    opens again is no contact; one that reaches 0 and would become negative is, even at closing speed 0.
     """
     lowest, now, met_at, squared = gap, 0.0, math.inf, 0.0
     while now < until:
