@@ -134,7 +134,7 @@ class Game(NamedTuple):
     physics: Physics | None = None  # None: exact impacts
 
     def with_layers(self, layers: Sequence[Layer]) -> Game:
-        """This game, which has no layers yet, with ``layers`` between the true state and its views and scripts."""
+        """The same game with ``layers`` between the true state and its views and scripts; it has none yet."""
         layers = tuple(layers)
         views = tuple(view_through(layers, view) for view in self.views)
         scripts = {body: script_through(layers, script) for body, script in self.scripts.items()}
@@ -171,8 +171,8 @@ class Game(NamedTuple):
         moves every line to the next decision, and harm, end and reward follow from the motion.
 
         ``actions`` [n, L] are the learners' actions, in [-1, 1]. With a shield they are proposals: NaN is no proposal,
-        and if ``actions`` is None, the shield's own agents propose. ``donate``: the arrays of ``state`` may be overwritten. Raises ``InvalidInput``
-        for bad actions; after any error ``state`` is unchanged.
+        and if ``actions`` is None, the shield's own agents propose. ``donate``: the arrays of ``state`` may be
+        overwritten. Raises ``InvalidInput`` for bad actions; after any error ``state`` is unchanged.
         """
         if self.shield is not None:
             if actions is not None:
