@@ -63,7 +63,7 @@ def unshared_amount(line, p, weights):
 def pair_amount(line, p, weights):
     """Harm of pair ``p`` so far in one world (m2/s2), in the count with these ``weights`` [6], a value of ``COUNTS``.
 
-    Pair 0 is the obstacle and Vehicle 1. ``line`` is the array of one world (``motion.layout``).
+    Pair 0 is the obstacle and Vehicle 1. ``line``: [LINE_ROWS, N + 1] (``motion.layout``).
     """
     harm = weights[OF_FIRST] * line[FIRST, p] + weights[OF_TOTAL] * line[TOTAL, p]
     return harm + (weights[OF_PASSED] * line[PASSED, p] + unshared_amount(line, p, weights))
@@ -71,7 +71,7 @@ def pair_amount(line, p, weights):
 
 @kernel
 def amount_so_far(line, weights):
-    """Harm of one world so far (m2/s2): ``pair_amount`` of all pairs, always summed from the obstacle to the rear."""
+    """Harm of one world so far (m2/s2): sum of ``pair_amount`` over all pairs, always from the obstacle to the rear."""
     amount = 0.0
     for p in range(line.shape[1] - 1):
         amount += pair_amount(line, p, weights)

@@ -201,7 +201,7 @@ class Game(NamedTuple):
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
         """State after one step, and what happened in the step, without the shield; arguments as in ``step``.
 
-        The reward contains only the terms that the compiled step computes: the line's harm and ``terminal``.
+        The reward contains only harm of the line and ``terminal``, which the compiled step computes.
         """
         if self.physics is not None:
             return self.physics.follow(self, state, actions)
@@ -228,7 +228,7 @@ class Game(NamedTuple):
         return {body: agent_through(self.layers, agent) for body, agent in drivers.items()}
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Whether something about each body is hidden from vehicle ``body`` at its first decision, [n, N + 1]."""
+        """Whether vehicle ``body`` lacks information about each body at its first decision, [n, N + 1]."""
         hidden: Bools = alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
         for layer in self.layers:
             hidden = hidden | layer.hides(alert, body)

@@ -16,7 +16,7 @@ from ethbrake_marl.motion.layout import Bools, Floats, Ints
 if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game
 
-# what agents need to know that act on what their vehicle sees (all texts: `agents.team.KNOWLEDGE`)
+# `knows` of agents that act on what their vehicle sees (all texts: `agents.team.KNOWLEDGE`)
 SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
 MESSAGES = "messages"  # also the messages that the vehicle has received
 
@@ -44,7 +44,7 @@ class Layer:
 
     """
 
-    stage = 0  # layers of a lower stage come first: 0 changes what is sent or measured, 1 what of it arrives
+    stage = 0  # layers of a lower stage come first: stage 0 changes what is sent or measured, stage 1 what arrives
 
     def first_decision(self, game: Game, alert: State, state: State) -> State:
         """The state at the first decision, with this layer's memory of what has happened since the ``alert``."""
@@ -97,7 +97,7 @@ class LayeredView(View):
 
 
 class LayeredScript:
-    """A script that acts on the state that a layer lets through."""
+    """A script that acts on the state that a layer lets through to its vehicle."""
 
     def __init__(self, layer: Layer, script: Any) -> None:
         self.layer, self.inner, self.name = layer, script, name_of(script)

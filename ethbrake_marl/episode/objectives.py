@@ -85,8 +85,8 @@ class Harm(NamedTuple):
 class Kind(NamedTuple):
     form: str  # how it is written; with ":" it takes an argument
     about: str
-    amount: Callable[[Harm, int, Objective], Floats]  # (harm, vehicle from 0, what is written) -> [n]
-    weights: Callable[[Floats, int, Objective], Floats] | None = None  # of sums: (car, vehicle, written) -> [n, N]
+    amount: Callable[[Harm, int, Objective], Floats]  # (harm, vehicle from 0, objective) -> [n]
+    weights: Callable[[Floats, int, Objective], Floats] | None = None  # of sums: (car, vehicle, objective) -> [n, N]
     function: Callable[..., Floats] | None = None  # of a registered objective
     arguments: tuple[str, ...] = ()  # that a registered objective may have
 

@@ -65,7 +65,7 @@ def name_of(script: Any) -> str:
 
 
 def begin_script(script: Any, alert: State, body: int) -> Any:
-    """Memory of a script for new episodes. Raises ``AgentFailed`` if the script fails."""
+    """Memory of a script at the ``alert`` of new episodes. Raises ``AgentFailed`` if the script fails."""
     return _call(script, "begin", alert, body)
 
 

@@ -89,7 +89,7 @@ class Step(NamedTuple):
 
     @property
     def terminated(self) -> Bools:
-        """Whether the episode ended in this step with all vehicles at rest and no command to move, [n]."""
+        """Whether the episode ended in this step with all vehicles at rest and no command that would move one, [n]."""
         return self.out[TERMINATED] == 1.0
 
     @property
@@ -181,9 +181,8 @@ def step_worlds(
 def advance(line, car, clock, wanted, scratch, time_step_s):
     """Advance one running world to its next decision, in place; return the result of ``move_line``, and ``at_rest``.
 
-    ``at_rest``: whether all vehicles are at rest and would stay so. The arguments are those of ``step_worlds`` for one
-    world. A decision time is the first decision plus a whole number of time steps, never a sum of steps, so that times
-    of equal steps never differ by rounding.
+    ``at_rest``: whether no vehicle moves or would move. The arguments are those of ``step_worlds`` for one world. The
+    decision times are the first one plus multiples of the time step, never sums, so they do not differ by rounding.
     """
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
@@ -238,7 +237,7 @@ def first_decision(alert: State, deciders: Ints, settings: StepSettings) -> Stat
 
 
 def steps_to_horizon(first_s: Any, settings: StepSettings) -> Any:
-    """Number of the step that ends at the horizon, if the first decision is at ``first_s``."""
+    """Number of the step that ends at the horizon, if the first decision is at ``first_s`` (s)."""
     return np.ceil((settings.horizon_s - first_s) / settings.time_step_s - ROUNDING)
 
 

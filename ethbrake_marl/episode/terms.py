@@ -195,9 +195,9 @@ class Shaping(NamedTuple):
 
 
 def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
-    """Term harm, [n, N]: minus the increase of the amount that each vehicle's objective should keep small.
+    """Term harm, [n, N]: minus the increase of the amount that each vehicle's objective minimises.
 
-    ``objectives`` has one objective per vehicle; ``count`` is the name of the count of harm (``episode.counts``).
+    ``objectives`` has one per vehicle; ``count`` is the name of the count of harm (``episode.counts``).
     """
     return -amounts(objectives, before, after, count)
 

@@ -42,7 +42,7 @@ _EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Announce the first compilation of a kernel in this process."""
+    """Listener that announces the first compilation of a kernel in this process."""
 
     def on_start(self, happened: event.Event) -> None:
         announce_compilation()

@@ -252,10 +252,10 @@ def solo(speed, command, onset, limit, duration):
 def move_apart(line, car, scratch, duration, ahead, builds):
     """Move the line through the whole interval at once if surely no two bodies touch; return whether that was possible.
 
-    A vehicle that touches nothing only gains or only loses speed within the interval, so a gap shrinks by at most
-    ``duration`` (s) times (largest speed of the rear body minus smallest speed of the front body). If a gap is smaller
-    than that, and both accelerations are constant, ``contact`` decides. A line in which a force changes within the
-    interval, or a body moves backward, is not moved.
+    Without contact a speed only rises or only falls within the interval, so a gap shrinks by at most ``duration`` (s)
+    times (largest rear speed minus smallest front speed). If the gap is smaller than that, and both accelerations are
+    constant, ``contact`` decides. The line is not moved if a force changes within the interval or a body moves
+    backward.
     """
     bodies, slowest, front = line.shape[1], math.inf, 0.0
     for i in range(ahead, bodies):
