@@ -1,8 +1,8 @@
 """Actions and commands: an action in [-1, 1] becomes a command, and a command an action.
 
 A *command* is an acceleration (m/s2), negative brakes. Action -1 is full braking, 0 is coasting, 1 is full driving; in
-between, a command is the action times the capacity in its direction. The capacity is that of now
-(``motion.forces.capacity``). A function for arrays stands below each kernel; both have the same bits.
+between, a command is the action times the present capacity in its direction (``motion.forces.capacity``). Below each
+kernel stands a function for arrays with the same bits.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ LARGEST_ACTION = float(np.nextafter(np.float32(1.0), np.float32(2.0)))  # counts
 
 @kernel
 def command_of(car, i, action, time):
-    """Command of body i (m/s2) for an ``action``; one beyond [-1, 1] counts as the end of this range."""
+    """Command of body i (m/s2) for an ``action``. An action outside [-1, 1] counts as the nearest end of this range."""
     action = min(max(action, -1.0), 1.0)
     return action * capacity(car, BRAKING if action < 0.0 else DRIVING, i, time)
 
 
 def commands_of(state: State, bodies: Any, actions: Floats) -> Floats:
-    """``command_of`` for the ``actions`` of one body, [n], or of B ``bodies``, [n, B]."""
+    """Commands (m/s2) for the ``actions`` of one body, [n], or of B ``bodies``, [n, B], as in ``command_of``."""
     actions = np.clip(actions, -1.0, 1.0)
     return np.asarray(actions * _capacity_for(state, bodies, actions))
 
 
 @kernel
 def write_commands(car, wanted, learners, actions, time):
-    """Write one world's commands to ``wanted`` [N + 1], from the ``actions`` [L] of the bodies ``learners`` [L]."""
+    """Write the commands (m/s2) of one world's ``learners`` [L] to ``wanted`` [N + 1], from their ``actions`` [L]."""
     for j in range(learners.shape[0]):
         wanted[learners[j]] = command_of(car, learners[j], actions[j], time)
 
@@ -48,19 +48,22 @@ def action_of(car, i, command, time):
 
 
 def actions_of(state: State, bodies: Any, commands: Floats) -> Floats:
-    """``action_of`` for the ``commands`` of one body, [n], or of B ``bodies``, [n, B]."""
+    """Actions for the ``commands`` (m/s2) of one body, [n], or of B ``bodies``, [n, B], as in ``action_of``."""
     most = _capacity_for(state, bodies, commands)
     return np.clip(np.divide(commands, most, out=np.zeros_like(most), where=most > 0.0), -1.0, 1.0)
 
 
 def _capacity_for(state: State, bodies: Any, signs: Floats) -> Floats:
-    """Capacity of ``bodies`` in the direction of ``signs``, which are actions or commands of the same shape."""
+    """Capacity (m/s2) of ``bodies`` to brake where ``signs`` are negative, otherwise to drive.
+
+    ``signs`` are actions or commands; the result has their shape.
+    """
     braking, driving = (capacities(state.car, row, state.time_s)[:, bodies] for row in (BRAKING, DRIVING))
     return np.where(signs < 0.0, braking, driving)
 
 
 def action_array(learners: Ints, actions: Floats | None, n: int) -> Floats:
-    """Actions of the L ``learners`` as float64 [n, L]. Raises ``InvalidInput`` for another type or shape."""
+    """Actions of the L ``learners`` as float64 [n, L]. Raises ``InvalidInput`` for any other type or shape."""
     shape = n, len(learners)
     if not isinstance(actions, np.ndarray) or actions.shape != shape or actions.dtype.kind not in "fiu":
         raise InvalidInput(f"actions = {actions!r:.60}: must be an array of numbers with the shape {shape}")
@@ -68,7 +71,7 @@ def action_array(learners: Ints, actions: Floats | None, n: int) -> Floats:
 
 
 def proposal_array(learners: Ints, actions: Floats | None, n: int) -> Floats:
-    """Copy of proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput``."""
+    """Copy of proposed actions, [n, L] in [-1, 1] or NaN. Raises ``InvalidInput`` for a bad type, shape or action."""
     actions = action_array(learners, actions, n)
     size = np.abs(actions)
     if not (size > 1.0).any():

@@ -1,6 +1,7 @@
-"""Features, the single numbers of an observation, with fixed scales and in groups.
+"""Features: the numbers of an observation, in groups and with fixed scales.
 
-A vehicle observes ``clip(value / scale, low, high)``. An unknown value reads 0, and the group's feature ``known`` is 0.
+A vehicle observes ``clip(value / scale, low, high)``. An unknown value of a group is observed as 0, and the group's
+feature ``known`` is then 0.
 """
 
 from __future__ import annotations
@@ -77,7 +78,7 @@ SIDE = re.compile(r"(front|rear)_([1-9][0-9]?)")
 
 
 class ComputedFeature(NamedTuple):
-    """A feature of the observer or of a neighbour, computed by a function of its own (``register_feature``)."""
+    """A feature that a registered function computes, of the observer or of a neighbour (``register_feature``)."""
 
     feature: Feature
     of: Of
@@ -136,15 +137,15 @@ def register_feature(
     ``InvalidInput`` for a bad argument.
 
     Args:
-        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. A list names a neighbour's as ``front_1.NAME``.
-        function: ``function(state, body)``, or ``function(state, body, other)`` for a neighbour, returns the value in
-            every world, [n], in ``unit``. ``body`` 1 is the front vehicle.
+        name: 1 to 64 characters ``a-z``, ``0-9``, ``_``. Lists name a feature of a neighbour ``front_1.NAME``.
+        function: ``function(state, body)``, or ``function(state, body, neighbour)``, returns the value in every world,
+            [n], in ``unit``. ``body`` is the observer; 1 is the front vehicle.
         unit: unit of the value.
         scale: number above 0; the observation is ``clip(value / scale, low, high)``.
         low: smallest observed number.
         high: largest observed number.
-        of: ``own``: the feature describes the observer itself; ``neighbour``: a vehicle that it knows.
-        unknown: value for an unknown neighbour, in ``unit``.
+        of: what the feature describes. ``own``: the observer itself; ``neighbour``: a vehicle that the observer knows.
+        unknown: value for a neighbour that the observer does not know, in ``unit``.
 
     """
     meaning = description_of(
@@ -179,10 +180,10 @@ def register_feature_group(
     function: Callable[[State, Ints, float], Floats],
     columns: slice = slice(None),  # a constant
 ) -> None:
-    """Register features that are computed together. Entry points: ``ethbrake_marl.feature_groups``.
+    """Register features that one function computes together. Entry points: ``ethbrake_marl.feature_groups``.
 
-    ``function(state, bodies, time_step_s)`` returns unscaled values, [n, bodies, ...]; ``columns`` of the last axis
-    belong to ``features``. Groups with the same function share one call.
+    ``function(state, bodies, time_step_s)`` returns unscaled values, [n, bodies, K]; ``columns`` of these K values
+    belong to ``features``. If several groups have the same function, one call serves all of them.
     """
     group = Group(tuple(features), function, columns)
     GROUPS.add(name, group, lambda registered: registered == group)
@@ -211,7 +212,7 @@ GROUPS: Registry[Group] = Registry("group of features", "feature_groups", regist
 
 
 def side_of(name: str) -> int | None:
-    """Offset of a neighbour's group: ``front_2`` gives -2 (two ahead), ``rear_1`` gives 1; None for another name."""
+    """Offset from the observer to a neighbour: -2 for the group ``front_2``, 1 for ``rear_1``, None for other names."""
     match = SIDE.fullmatch(name)
     if match is None or int(match[2]) > MOST_NEIGHBOURS:
         return None
@@ -219,14 +220,17 @@ def side_of(name: str) -> int | None:
 
 
 def group_named(name: str) -> tuple[Feature, ...] | None:
-    """Features of a group, such as ``own``, ``front_1`` or ``contact``; None for another name."""
+    """Features of the group with this name, such as ``own``, ``front_1`` or ``contact``; None if there is none."""
     if side_of(name) is not None:
         return NEIGHBOUR
     return WHOLE_GROUPS[name] if name in WHOLE_GROUPS else GROUPS[name].features if name in GROUPS else None
 
 
 def feature_named(name: str) -> Feature:
-    """Feature with the full name ``front_1.gap``, ``place`` or the like. Raises ``UnknownName``."""
+    """Feature with a full name such as ``front_1.gap`` or ``place``.
+
+    Raises ``UnknownName``, or ``InvalidInput`` if the name of a neighbour's feature lacks the neighbour.
+    """
     group, dot, feature_name = name.partition(".")
     if not dot and name in FEATURES and FEATURES[name].of == "own":
         return FEATURES[name].feature
@@ -241,7 +245,7 @@ def feature_named(name: str) -> Feature:
 
 
 def known_names() -> list[str]:
-    """All names for an ``observation:`` list: groups, then features; neighbours as ``front_1``."""
+    """All names for an ``observation:`` list: groups, then features. Of the neighbours, only the nearest are listed."""
     groups = [*WHOLE_GROUPS, "front_1", "rear_1", *GROUPS]
     inside = [f"{group}.{feature.name}" for group in groups for feature in group_named(group) or ()]
     return [*groups, *LISTS, *inside, *(name if FEATURES[name].of == "own" else f"front_1.{name}" for name in FEATURES)]
@@ -257,9 +261,10 @@ def _names_of(group_or_feature: str) -> list[str]:
 
 
 def listed_features(observation: object) -> tuple[str, ...]:
-    """Full names for an ``observation:`` list: ``["own", "front_1.gap"]`` gives ``("own.speed", ..., "front_1.gap")``.
+    """Full names of all features in an ``observation:`` list.
 
-    Raises ``InvalidInput`` unless it is a list of known, different names.
+    ``["own", "front_1.gap"]`` gives ``("own.speed", ..., "front_1.gap")``. Raises ``InvalidInput`` unless the list
+    contains only known names, and no feature twice.
     """
     if isinstance(observation, str) or not isinstance(observation, Sequence) or not observation:
         raise InvalidInput("observation: must be a list of groups and features, for instance [own, front_1, rear_1]")

@@ -1,4 +1,4 @@
-"""The full state of a world as one vector, for central critics: all vehicles, all pairs, the time, the obstacle."""
+"""The full state of a world as one vector, for centralised critics: all vehicles, all pairs, the time, the obstacle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OWN_VIEW = View(["own"])
 
 
 def state_features(vehicles: int, horizon_s: float, obstacle: bool) -> tuple[Feature, ...]:
-    """Features of ``full_state``, in order: 7 of each vehicle, 2 of each pair, the time, and 2 of an obstacle."""
+    """Features of ``full_state``, in order: 7 of each vehicle, 2 of each pair, the time, 2 of the obstacle, if any."""
     vehicle_features = [f._replace(name=f"vehicle_{i}.{f.name}") for i in range(1, vehicles + 1) for f in OWN]
     pairs = [f._replace(name=f"pair_{p}.{f.name}") for p in range(1, vehicles) for f in OF_PAIR.values()]
     time = Feature("time", "s", horizon_s, 0.0, 1.0, "time since the alert; scale: the horizon")
@@ -24,7 +24,7 @@ def state_features(vehicles: int, horizon_s: float, obstacle: bool) -> tuple[Fea
 
 
 def full_state(state: State, horizon_s: float, obstacle: bool) -> Observations:
-    """Values of all ``state_features``, [n, features] float32, whether or not a vehicle knows them."""
+    """Scaled values of all ``state_features``, [n, features] float32, also of those that no vehicle knows."""
     car = state.car.copy()
     car[:, OWN_LATENCY] = car[:, LATENCY]
     vehicle_values = OWN_VIEW.observe(state._replace(car=car), np.arange(1, state.vehicles + 1), 0.0).reshape(

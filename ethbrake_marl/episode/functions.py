@@ -13,10 +13,10 @@ from ethbrake_marl.motion.layout import Floats
 
 
 def description_of(kind: str, name: object, function: object, pattern: str, form: str) -> str:
-    """Docstring, on one line, of a ``function`` that is being registered as a ``kind``, such as ``term``.
+    """Docstring, on one line, of a ``function`` that a user registers as a ``kind``, such as ``term``.
 
-    Raises ``InvalidInput`` if there is none, or for a name that does not match ``pattern``, which ``form`` says in
-    words.
+    Raises ``InvalidInput`` if there is no docstring, or if ``name`` does not match the regular expression ``pattern``;
+    the message describes the pattern by ``form``.
     """
     if not isinstance(name, str) or re.fullmatch(pattern, name) is None:
         raise InvalidInput(f"{kind} {name!r:.80}: the name must be 1 to 64 characters {form}")
@@ -28,9 +28,10 @@ def description_of(kind: str, name: object, function: object, pattern: str, form
 def call_function(
     what: str, function: Callable[..., Any], arguments: tuple[Any, ...], *shapes: tuple[int, ...]
 ) -> Floats:
-    """Result of ``function(*given)``, as an array of numbers.
+    """Result of ``function(*arguments)``, as an array of numbers.
 
-    Raises ``InvalidInput``, beginning with ``what``, if it fails or its result has none of the ``shapes``.
+    Raises ``InvalidInput``, with a message that begins with ``what``, if the function fails or if the shape of its
+    result is not one of ``shapes``.
     """
     try:
         value = np.asarray(function(*arguments))
@@ -47,9 +48,9 @@ def call_function(
 
 
 def check_finite_values(what: str, value: Floats, times_s: Floats) -> None:
-    """Raise ``InvalidInput`` unless all of ``value``, [n] or [n, N], are finite.
+    """Raise ``InvalidInput`` unless all numbers in ``value``, [n] or [n, N], are finite.
 
-    The message names ``what`` and the first bad row, with its time from ``times_s`` [n].
+    The message names ``what``, the first world with a bad number, and the time in this world, from ``times_s`` [n].
     """
     for row, *vehicle in np.argwhere(~np.isfinite(value))[:1]:
         whose = "".join(f" for vehicle_{i + 1}" for i in vehicle)

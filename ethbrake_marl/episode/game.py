@@ -1,4 +1,4 @@
-"""A game: everything that stays the same in an episode. It has no state of its own."""
+"""A game: everything that stays the same during an episode. What changes is a ``State``."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from ethbrake_marl.motion.layout import LATENCY, Bools, Floats, Ints
 
 
 class Script(Protocol):
-    """Drives one vehicle by a script, policy or search. It sees the whole state.
+    """Controls one vehicle, by rules, a policy or a search. A script sees the whole state.
 
-    It decides at the alert, and then whenever the learners do. What it remembers is in ``memory``, never in the object:
-    simulations ask the same object, and one agent may drive several vehicles.
+    It decides at the alert, and then whenever the learners do. A script remembers nothing in the object, only in
+    ``memory``: simulations call the same object, and one script may control several vehicles.
     """
 
     def begin(self, alert: State, body: int) -> Any:
-        """Memory of the script at the alert: None, an array with one row per world, or a tuple of memories."""
+        """Memory of the script at the alert: None, an array with a row per world, or a tuple or mapping of these."""
 
     def act(self, state: State, memory: Any, body: int) -> tuple[Floats, Any]:
-        """Commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the new memory."""
+        """Commands of vehicle ``body`` (1: Vehicle 1), [n] m/s2, and the script's new memory."""
 
 
 class Shield(Protocol):
@@ -54,21 +54,24 @@ class Shield(Protocol):
     """
 
     def begin(self, game: Game, alert: State, state: State) -> Any:
-        """Memory of the shield for new episodes: their worlds at the ``alert``, and at the first decision ``state``."""
+        """Memory of the shield for new episodes.
+
+        ``alert`` holds the worlds at the alert, ``state`` the same worlds at their first decision.
+        """
 
     def decide(self, game: Game, state: State, proposed: Floats | None, *, donate: bool) -> tuple[Floats, Any]:
-        """Actions to apply, [n, L] of the L learners, and the new memory.
+        """Actions to apply to the L learners, [n, L], and the shield's new memory.
 
-        ``proposed`` [n, L] are actions in [-1, 1], or NaN for no proposal. None: the shield's own agents propose.
-        ``donate``: the arrays of ``state`` may be overwritten.
+        ``proposed`` [n, L] are actions in [-1, 1], or NaN where a learner proposes nothing. If ``proposed`` is None,
+        the shield's own agents propose. ``donate``: the arrays of ``state`` may be overwritten.
         """
 
     def infos(self, game: Game, state: State) -> dict[str, Any]:
-        """Values for the infos: name -> [n] or [n, N]."""
+        """Values that the shield adds to the infos: name -> [n] or [n, N]."""
 
 
 class Physics(Protocol):
-    """How vehicles move and collide in a game, instead of the exact physics.
+    """Replaces the exact physics of a game: how vehicles move and collide.
 
     >>> import numpy as np
     >>> import ethbrake_marl as eb
@@ -93,20 +96,20 @@ class Physics(Protocol):
         """Refuse (``files.model.refuse``) a scenario that this physics cannot simulate."""
 
     def rewarding(self, game: Game) -> Rewarding:
-        """The rewards of a game that has this physics. Raises ``InvalidInput`` for terms that it cannot compute."""
+        """Rewards of a ``game`` with this physics. Raises ``InvalidInput`` for terms that it cannot compute."""
 
     def first_decision(self, game: Game, alert: State) -> State:
-        """Episodes at their first decision, as ``Game.first_decision``."""
+        """Episodes at their first decision, from worlds at the ``alert``; called by ``Game.first_decision``."""
 
     def follow(self, game: Game, state: State, actions: Floats | None) -> tuple[State, Step]:
-        """State after one step and what happened in it, as ``Game.follow``."""
+        """State after one step, and what happened in the step; called by ``Game.follow``."""
 
 
 class Game(NamedTuple):
-    """Worlds to draw, settings, scripts, observations, rewards, and perhaps layers, another physics and a shield.
+    """A source of worlds, settings, scripts, observations, rewards; perhaps layers, other physics and a shield.
 
-    ``draw`` returns worlds at the alert; ``reset`` moves them to the first decision, and ``step`` to the next one.
-    Environments, evaluation, search and shields all use this ``step``.
+    ``draw`` returns worlds at the alert; ``reset`` moves them to the first decision, and ``step`` to the next
+    decision. Environments, evaluation, search and shields all use this ``step``.
 
     >>> import numpy as np
     >>> import ethbrake_marl as eb
@@ -131,14 +134,14 @@ class Game(NamedTuple):
     physics: Physics | None = None  # None: exact impacts
 
     def with_layers(self, layers: Sequence[Layer]) -> Game:
-        """A game without layers, now with ``layers``: its views and scripts see what all of them let through."""
+        """The same game with ``layers`` between the true state and its views and scripts; it has none yet."""
         layers = tuple(layers)
         views = tuple(view_through(layers, view) for view in self.views)
         scripts = {body: script_through(layers, script) for body, script in self.scripts.items()}
         return self._replace(views=views, scripts=scripts, layers=layers)
 
     def reset(self, alert: State) -> State:
-        """Episodes at their first decision, from worlds at the alert. Scripts decide at the alert."""
+        """Episodes at their first decision, from worlds at the ``alert``. Scripts already decide at the alert."""
         wanted, memories = alert.wanted, dict(alert.memories)
         if self.scripts:
             wanted = wanted.copy()
@@ -167,9 +170,9 @@ class Game(NamedTuple):
         Within ``step``: the shield decides, scripts choose commands, learners' actions become commands, the physics
         moves every line to the next decision, and harm, end and reward follow from the motion.
 
-        ``actions`` [n, L] of the learners are in [-1, 1]. With a shield they are proposals: NaN for none, and None lets
-        the shield's own agents propose. ``donate``: the arrays of ``state`` may be overwritten. Raises ``InvalidInput``
-        for bad actions; after any error ``state`` is unchanged.
+        ``actions`` [n, L] are the learners' actions, in [-1, 1]. With a shield they are proposals: NaN is no proposal,
+        and if ``actions`` is None, the shield's own agents propose. ``donate``: the arrays of ``state`` may be
+        overwritten. Raises ``InvalidInput`` for bad actions; after any error ``state`` is unchanged.
         """
         if self.shield is not None:
             if actions is not None:
@@ -182,9 +185,10 @@ class Game(NamedTuple):
         return self.rewarding.complete(state, step, after)
 
     def first_decision(self, alert: State) -> State:
-        """Episodes at their first decision, before shaping and shield begin. The scripts have decided already.
+        """Episodes at their first decision, without the memories of shaping and shield, which ``reset`` adds.
 
-        Raises ``InvalidInput`` for worlds of another physics.
+        In ``alert`` the scripts have already decided. Raises ``InvalidInput`` if this game has exact impacts and the
+        worlds have another physics.
         """
         if self.physics is not None:
             return self.physics.first_decision(self, alert)
@@ -195,7 +199,10 @@ class Game(NamedTuple):
         return state
 
     def follow(self, state: State, actions: Floats | None, *, donate: bool = False) -> tuple[State, Step]:
-        """``step`` (same arguments) without the shield, and without reward terms other than harm and terminal."""
+        """State after one step, and what happened in the step, without the shield; arguments as in ``step``.
+
+        The reward contains only harm of the line and ``terminal``, which the compiled step computes.
+        """
         if self.physics is not None:
             return self.physics.follow(self, state, actions)
         after, step = one_step.step(self.settings, self.scripts, state, actions, donate=donate and not self.layers)
@@ -212,13 +219,16 @@ class Game(NamedTuple):
         return state
 
     def agents(self, drivers: Mapping[int, Any]) -> Mapping[int, Any]:
-        """The agents, body -> agent, each limited to what its vehicle may know."""
+        """The agents ``drivers``, body -> agent.
+
+        An agent that relies on sensors or messages sees only what the layers let through to its vehicle.
+        """
         if not self.layers:
             return drivers
         return {body: agent_through(self.layers, agent) for body, agent in drivers.items()}
 
     def hides(self, alert: State, body: int) -> Bools:
-        """Whether something about each body is hidden from vehicle ``body`` at its first decision, [n, N + 1]."""
+        """Whether vehicle ``body`` lacks information about each body at its first decision, [n, N + 1]."""
         hidden: Bools = alert.know[:, body] > alert.car[:, LATENCY, body, np.newaxis]
         for layer in self.layers:
             hidden = hidden | layer.hides(alert, body)
@@ -237,6 +247,6 @@ class Game(NamedTuple):
         return [self.views[i].observe(state, np.array([i]), self.settings.time_step_s)[:, 0] for i in bodies.tolist()]
 
     def observe_alike(self, state: State, bodies: Sequence[int] | Ints) -> Observations:
-        """Observations, [n, len(bodies), F], of ``bodies`` that observe the same features."""
+        """Observations of ``bodies`` that all observe the same F features, [n, len(bodies), F]."""
         bodies = np.asarray(bodies, np.int64)
         return self.views[bodies[0]].observe(state, bodies, self.settings.time_step_s)

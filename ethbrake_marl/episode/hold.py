@@ -1,6 +1,6 @@
-"""Predicts what would happen if vehicles held constant commands, without stops at decisions.
+"""Prediction of the harm if vehicles hold constant commands, without stops at decisions.
 
-It is fast, but rounded differently than the episode; ``episode.play`` has the bits of the episode.
+It is fast, but rounds differently from an episode; ``episode.play`` has the same bits as the episode.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from ethbrake_marl.motion.layout import BRAKING, Floats, scratch_for
 
 @large
 def hold_worlds(line, car, wanted, bodies, trials, time, until, weights, tie_weights, memory, out):
-    """Write the harm to ``out`` [2, n, C] if ``bodies`` [B] hold the commands ``trials`` [n, C, B] (m/s2).
+    """Write the harm (m2/s2) to ``out`` [2, n, C] if ``bodies`` [B] hold the commands ``trials`` [n, C, B] (m/s2).
 
-    The other bodies hold ``wanted``. Row 0 of ``out`` counts by ``weights`` [6], row 1 by ``tie_weights``. ``time``
-    and ``until`` [n] (s): from when to when they hold. ``line``, ``car`` and ``wanted`` are arrays of a ``State``;
-    ``memory``: working memory of the physics, of one line and of its commands, overwritten.
+    Each of C trials starts from ``line``; all other bodies hold ``wanted``. Row 0 of ``out`` is the harm in the count
+    with the weights ``weights`` [6], row 1 in the count with ``tie_weights`` [6]. The commands hold from ``time`` to
+    ``until`` (s, [n] each). ``line``, ``car`` and ``wanted`` are arrays of a ``State``. ``memory`` is overwritten:
+    scratch memory of the physics, one line, and its commands.
     """
     scratch, line_copy, commands = memory
     for k in range(trials.shape[0]):
@@ -48,8 +49,8 @@ def hold(
 ) -> Floats:
     """Harm if ``bodies`` hold constant commands until ``until_s`` (one time or [n]), [2, n, C] m2/s2.
 
-    The first row is the harm in ``count``, the second in the count that decides ties. ``trials`` [n, C, B] are C sets
-    of commands for the B bodies (m/s2); the other bodies hold ``wanted`` [n, N + 1].
+    The first row is the harm in ``count``, the second the harm in the count that breaks ties. ``trials`` [n, C, B] are
+    C sets of commands for the B bodies (m/s2); all other bodies hold ``wanted`` [n, N + 1] (m/s2).
     """
     features = "e_v2x_bm other than pairwise, shields other than episode:pairwise, shaping"
     check_exact(state, f"a plan of constant commands ({features})")
@@ -65,10 +66,11 @@ def hold(
 def descend(
     state: State, bodies: Sequence[int], shares: Floats, rounds: int, until_s: float | Floats, count: Count
 ) -> tuple[Floats, Floats]:
-    """Choose the best constant share of each body's brakes, one body after the other, while all others brake fully.
+    """Choose a constant share of the brakes for each of ``bodies``, by coordinate descent; all others brake fully.
 
-    ``shares`` are the candidates, in [0, 1]. The bodies take turns in ``rounds`` rounds, each with the others' latest
-    choice. Returns the commands of all bodies, [n, N + 1] m/s2, and the harm of the episode, [n] m2/s2.
+    All ``bodies`` start from full braking and take turns, ``rounds`` times: each picks the best of ``shares`` (in [0,
+    1]) for the others' latest choice. Commands are held until ``until_s``. Returns the commands of all bodies, [n, N +
+    1] m/s2, and the harm of the episode, [n] m2/s2.
     """
     braking = capacities(state.car, BRAKING, state.time_s)
     commands, least = -braking, np.zeros(state.n)

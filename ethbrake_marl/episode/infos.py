@@ -4,14 +4,14 @@
 time_s                    time since the alert, s
 command_in_force_mps2     acceleration that the vehicle's brakes or engine cause, m/s2
 chosen_command_mps2       last command of its policy or script, m/s2; it takes effect after the latency
-chosen_action             the same as an action, in [-1, 1]
+chosen_action             this command as an action, in [-1, 1]
 first_impact_harm         harm that the vehicle has borne so far, first impact of each pair, m2/s2
-total_harm                the same over all impacts
+total_harm                harm that the vehicle has borne so far, all impacts, m2/s2
 world_first_impact_harm   harm of the whole line so far, first impact of each pair, m2/s2
-world_total_harm          the same over all impacts
+world_total_harm          harm of the whole line so far, all impacts, m2/s2
 collided                  whether the world has had an impact
 cost                      harm of the line in the last step, in the reward's count, m2/s2
-reward_NAME               term NAME of the reward or of ``report`` in the last step, without its weight
+reward_NAME               term NAME in the last step, without its weight, if the reward or ``report`` has it
 world_seed, world         seed and number of the world; -1 and -1 for a world made by the caller
 world_listed              whether the world is in the evaluation list of the seed, not among its training worlds
 shield_NAME               values that a shield reports
@@ -49,9 +49,9 @@ FIRST_WEIGHTS, TOTAL_WEIGHTS = COUNTS["first"], COUNTS["total"]
 
 @large
 def report(line, car, clock, wanted, bodies, borne, out):
-    """Write the infos ``NUMBERS`` of the bodies to ``out`` [n, bodies, len(NUMBERS)].
+    """Write the infos in ``NUMBERS`` of the ``bodies`` to ``out`` [n, bodies, len(NUMBERS)].
 
-    ``line`` to ``wanted`` are arrays of a ``State``; ``borne`` [2, N] is working memory.
+    ``line``, ``car``, ``clock`` and ``wanted`` are arrays of a ``State``; ``borne`` [2, N] is working memory.
     """
     for k in range(len(out)):
         split_world(line[k, FIRST], car[k, MASS], borne[0])
@@ -76,7 +76,7 @@ def numbers(state: State, bodies: Ints) -> Floats:
 
 
 def names_of_worlds(state: State, seed: Any) -> dict[str, Any]:
-    """Seed, number and list of each world, name -> [n]; ``seed`` is one for all worlds, or [n]."""
+    """Infos that identify each world (seed, number, list), name -> [n]. ``seed`` is one for all worlds, or [n]."""
     number = state.clock[:, NUMBER].astype(np.int64)
     in_evaluation_list = number <= FIRST_IN_LIST
     number_in_list = np.where(in_evaluation_list, FIRST_IN_LIST - number, number)
@@ -84,7 +84,10 @@ def names_of_worlds(state: State, seed: Any) -> dict[str, Any]:
 
 
 def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str, Any]:
-    """Cost, seed, world number and reward terms: name -> [n] or [n, N]. ``step`` is None after a reset."""
+    """Infos of the last step: cost, reward terms, seed and number of the world; name -> [n] or [n, N].
+
+    ``step`` is None after a reset; cost and terms are then 0.
+    """
     reported = game.rewarding.reported
     worlds = names_of_worlds(state, seed)
     if step is None:
@@ -95,7 +98,7 @@ def of_step(game: Game, state: State, step: Step | None, seed: Any) -> dict[str,
 
 
 def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies: Ints) -> list[dict[str, Any]]:
-    """Infos, one dictionary for each world and body, world by world."""
+    """Infos of the ``bodies`` in all worlds: a list of dictionaries, one for each world and body, world by world."""
     infos = []
     shared = per_body(of_step(game, state, step, seed) | game.own_infos(state), state.n, bodies)
     for values, common in zip(numbers(state, bodies).reshape(-1, len(NUMBERS)).tolist(), shared, strict=True):
@@ -106,7 +109,7 @@ def dictionaries(game: Game, state: State, step: Step | None, seed: int, bodies:
 
 
 def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, Any]]:
-    """Split columns, [n] or [n, N], into one dictionary for each world and body, world by world."""
+    """Split ``columns``, [n] or [n, N] each, into one dictionary for each world and body, world by world."""
     shared = {name: value.tolist() for name, value in columns.items() if value.ndim == 1}
     vehicle_columns = {name: value[:, bodies - 1].tolist() for name, value in columns.items() if value.ndim == 2}
     rows = []
@@ -117,7 +120,7 @@ def per_body(columns: dict[str, Any], n: int, bodies: Ints) -> list[dict[str, An
 
 
 def arrays(game: Game, state: State, step: Step | None, seed: int, body: int) -> dict[str, Any]:
-    """Infos of one body in all worlds, name -> [n]."""
+    """Infos of one body in all worlds: name -> [n]."""
     columns = dict(zip(NUMBERS, numbers(state, np.array([body]))[:, 0].T, strict=True))
     columns["collided"] = columns["collided"] == 1.0
     for name, value in (of_step(game, state, step, seed) | game.own_infos(state)).items():

@@ -16,16 +16,16 @@ from ethbrake_marl.motion.layout import Bools, Floats, Ints
 if TYPE_CHECKING:
     from ethbrake_marl.episode.game import Game
 
-# what agents need to know that act on what their vehicle sees (all texts: `agents.team.KNOWLEDGE`)
+# `knows` of agents that act on what their vehicle sees (all texts: `agents.team.KNOWLEDGE`)
 SENSORS = "own sensors"  # its own vehicle, and the neighbours that its sensors see
 MESSAGES = "messages"  # also the messages that the vehicle has received
 
 
 class Layer:
-    """Something between the true state and what a vehicle sees of it. Override the methods that differ.
+    """Changes what vehicles see of the true state. Override the methods that should do more than nothing.
 
-    Each layer of a game sees what the layers before it let through. A layer has no state of its own: what it remembers
-    is in ``State.memories``. Physics, rewards and shields use the true state.
+    Each layer of a game sees what the layers before it let through. A layer object has no state: what the layer
+    remembers is in ``State.memories``. Physics, rewards and shields use the true state.
 
     >>> import ethbrake_marl as eb
     >>> from ethbrake_marl.episode.layer import Layer
@@ -44,10 +44,10 @@ class Layer:
 
     """
 
-    stage = 0  # layers of a lower stage come first: 0 changes what is sent or measured, 1 what of it arrives
+    stage = 0  # layers of a lower stage come first: stage 0 changes what is sent or measured, stage 1 what arrives
 
     def first_decision(self, game: Game, alert: State, state: State) -> State:
-        """The first decision ``state``, with this layer's memory of what has happened since the ``alert``."""
+        """The state at the first decision, with this layer's memory of what has happened since the ``alert``."""
         return state
 
     def after(self, game: Game, before: State, state: State) -> State:
@@ -55,9 +55,9 @@ class Layer:
         return state
 
     def seen(self, state: State, body: int) -> State:
-        """The state as vehicle ``body`` sees it (0: as somebody sees it who is in no vehicle).
+        """The state as vehicle ``body`` sees it; ``body`` 0 stands for an observer outside all vehicles.
 
-        ``state`` is what the layers before this one let through; it must not be changed in place.
+        ``state`` is what the layers before this one let through. Do not change it in place.
         """
         return state
 
@@ -66,15 +66,15 @@ class Layer:
         return np.zeros((alert.n, alert.vehicles + 1), np.bool_)
 
     def infos(self, state: State) -> dict[str, Any]:
-        """Values for the infos: name -> [n] or [n, N]."""
+        """Values that this layer adds to the infos: name -> [n] or [n, N]."""
         return {}
 
     def view(self, view: View) -> View:
-        """The observations of ``view`` through this layer."""
+        """A view with the features of ``view``, computed from the state that this layer lets through."""
         return LayeredView(self, view)
 
     def script(self, script: Any) -> Any:
-        """A script like ``script`` that acts on what its vehicle sees through this layer."""
+        """A script that acts like ``script`` on the state that this layer lets through to its vehicle."""
         return LayeredScript(self, script)
 
 
@@ -97,7 +97,7 @@ class LayeredView(View):
 
 
 class LayeredScript:
-    """A script that acts on the state that a layer lets through."""
+    """A script that acts on the state that a layer lets through to its vehicle."""
 
     def __init__(self, layer: Layer, script: Any) -> None:
         self.layer, self.inner, self.name = layer, script, name_of(script)
@@ -113,7 +113,7 @@ class LayeredScript:
 
 @cache
 def view_through(layers: tuple[Layer, ...], view: View) -> View:
-    """The observations of ``view`` through all layers; the first layer is the nearest to the true state."""
+    """``view`` of the state that all layers let through; the first layer is nearest to the true state."""
     for layer in reversed(layers):
         view = layer.view(view)
     return view
@@ -126,7 +126,7 @@ def script_through(layers: tuple[Layer, ...], script: Any) -> Any:
 
 
 def agent_through(layers: tuple[Layer, ...], agent: Any) -> Any:
-    """The agent through all layers, if it uses only sensors and messages; any other agent sees the true state."""
+    """The agent behind all layers, if it uses only sensors and messages; any other agent still sees the true state."""
     if isinstance(agent, UserScript):
         return UserScript(agent_through(layers, agent.script))
     if hasattr(agent, "through"):  # it observes by a view

@@ -1,6 +1,7 @@
 """Objectives: whose harm a vehicle should minimise.
 
-With the harm ``H_j`` that vehicle j bears (m2/s2), ``H`` of the whole line, and masses ``m_j``, vehicle i minimises:
+Let ``H_j`` be the harm that vehicle j bears (m2/s2), ``H`` the harm of the line and ``m_j`` the mass of vehicle j.
+Vehicle i minimises:
 
 ==================  ================================================================================================
 total               ``H``
@@ -10,16 +11,16 @@ social:phi          ``cos(phi) H_i + sin(phi) (H - H_i)``: social value orientat
 maximin             ``max_j H_j``
 mass-weighted       ``N sum_j m_j H_j / sum_j m_j``
 weighted:w1,w2,...  ``N sum_j w_j H_j / sum_j w_j``, one weight per vehicle, 0 or from 1e-6 to 1e6
-preference          as ``weighted``, with the scenario's ``harm_weight``
+preference          as ``weighted``, with the weights ``harm_weight`` of the scenario
 first:A,then:B      ``1000 A + B`` for two other objectives: nearly their lexicographic order
 ==================  ================================================================================================
 
-All are weighted sums of the vehicles' harm, except ``maximin``, registered ones, and a ``first`` that contains one of
-these.
+All are weighted sums of the vehicles' harm, except ``maximin``, registered objectives, and a ``first`` that contains
+one of these.
 
 ``first:A,then:B`` lets B break ties of A. The order is lexicographic if two actions differ in A by more than a
-thousandth of their difference in B. Other objectives may give an impact no weight (``free_pairs``); then causing it
-costs nothing.
+thousandth of their difference in B. Some objectives give the impacts of a pair no weight (``free_pairs``); then causing
+them costs nothing.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Harm(NamedTuple):
     def of(cls, amounts: Floats, car: Floats) -> Harm:
         """Harm of pairs, vehicles and line, from ``pair_amounts`` and the parameters ``car`` of a ``State``.
 
-        The rear vehicle of a pair bears its conduct alone; the two share the rest by their masses.
+        The rear vehicle of a pair alone bears the price of its conduct; the pair shares the rest of its harm by mass.
         """
         pairs, unshared = amounts
         line_harm, borne = np.zeros(len(pairs)), np.empty((len(pairs), pairs.shape[1] - 1))
@@ -70,7 +71,10 @@ class Harm(NamedTuple):
         return cls(impacts, borne + unshared[:, :-1], line_harm, car)
 
     def weighted(self, weights: Floats) -> Floats:
-        """``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, for ``weights`` [n, N]; summed from front to rear."""
+        """Weighted harm ``N sum_j w_j H_j / sum_j w_j``, [n] m2/s2, with ``weights`` w [n, N].
+
+        The sums run from front to rear.
+        """
         harm, total_weight = np.zeros(len(self.borne)), np.zeros(len(self.borne))
         for j in range(self.borne.shape[1]):
             harm = harm + weights[:, j] * self.borne[:, j]
@@ -81,8 +85,8 @@ class Harm(NamedTuple):
 class Kind(NamedTuple):
     form: str  # how it is written; with ":" it takes an argument
     about: str
-    amount: Callable[[Harm, int, Objective], Floats]  # (harm, vehicle from 0, what is written) -> [n]
-    weights: Callable[[Floats, int, Objective], Floats] | None = None  # of sums: (car, vehicle, written) -> [n, N]
+    amount: Callable[[Harm, int, Objective], Floats]  # (harm, vehicle from 0, objective) -> [n]
+    weights: Callable[[Floats, int, Objective], Floats] | None = None  # of sums: (car, vehicle, objective) -> [n, N]
     function: Callable[..., Floats] | None = None  # of a registered objective
     arguments: tuple[str, ...] | type[float] = ()  # that a registered objective may have; float: any number
 
@@ -109,17 +113,17 @@ class Objective(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """Whether the amount may differ between vehicles with this objective, as for ``own``."""
+        """Whether two vehicles with this objective may minimise different amounts, as with ``own``."""
         return self.kind.name in PERSONAL or self.kind.function is not None or any(part.differs for part in self.parts)
 
     def amount(self, harm: Harm, vehicle: int) -> Floats:
-        """Amount that ``vehicle`` (from 0) should minimise, [n]."""
+        """Amount that ``vehicle`` (0: Vehicle 1) should minimise, [n]."""
         return self.kind.amount(harm, vehicle, self)
 
     def weights(self, car: Floats, vehicle: int) -> Floats:
-        """Weight of each vehicle's harm in the amount of ``vehicle`` (from 0), [n, N]; ``car``: array of a ``State``.
+        """Weight of each vehicle's harm in the amount that ``vehicle`` (0: Vehicle 1) should minimise, [n, N].
 
-        Raises ``InvalidInput`` unless the objective is a weighted sum.
+        ``car`` is the array of a ``State``. Raises ``InvalidInput`` unless the objective is a weighted sum.
         """
         if self.kind.weights is None:
             forms = ", ".join(kind.form for kind in OBJECTIVES.loaded.values() if kind.weights)
@@ -180,12 +184,15 @@ def _first_and_then(text: str, argument: str) -> tuple[Objective, ...]:
 
 
 def objective_name(text: str) -> str:
-    """Name of the kind of objective: ``social`` for ``social:45``, ``vehicle_K`` for ``vehicle_3``."""
+    """Name of an objective without its argument: ``social`` for ``social:45``, ``vehicle_K`` for ``vehicle_3``."""
     return re.sub("vehicle_[1-9][0-9]?", "vehicle_K", text) if ":" not in text else text.partition(":")[0]
 
 
 def objectives_of(declared: Declared, vehicles: int) -> tuple[Objective, ...]:
-    """Objective of each vehicle, front to rear. Raises ``InvalidInput`` for a bad text or the wrong number of texts."""
+    """Objective of each vehicle, front to rear, from one text for all vehicles or a list of texts.
+
+    Raises ``InvalidInput`` for a bad text or the wrong number of texts.
+    """
     texts = [declared] * vehicles if isinstance(declared, str) else declared
     if not isinstance(texts, Sequence) or not all(isinstance(text, str) for text in texts):
         raise InvalidInput(
@@ -216,10 +223,10 @@ def _check_vehicles(text: str, objective: Objective, vehicles: int) -> None:
 
 
 def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: bool) -> list[int]:
-    """Pairs whose impacts cost ``vehicle`` (from 0) nothing: K for Vehicles K and K + 1, 0 for an ``obstacle``.
+    """Pairs whose impacts cost ``vehicle`` (0: Vehicle 1) nothing: K for Vehicles K and K + 1, 0 with the obstacle.
 
-    Only for ``weighted`` and ``vehicle_K``, whose weights of 0 may be a mistake. With ``own`` or ``social:90``
-    indifference is intended: the result is empty.
+    Only for ``weighted`` and ``vehicle_K``, whose weights of 0 may be a mistake. With other objectives, such as ``own``
+    or ``social:90``, indifference is intended, and the result is empty. ``obstacle``: whether there is an obstacle.
     """
     if objective.kind.name not in ("weighted", "vehicle_K"):
         return []
@@ -228,10 +235,10 @@ def free_pairs(objective: Objective, vehicle: int, vehicles: int, *, obstacle: b
 
 
 def amounts(objectives: Sequence[Objective], before: State | None, after: State, count: str) -> Floats:
-    """Increase of what each vehicle should minimise, since ``before`` (None: since the alert), [n, N].
+    """Increase of the amount that each vehicle should minimise, since ``before`` (None: since the alert), [n, N].
 
-    A weighted sum is computed from the harm since then; other objectives are amount after minus amount before.
-    ``count`` says which harm (``episode.counts``).
+    A weighted sum is computed from the harm since ``before``; any other objective is the amount after minus the amount
+    before. ``count`` is the name of the count of harm (``episode.counts``).
     """
     amounts_after = pair_amounts(after.line, count)
     harm_so_far = Harm.of(amounts_after, after.car)
@@ -280,11 +287,10 @@ def register_objective(
 ) -> None:
     """Register an objective for scenarios and rewards. Entry points: ``ethbrake_marl.objectives``.
 
-    ``function(harm, vehicle)`` returns what ``vehicle`` (from 0) should minimise, [n]; its docstring describes this
-    amount. With ``arguments`` the objective is written ``name:argument``, and the function gets the argument third:
-    one of these texts, or with ``arguments=float`` any number.
-    Raises ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a
-    docstring.
+    ``function(harm, vehicle)`` returns the amount that ``vehicle`` (0: Vehicle 1) should minimise, [n], for a ``Harm``;
+    its docstring describes this amount. With ``arguments`` the objective is written ``name:argument``, and the argument
+    is the function's third parameter: one of these texts, or with ``arguments=float`` any number. Raises
+    ``AlreadyExists`` for a name in use, and ``InvalidInput`` for a bad name or a function without a docstring.
     """
     form = "a-z, 0-9, - and _, beginning with a letter or digit, and no name of a vehicle"
     meaning = description_of("objective", name, function, r"(?!vehicle_\d+$)[a-z0-9][a-z0-9_-]{0,63}", form)

@@ -1,4 +1,4 @@
-"""Observations: values of the listed features, for every observer in every world."""
+"""Observations: the scaled values of a list of features, for every observer in every world."""
 
 from __future__ import annotations
 
@@ -90,11 +90,11 @@ class View:
         return f"View({list(self.names)})"
 
     def part(self, names: Sequence[str]) -> View:
-        """The same view of some of its features."""
+        """A view of only the features ``names``."""
         return View(names)
 
     def observe(self, state: State, observers: Ints, time_step_s: float) -> Observations:
-        """Observations of the bodies ``observers`` (1: Vehicle 1), [n, observers, F]."""
+        """Observations of the bodies ``observers`` (1: Vehicle 1), [n, len(observers), F]; this view has F features."""
         plan = self.plan
         observations = np.empty((state.n, len(observers), len(self.names)), np.float32)
         observe_worlds(
@@ -118,6 +118,7 @@ class View:
 
     @cached_property
     def plan(self) -> ObservationPlan:
+        """Where each feature of this view comes from: the kernel, a group's function or a feature's function."""
         group_names = list(dict.fromkeys(name.partition(".")[0] for name in self.names if "." in name))
         offsets = [offset for name in group_names if (offset := side_of(name)) is not None]
         kernel_groups = ["own", *(name for name in group_names if side_of(name) is not None)]
@@ -143,20 +144,20 @@ class View:
 
 
 def knows(state: State, body: int, neighbour: int) -> NDArray[np.bool_]:
-    """Whether a body knows another one already and may react to it, [n]; False if the other one does not exist."""
+    """Whether ``body`` already knows ``neighbour`` and may react to it, [n]; False if there is no such vehicle."""
     if not 0 < neighbour <= state.vehicles:
         return np.zeros(state.n, np.bool_)
     return np.asarray(state.time_s >= state.know[:, body, neighbour])
 
 
 def has_unknown(state: State, body: int) -> NDArray[np.bool_]:
-    """Whether a quantity of a body is unknown (NaN) in this state, [n]."""
+    """Whether some quantity of ``body`` is unknown (NaN) in this state, [n]."""
     parts = (state.line[:, :, body], state.car[:, :, body], state.wanted[:, [body]])
     return np.asarray(np.isnan(np.concatenate(parts, axis=1)).any(axis=1))
 
 
 def scaling_of(features: Sequence[Feature]) -> Floats:
-    """1 / scale, low and high of features, [3, F]."""
+    """Scaling of F features, [3, F]: the rows are 1 / scale, low and high."""
     return np.array([[1.0 / f.scale for f in features], [f.low for f in features], [f.high for f in features]])
 
 
@@ -165,10 +166,10 @@ def scale_values(values: Floats, scaling: Floats) -> Floats:
 
 
 def observe_computed(entry: ComputedFeature, state: State, body: int, offset: int, known: NDArray[np.bool_]) -> Floats:
-    """Observed value of a feature that has a function, [n].
+    """Scaled value of a feature that a registered function computes, as ``body`` observes it, [n].
 
-    ``offset`` leads from the body to the neighbour that is described (-1: the vehicle ahead), where it is ``known``
-    [n]; 0: the feature describes the body itself.
+    ``offset`` leads from ``body`` to the neighbour that the feature describes (-1: the vehicle ahead); ``known`` [n]
+    says whether ``body`` knows this neighbour. With ``offset`` 0 the feature describes ``body`` itself.
     """
     what = f"feature {entry.feature.name!r} of vehicle_{body}"
     if offset and not known.any():
@@ -186,7 +187,7 @@ def observe_computed(entry: ComputedFeature, state: State, body: int, offset: in
 
 @kernel
 def full_stop_m(speed, latency_left, capacity):
-    """Distance to a stop (m): ``v tau + v^2 / (2 a)``, if brakes act at once (``forces.stopping_m``).
+    """Stopping distance (m) ``v tau + v^2 / (2 a)`` if brakes act at once; otherwise see ``forces.stopping_m``.
 
     Speed v (m/s), time ``latency_left`` tau (s) without braking, braking ``capacity`` a (m/s2).
     """
@@ -196,10 +197,10 @@ def full_stop_m(speed, latency_left, capacity):
 
 @kernel
 def fitting_deceleration(speed, latency_left, room):
-    """Deceleration (m/s2) that stops a vehicle within ``room`` (m): ``v^2 / (2 (room - v tau))``.
+    """Deceleration (m/s2) that stops a vehicle within the distance ``room`` (m): ``v^2 / (2 (room - v tau))``.
 
-    Speed v (m/s), time ``latency_left`` tau (s) without braking. If less than 1 mm is left after tau, it counts as 1
-    mm; the observation is clipped there.
+    Speed v (m/s), time ``latency_left`` tau (s) without braking. If less than 1 mm is left after tau, the formula uses
+    1 mm; the observation is clipped in this case.
     """
     speed = max(speed, 0.0)
     return speed * speed / (2.0 * max(room - speed * latency_left, 1e-3))
@@ -212,12 +213,13 @@ def scale_value(value, scaling, f):
 
 @large
 def observe_worlds(line, car, clock, know, observers, offsets, role, obstacle, places, scaling, value, out):
-    """Write the scaled features of the groups own, neighbours, role and obstacle to ``out`` [n, observers, F].
+    """Write the scaled features of the built-in groups to ``out`` [n, observers, F].
 
-    All are computed in this order in ``value``; ``role`` and ``obstacle`` say whether these groups are. ``places`` [F]
-    are the positions to write (-1: none); if it is empty, all values are written in order. ``line`` to ``know`` are
-    arrays of a ``State``, ``offsets`` lead to the neighbours (-1: the vehicle ahead), ``scaling`` is from
-    ``scaling_of``.
+    ``value`` is working memory for the unscaled features of one observer: group own, the neighbours, role, obstacle.
+    ``role`` and ``obstacle`` say whether to compute these two groups. ``places`` [F] are the positions in ``value`` of
+    the features to write (-1: not written here); if it is empty, all values are written in order. ``line``, ``car``,
+    ``clock`` and ``know`` are arrays of a ``State``. ``offsets`` lead from an observer to the neighbours (-1: the
+    vehicle ahead). ``scaling`` is from ``scaling_of``.
     """
     bodies = line.shape[2]
     for k in range(len(out)):

@@ -1,4 +1,4 @@
-"""Predicts what would happen if the learners followed a plan, decision by decision, with the bits of the episode."""
+"""Prediction of episodes in which the learners follow a plan, decision by decision, with the bits of the episode."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from ethbrake_marl.motion.layout import Floats, scratch_for
 
 @large
 def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, weights, scratch, out):
-    """Follow plans [n, T, L] of the L learners, in place; write the harm to ``out`` [n].
+    """Follow the plans [n, T, L] of the L learners to the end, in place; write the harm (m2/s2) to ``out`` [n].
 
-    An episode stops above the harm ``most`` [n]. After T decisions the last one repeats. The other arguments are those
-    of ``step.step_worlds``.
+    An episode stops when its harm is above ``most`` [n]. After T decisions the last actions repeat. The other arguments
+    are those of ``step.step_worlds``.
     """
     for k in range(len(out)):
         harm = amount_so_far(line[k], weights)
@@ -37,11 +37,12 @@ def play_worlds(line, car, clock, wanted, plans, most, learners, time_step_s, we
 def follow_plans(
     game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf, *, donate: bool = False
 ) -> tuple[State, Floats]:
-    """Last states of episodes whose learners follow plans from ``state`` on, and the harm, [n] m2/s2.
+    """Last states of episodes whose learners follow ``plans`` from ``state`` on, and their harm, [n] m2/s2.
 
-    ``plans`` [n, T, L] are the learners' actions at every decision; the last one repeats. An episode stops when its
-    harm is above ``most`` [n]. If a check of the physics fails, the harm is infinite; but in games with scripts that
-    look at the state, ``PhysicsError`` is raised. ``donate``: the arrays of ``state`` may be overwritten.
+    ``plans`` [n, T, L] are the learners' actions at every decision of the episode, from the first one on; the last
+    actions repeat. An episode stops when its harm is above ``most`` [n]. If a check of the physics fails, the harm is
+    infinite; but in games with scripts, ``PhysicsError`` is raised. ``donate``: the arrays of ``state`` may be
+    overwritten.
     """
     most = np.full(len(plans), most)
     if game.scripts or game.physics is not None:
@@ -62,5 +63,5 @@ def follow_plans(
 
 
 def price(game: Game, state: State, plans: Floats, count: Count, most: Any = math.inf) -> Floats:
-    """Harm of every episode, [n] m2/s2, if its learners follow ``plans`` from now on (see ``follow_plans``)."""
+    """Harm of every episode, [n] m2/s2, if the learners follow ``plans`` from ``state`` on (see ``follow_plans``)."""
     return follow_plans(game, state, plans, count, most)[1]

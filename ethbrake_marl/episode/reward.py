@@ -51,17 +51,17 @@ class RewardParams(FileModel):
     """Weights of the terms of a reward, and their constants. A term of weight 0 is not computed.
 
     Args:
-        harm: weight of the term harm. Give it whenever you give another weight.
+        harm: weight of the term harm. Required if you give any other weight.
         harm_count: what the term harm counts: ``first``, ``total`` or ``honest`` (``episode.counts``).
-        objective: objective of all vehicles, or a list with one each; None: the scenario's.
+        objective: objective of all vehicles, or a list with one per vehicle; None: as in the scenario.
         collision, risk, jerk, terminal, push, drove, still_moving, shaping: weights of these terms (``episode.terms``).
-        shaping_discount: discount in the term shaping, in (0, 1]; it should be the learner's own.
+        shaping_discount: discount in the term shaping, in (0, 1]; use the discount of your training.
         k_energy: factor of the term collision, or a list with one for each pair of vehicles, front to rear.
         ttc_scale_s: tau of the term risk, s.
         safety_buffer_m: d_safe of the term risk, m.
         target_gap_m: d_target of the term risk, m.
         distance_slope_per_m: k_d of the term risk, 1/m.
-        terms: name of a registered term -> weight; negative for an amount that should become small.
+        terms: name of a registered term -> weight; a negative weight makes the term's value small.
 
     >>> import ethbrake_marl as eb
     >>> env = eb.EthBrakeEnv("paper-random", reward=eb.RewardParams(harm=0.05, terminal=1.0))
@@ -91,6 +91,7 @@ class RewardParams(FileModel):
     @model_validator(mode="before")
     @classmethod
     def _own_terms(cls, value: Any) -> Any:
+        """Move weights of registered terms that stand next to the other settings into the mapping ``terms``."""
         if not isinstance(value, dict):
             return value
         outside_weights = {name: weight for name, weight in value.items() if name in own_terms()}
@@ -130,7 +131,10 @@ class RewardParams(FileModel):
 
     @model_validator(mode="after")
     def _harm_is_meant(self) -> Self:
-        """Refuse weights of other terms without a weight of harm, because its default is 1."""
+        """Refuse weights of other terms if no weight of harm is set, because its default is 1.
+
+        Also refuse an objective if the weight of harm is 0.
+        """
         names = {*self.model_fields_set, *(self.terms if "terms" in self.model_fields_set else ())}
         weighted_terms = [name for name, weight in self.weights.items() if weight != 0.0 and name in names]
         right = (
@@ -157,7 +161,7 @@ Reward = str | RewardParams | Mapping[str, Any]  # a name, or settings
 
 
 def reward_params(reward: Reward) -> RewardParams:
-    """Settings of a reward. Raises ``UnknownName`` or ``InvalidInput``."""
+    """Settings of a reward from its name or a mapping. Raises ``UnknownName`` or ``InvalidInput``."""
     if isinstance(reward, RewardParams):
         return reward
     if isinstance(reward, str):
@@ -182,7 +186,7 @@ def reward_params(reward: Reward) -> RewardParams:
 
 
 class Rewarding(NamedTuple):
-    """A reward, ready to be computed after each step: everything that the compiled step does not compute itself."""
+    """A reward, ready to be computed after each step: all terms that the compiled step does not compute itself."""
 
     params: RewardParams
     counted: tuple[str, ...]  # names of the terms whose weight is not 0
@@ -202,11 +206,11 @@ class Rewarding(NamedTuple):
         vector: Any,
         report: Sequence[str] = (),
     ) -> tuple[Rewarding, StepSettings]:
-        """The reward, and the settings of a step with its weights.
+        """The reward, and the settings of a step, which contain the weights that the compiled step uses.
 
-        ``objective`` is the scenario's; ``times`` are time step and horizon (s); ``vector`` lists the components of a
-        vector reward, or is None; ``report`` lists terms whose value infos contain, with or without a weight. Warns if
-        an objective has no effect.
+        ``objective`` is the scenario's. ``times`` are time step and horizon (s). ``vector`` lists the components of a
+        vector reward, or is None. ``report`` names terms whose values the infos contain, even if they have no weight.
+        Warns (``WithoutEffect``) if the objective has no effect.
         """
         params = reward_params(reward)
         declared = objective if params.objective is None else params.objective
@@ -262,7 +266,7 @@ class Rewarding(NamedTuple):
         return not self.terms and self.shaping is None and not self.components
 
     def complete(self, before: State, step: Step, after: State) -> tuple[State, Step]:
-        """State with the reward's new memory, and step with the complete reward."""
+        """The state ``after`` with the reward's new memory, and the step with the complete reward."""
         values = {name: function(before, step, after) for name, _, function in self.terms}
         if self.shaping is not None:
             values["shaping"], memory = self.shaping.value(before, step, after)

@@ -14,9 +14,9 @@ from ethbrake_marl.motion.layout import BRAKING, DRIVING, Floats
 
 
 class UserScript:
-    """A script from outside this package: it gets read-only states, and its memories are checked and made read-only.
+    """Guards a script from outside this package: its states are read-only, its memories are checked and made read-only.
 
-    Simulations share states and memories, so a script must change neither.
+    Simulations share states and memories, so a script must not change either.
     """
 
     def __init__(self, script: Any) -> None:
@@ -50,7 +50,10 @@ class UserScript:
 
 
 def guard_scripts(scripts: Mapping[int, Any]) -> dict[int, Any]:
-    """The scripts, body -> script, those of users each in a ``UserScript``. Scripts of this package are trusted."""
+    """The scripts, body -> script, with each script from outside this package in a ``UserScript``.
+
+    Scripts of this package are trusted.
+    """
     return {
         body: script if type(script).__module__.startswith("ethbrake_marl.") else UserScript(script)
         for body, script in scripts.items()
@@ -62,7 +65,7 @@ def name_of(script: Any) -> str:
 
 
 def begin_script(script: Any, alert: State, body: int) -> Any:
-    """Memory of a script for new episodes. Raises ``AgentFailed`` if the script fails."""
+    """Memory of a script at the ``alert`` of new episodes. Raises ``AgentFailed`` if the script fails."""
     return _call(script, "begin", alert, body)
 
 
@@ -92,7 +95,7 @@ def ask_script(script: Any, state: State, memory: Any, body: int) -> tuple[Float
 
 
 def ask_scripts(scripts: Mapping[int, Any], state: State) -> State:
-    """State with new commands and memories of the ``scripts``; its commands are a new array."""
+    """State with new commands and new memories of the ``scripts``. The array of commands is a new one."""
     wanted, memories, commands = state.wanted.copy(), dict(state.memories), {}
     for i, script in scripts.items():
         commands[i], memories[i] = ask_script(script, state, memories[i], i)
@@ -103,7 +106,7 @@ def ask_scripts(scripts: Mapping[int, Any], state: State) -> State:
 
 
 def _call(script: Any, method: str, state: State, *arguments: Any) -> Any:
-    """Result of a script's method. Its errors become ``AgentFailed``."""
+    """Result of a script's ``method``. An error of the script becomes ``AgentFailed``."""
     try:
         return getattr(script, method)(state, *arguments)
     except EthBrakeError:

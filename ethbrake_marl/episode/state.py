@@ -43,11 +43,11 @@ PHYSICS_MARK = "physics"  # a memory of this name marks worlds whose impacts are
 
 
 class State(NamedTuple):
-    """n episodes of N vehicles, one row per world. It is never changed; a step returns a new state.
+    """State of n episodes with N vehicles each, one row per world. It is never changed; a step returns a new state.
 
-    The arrays have a column for each body 0 to N (``motion.layout``). The properties, for agents and terms, have
-    columns of vehicles: column i belongs to ``vehicle_{i + 1}``, or to the pair of it and the vehicle behind.
-    Properties are views: copy them before a change.
+    The arrays have a column for each body 0 to N (``motion.layout``). The properties, for agents and terms, have a
+    column for each vehicle or pair: column i belongs to ``vehicle_{i + 1}``, or to the pair of ``vehicle_{i + 1}`` and
+    the vehicle behind it. Properties may be views of the arrays: copy them before you change them.
 
     >>> import ethbrake_marl as eb
     >>> worlds = eb.load_scenario("paper-random").sample(2, seed=7)
@@ -59,23 +59,23 @@ class State(NamedTuple):
     line: Floats  # [n, LINE_ROWS, N + 1] speeds, forces, gaps, harm
     car: Floats  # [n, CAR_ROWS, N + 1] parameters
     clock: Floats  # [n, CLOCK_COLUMNS]
-    know: Floats  # [n, N + 1, N + 1] time from which body i acts on news of body j (s); infinite: never
+    know: Floats  # [n, N + 1, N + 1] time from which body i knows the state of body j (s); infinite: never
     wanted: Floats  # [n, N + 1] last commands (m/s2), negative brakes
     memories: Mapping[Any, Any]  # body -> memory of its script; a name -> memory of a shield or term
 
     def take(self, rows: Any) -> State:
-        """The episodes in ``rows`` (indices, a mask or a slice)."""
+        """State of the episodes in ``rows`` (indices, a mask or a slice)."""
         state: State = take(self, rows)
         return state
 
     def put(self, rows: Any, new: State, *, donate: bool = False) -> State:
-        """The state with the episodes ``new`` in ``rows``. ``donate``: its arrays may be overwritten."""
+        """State with the episodes ``new`` in place of those in ``rows``. ``donate``: its arrays may be overwritten."""
         state: State = put_rows(self, rows, new, donate)
         return state
 
     @staticmethod
     def join(parts: Sequence[State], merged: Callable[[Sequence[Any]], Any] = np.concatenate) -> State:
-        """Join the episodes of several states, whose memories have the same structure.
+        """One state with the episodes of several states, whose memories have the same structure.
 
         ``merged`` turns a list of arrays, one per state, into one array; by default it concatenates them.
         """
@@ -83,7 +83,7 @@ class State(NamedTuple):
         return state
 
     def read_only(self) -> State:
-        """The same episodes in arrays that cannot be changed."""
+        """The same state with read-only arrays; memories are the same objects."""
         line, car, clock, know, wanted = (array.view() for array in self[:5])
         for view in (line, car, clock, know, wanted):
             view.setflags(write=False)
@@ -115,13 +115,13 @@ class State(NamedTuple):
 
     @property
     def at_rest(self) -> Bools:
-        """Whether every vehicle is at rest and no command would move it, [n]."""
+        """Whether every vehicle is at rest and no command or force would move it, [n]."""
         moves = (self.line[:, SPEED] != 0.0) | (self.wanted > 0.0) | (self.line[:, FORCE] > 0.0)
         return ~moves[:, 1:].any(axis=1)
 
     @property
     def moving(self) -> Bools:
-        """Whether a vehicle moves, [n]."""
+        """Whether at least one vehicle moves, [n]."""
         return np.asarray((self.line[:, SPEED, 1:] != 0.0).any(axis=1))
 
     @property
@@ -152,7 +152,7 @@ class State(NamedTuple):
 
     @property
     def pair_hit(self) -> Bools:
-        """Whether the pair has had an impact, [n, N - 1]."""
+        """Whether the pair of neighbouring vehicles has had an impact, [n, N - 1]."""
         return self.line[:, HIT, 1:-1] == 1.0
 
     @property
@@ -186,22 +186,23 @@ class State(NamedTuple):
         return np.asarray(self.line[:, IMPACTS].any(axis=1))
 
     def harm(self, count: Count = "first") -> Floats:
-        """Harm of each world so far, [n] m2/s2; ``count`` says which harm (``episode.counts``)."""
+        """Harm of each world so far, [n] m2/s2; ``count`` is the count of harm (``episode.counts``)."""
         self._check_count(count)
         out = np.empty(self.n)
         _harm(self.line, weights_of(count), out)
         return out
 
     def pair_harm(self, count: Count = "first") -> Floats:
-        """Harm of each pair of neighbours so far, [n, N - 1] m2/s2.
+        """Harm of each pair of neighbouring vehicles so far, [n, N - 1] m2/s2.
 
-        Without impacts with the obstacle and, in the honest cost, Vehicle 1's own driving and motion.
+        The pair with the obstacle is left out: impacts with the obstacle and, in the honest cost, Vehicle 1's own
+        driving and motion.
         """
         self._check_count(count)
         return pair_amounts(self.line, count)[0, :, 1:-1]
 
     def borne_harm(self, count: Count = "first") -> Floats:
-        """Harm that each vehicle has borne so far, [n, N] m2/s2. The two shares of a pair sum to its harm."""
+        """Harm that each vehicle has borne so far, [n, N] m2/s2. The two shares of a pair sum to the pair's harm."""
         self._check_count(count)
         (pairs, unshared), out = pair_amounts(self.line, count), np.empty((self.n, self.vehicles))
         split_harm(pairs - unshared, self.car[:, MASS], out)
@@ -209,7 +210,7 @@ class State(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """Whether these worlds have exact impacts, and not another physics (key ``physics`` of a scenario)."""
+        """Whether these worlds have exact impacts, not another physics (key ``physics`` of a scenario)."""
         return PHYSICS_MARK not in self.memories
 
     def _check_count(self, count: Count) -> None:
@@ -233,9 +234,10 @@ def check_exact(state: State, what: str) -> None:
 
 
 def map_arrays(function: Callable[..., Any], memory: Any, *siblings: Any) -> Any:
-    """A memory with ``function(array, ...)`` in place of each array; ``siblings`` are memories of the same structure.
+    """A memory with ``function(array, ...)`` in place of each array.
 
-    A memory is None, an array with one row per world, or a tuple or mapping of memories (a state is one, too).
+    A memory is None, an array with one row per world, or a tuple or mapping of memories; a state is one, too.
+    ``siblings`` are memories of the same structure, whose arrays are further arguments of ``function``.
     """
     if isinstance(memory, np.ndarray):  # first, because the check for a mapping is slow
         return function(memory, *siblings)
@@ -251,7 +253,7 @@ def map_arrays(function: Callable[..., Any], memory: Any, *siblings: Any) -> Any
 
 
 def take(memory: Any, rows: Any) -> Any:
-    """``rows`` of every array in a memory (``map_arrays``). Slices are copied, so kernels get the usual layout."""
+    """A memory (``map_arrays``) of only the worlds in ``rows``. Slices are copied, so kernels get the usual layout."""
     if isinstance(rows, slice):
         return map_arrays(lambda array: array[rows].copy(), memory)
     places = np.asarray(rows, None if len(rows) else np.int64)
@@ -260,7 +262,10 @@ def take(memory: Any, rows: Any) -> Any:
 
 
 def put_rows(memory: Any, rows: Any, new: Any, donate: bool = False) -> Any:
-    """A memory (``map_arrays``) with ``new`` in ``rows``: a copy, or with ``donate`` the same writable arrays."""
+    """A memory (``map_arrays``) with the arrays of ``new`` in the worlds ``rows``.
+
+    The arrays are copies; with ``donate`` they are the same arrays where these are writable.
+    """
 
     def write_rows(old: Any, part: Any) -> Any:
         array = old if donate and old.flags.writeable else old.copy()
@@ -280,7 +285,7 @@ def _harm(line, weights, out):
 def front_share(harm, front_mass, rear_mass):
     """Part of a pair's harm that its front vehicle bears: ``harm m_rear / (m_front + m_rear)``, with masses in t.
 
-    The larger part is computed and the smaller one is the rest, so both sum to ``harm`` exactly.
+    The larger part is computed by the formula and the smaller part is the rest, so both sum to ``harm`` exactly.
     """
     if front_mass <= rear_mass:
         return rear_mass / (front_mass + rear_mass) * harm
@@ -289,9 +294,10 @@ def front_share(harm, front_mass, rear_mass):
 
 @kernel
 def split_world(pair_harm, mass, borne):
-    """Write the harm that each vehicle of one world bears to ``borne`` [N]. With the obstacle, Vehicle 1 bears all.
+    """Write the harm (m2/s2) that each vehicle of one world bears to ``borne`` [N].
 
-    ``pair_harm`` [N + 1] is the harm of each pair (m2/s2), ``mass`` [N + 1] the mass of each body (t).
+    ``pair_harm`` [N + 1] is the harm of each pair (m2/s2), ``mass`` [N + 1] the mass of each body (t). Vehicle 1 bears
+    the whole harm of its impacts with the obstacle.
     """
     rear = 0.0
     for p in range(1, len(borne)):
@@ -304,6 +310,9 @@ def split_world(pair_harm, mass, borne):
 
 @large
 def split_harm(pair_harm, mass, out):
-    """``split_world`` for n worlds: ``pair_harm`` and ``mass`` [n, N + 1], ``out`` [n, N]."""
+    """Write the harm (m2/s2) that each vehicle of n worlds bears to ``out`` [n, N] (see ``split_world``).
+
+    ``pair_harm`` (m2/s2) and ``mass`` (t) are [n, N + 1].
+    """
     for k in range(len(out)):
         split_world(pair_harm[k], mass[k], out[k])

@@ -42,19 +42,19 @@ ROUNDING = 1e-9  # fraction of a step: a horizon that exceeds whole steps by les
 
 
 class StepSettings(NamedTuple):
-    """The numbers that a step needs."""
+    """Settings of a step: learners, times, and weights of the reward."""
 
-    learners: Ints  # [L] bodies (1: Vehicle 1) whose actions are given
+    learners: Ints  # [L] bodies (1: Vehicle 1) whose actions a step gets
     time_step_s: float
     horizon_s: float
     harm: float = 1.0  # weight of the line's harm in the reward
     terminal: float = 0.0  # weight of an end without impact in the reward
-    weights: Floats = COUNTS["first"]  # of what counts as harm in the reward (``episode.counts``)
+    weights: Floats = COUNTS["first"]  # [6] of the count of harm in the reward (``episode.counts``)
     most_steps: float = np.inf  # number of steps after which an episode is truncated, as at the horizon
 
 
 class Step(NamedTuple):
-    """What happened in one step of n worlds. Nothing happens in episodes that ended before.
+    """What happened in one step of n worlds. Nothing happens in episodes that had already ended.
 
     >>> import numpy as np
     >>> import ethbrake_marl as eb
@@ -84,17 +84,17 @@ class Step(NamedTuple):
 
     @property
     def cost(self) -> Floats:
-        """Harm of the line in this step in the reward's count, [n] m2/s2."""
+        """Harm of the line in this step, in the count of harm that the reward uses, [n] m2/s2."""
         return self.out[COST]
 
     @property
     def terminated(self) -> Bools:
-        """Whether the episode ended in this step with all vehicles at rest and no command to move, [n]."""
+        """Whether the episode ended in this step with all vehicles at rest and no command that would move one, [n]."""
         return self.out[TERMINATED] == 1.0
 
     @property
     def truncated(self) -> Bools:
-        """Whether the episode ended in this step at the horizon, or after the most steps (``StepSettings``), [n]."""
+        """Whether the episode ended in this step at the horizon, or after ``StepSettings.most_steps`` steps, [n]."""
         return self.out[TRUNCATED] == 1.0
 
     @property
@@ -108,8 +108,9 @@ def step(
 ) -> tuple[State, Step]:
     """State after one step, and what happened in the step.
 
-    ``actions`` [n, L] are the learners' actions in [-1, 1]; ``scripts`` look at the state at every decision. Raises
-    ``InvalidInput`` for a bad action. ``state`` is unchanged, unless ``donate`` allows its arrays to be overwritten.
+    ``actions`` [n, L] are the learners' actions in [-1, 1]. The ``scripts``, body -> script, choose new commands first.
+    Raises ``InvalidInput`` for a bad action, and ``PhysicsError`` if a check of the physics fails. ``state`` is
+    unchanged, unless ``donate`` allows its arrays to be overwritten.
     """
     actions = action_array(settings.learners, actions, state.n)
     line, car, clock, know, wanted, memories = ask_scripts(scripts, state) if scripts else state
@@ -132,11 +133,12 @@ def step(
 def step_worlds(
     line, car, clock, wanted, actions, scratch, out, reward, learners, time_step_s, harm, terminal, weights
 ):
-    """Advance every running episode by one step, in place; return the row of an invalid action and of a failed world.
+    """Advance every running episode by one step, in place; return the index of a refused world and of a failed world.
 
-    -1 stands for none. An action is invalid if it is not a number in [-1, 1]; then nothing has moved. ``line`` to
-    ``wanted`` are arrays of a ``State``, ``out`` and ``reward`` of a ``Step``; ``scratch`` is the physics' working
-    memory. ``harm`` and ``terminal`` are weights of the reward, ``weights`` [6] those of the harm in it (``COUNTS``).
+    -1 stands for none. A world is refused if an action is not a number in [-1, 1]; then no world has moved. It fails if
+    a check of the physics fails. ``line``, ``car``, ``clock`` and ``wanted`` are arrays of a ``State``, ``out`` and
+    ``reward`` of a ``Step``; ``scratch`` is the working memory of the physics. ``harm`` and ``terminal`` are weights of
+    the reward; ``weights`` [6] belong to the count of harm in the reward (``COUNTS``).
     """
     n, bodies = wanted.shape
     for k in range(n):
@@ -177,10 +179,10 @@ def step_worlds(
 
 @kernel
 def advance(line, car, clock, wanted, scratch, time_step_s):
-    """Advance one running world to its next decision, in place; return ``move_line``'s result, and whether all rests.
+    """Advance one running world to its next decision, in place; return the result of ``move_line``, and ``at_rest``.
 
-    Arguments as in ``step_worlds``, without the axis of worlds. Decision times are multiples of the time step after the
-    first decision, so that they never differ by rounding.
+    ``at_rest``: whether no vehicle moves or would move. The arguments are those of ``step_worlds`` for one world. The
+    decision times are the first one plus multiples of the time step, never sums, so they do not differ by rounding.
     """
     clock[STEPS] += 1.0
     over = clock[STEPS] >= clock[LAST]
@@ -196,7 +198,7 @@ def advance(line, car, clock, wanted, scratch, time_step_s):
 
 @kernel
 def stands(line, wanted):
-    """Whether every vehicle of one world is at rest, and no command (``wanted``) or force would move it."""
+    """Whether every vehicle of one world is at rest, and no command (``wanted``, m/s2) or force would move it."""
     at_rest = True
     for i in range(1, line.shape[1]):
         at_rest = at_rest and line[SPEED, i] == 0.0 and wanted[i] <= 0.0 and line[FORCE, i] <= 0.0
@@ -205,15 +207,15 @@ def stands(line, wanted):
 
 @kernel
 def note_motion(line):
-    """Store each vehicle's squared speed at the end in the row MOVING of one world's ``line``."""
+    """Store the square of each vehicle's present speed (m2/s2) in the row MOVING of one world's ``line``."""
     for i in range(1, line.shape[1]):
         line[MOVING, i - 1] = line[SPEED, i] * line[SPEED, i]
 
 
 def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: Ints) -> State:
-    """State of worlds at the alert, when Vehicle 1 begins to brake and nobody has decided yet.
+    """State of worlds at the alert, when Vehicle 1 begins to brake and no agent has decided yet.
 
-    The arrays are those of ``State``; ``numbers`` [n] are the worlds' numbers.
+    The arrays are those of ``State``; ``numbers`` [n] are the numbers of the worlds in their list.
     """
     clock = np.zeros((len(line), CLOCK_COLUMNS))
     clock[:, NUMBER] = numbers
@@ -223,7 +225,7 @@ def at_alert(line: Floats, car: Floats, know: Floats, wanted: Floats, numbers: I
 def first_decision(alert: State, deciders: Ints, settings: StepSettings) -> State:
     """Episodes at their first decision: when the shortest latency of the bodies ``deciders`` has elapsed.
 
-    Until then all vehicles hold ``alert.wanted``.
+    Until then all vehicles hold the commands ``alert.wanted``.
     """
     first = alert.car[:, LATENCY, deciders].min(axis=1) if len(deciders) else np.zeros(alert.n)
     state, most = hold_commands(alert, first), settings.most_steps
@@ -235,12 +237,12 @@ def first_decision(alert: State, deciders: Ints, settings: StepSettings) -> Stat
 
 
 def steps_to_horizon(first_s: Any, settings: StepSettings) -> Any:
-    """Number of the step that ends at the horizon, if the first decision is at ``first_s``."""
+    """Number of the step that ends at the horizon, if the first decision is at ``first_s`` (s)."""
     return np.ceil((settings.horizon_s - first_s) / settings.time_step_s - ROUNDING)
 
 
 def hold_commands(state: State, until_s: Floats) -> State:
-    """State at ``until_s`` [n] if all vehicles hold their commands."""
+    """State at the time ``until_s`` [n] if all vehicles hold their commands until then. Raises ``PhysicsError``."""
     line, clock, wanted = state.line.copy(), state.clock.copy(), state.wanted.copy()
     car = np.require(state.car, requirements=("C", "W"))  # a kernel is compiled again for others
     failed = move_lines(line, car, state.time_s.copy(), until_s.copy(), wanted, scratch_for(wanted.shape[1]))

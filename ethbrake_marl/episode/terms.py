@@ -4,15 +4,15 @@ A term is a function ``term(before, step, after)`` of two states and the step be
 returns one number per world, [n], or per vehicle, [n, N]. Built-in terms, here for one vehicle in one step:
 
 ============  ==========================================================================================================
-harm          minus the harm of the line; with an objective, minus the increase of what the vehicle should minimise
+harm          minus the harm of the line; with an objective, minus the increase of the amount that the vehicle minimises
 collision     minus ``sum k_energy w^2`` over every impact, with the closing speed w
 risk          minus the sum over the vehicle's pairs of ``sigma(-TTC / tau) + sigma(k_d (d_target - d))``, with the gap
               d and ``TTC = max(d - d_safe, 0) / closing speed``; the first summand is 0 for a pair that does not close
 jerk          minus the squared rate of change of the vehicle's force
 terminal      1 at the end of an episode without any impact
-push          minus the closing speed that contacts of the line take up (``motion.add_push``)
-drove         minus the speed that the vehicle's engine alone gives (``motion.forces.driving``)
-still_moving  -1 for an end at the horizon with a vehicle in motion
+push          minus the push of all contacts of the line (``motion.push``)
+drove         minus the speed that the vehicle's engine alone gives it (``motion.forces.driving``)
+still_moving  -1 if the episode ends at the horizon with a vehicle in motion
 shaping       for learners: ``discount Phi(after) - Phi(before)``; Phi is minus the least harm that constant braking of
               the learners can reach. It leaves the optimal policy unchanged (Ng, Harada and Russell 1999)
 harm_K        minus the harm that vehicle_K bears
@@ -20,7 +20,7 @@ pair_J_K      minus the harm of the pair of vehicle_J and vehicle_K behind it
 obstacle      minus the harm of impacts with the obstacle
 ============  ==========================================================================================================
 
-``collision``, ``risk``, ``jerk`` and ``terminal`` are the paper's, with its misprints corrected.
+``collision``, ``risk``, ``jerk`` and ``terminal`` are terms of the paper, without its misprints.
 """
 
 from __future__ import annotations
@@ -56,7 +56,10 @@ class Term(NamedTuple):
     meaning: str
 
     def value(self, before: State, step: Step, after: State) -> Floats:
-        """Value, [n] or [n, N]. Raises ``InvalidInput`` if the function fails or returns anything else."""
+        """Value in each world, [n], or of each vehicle, [n, N]; 0 in episodes that had ended before the step.
+
+        Raises ``InvalidInput`` if the function fails, or if its result has another shape or is not finite.
+        """
         what, arguments = f"term {self.name!r}", (before.read_only(), step, after.read_only())
         value = call_function(what, self.function, arguments, (after.n,), (after.n, after.vehicles))
         running = ~before.ended
@@ -101,7 +104,7 @@ BUILT_IN = {  # name -> (unit, meaning)
 
 
 def collision(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Term collision (formula: module docstring) with exact impacts, [n]; ``params`` are ``RewardParams``."""
+    """Term collision (formula: module docstring), [n]; needs exact impacts. ``params`` are ``RewardParams``."""
     check_exact(before, "the sum of the term collision")
     if isinstance(params.k_energy, float):
         return -params.k_energy * step.total_harm
@@ -109,7 +112,7 @@ def collision(params: Any, before: State, step: Step, after: State) -> Floats:
 
 
 def pair_energies(params: Any, vehicles: int) -> Floats:
-    """``k_energy`` of every pair, [N + 1], from ``RewardParams``; the obstacle's is that of the first two vehicles."""
+    """``k_energy`` of every pair, [N + 1], from ``RewardParams``; the obstacle's pair has the first pair's value."""
     factors = params.k_energy if isinstance(params.k_energy, tuple) else (params.k_energy,) * (vehicles - 1)
     return np.array([factors[0], *factors, 0.0])
 
@@ -120,7 +123,7 @@ def jerk(before: State, step: Step, after: State) -> Floats:
 
 
 def risk(params: Any, before: State, step: Step, after: State) -> Floats:
-    """Term risk (formula: module docstring), [n, N]; ``params`` are ``RewardParams``."""
+    """Term risk of each vehicle (formula: module docstring), [n, N]; ``params`` are ``RewardParams``."""
     closing = after.speeds_mps[:, 1:] - after.speeds_mps[:, :-1]
     room = np.maximum(after.gaps_m - params.safety_buffer_m, 0.0)
     approaching = closing > 0.0
@@ -134,25 +137,25 @@ def risk(params: Any, before: State, step: Step, after: State) -> Floats:
 
 
 def push(before: State, step: Step, after: State) -> Floats:
-    """Term push, [n]: minus the push (m/s) of all contacts in the step.
+    """Term push, [n]: minus the push (m/s) of all contacts in the step, the contact with the obstacle included.
 
-    It includes the contact with the obstacle. Formula: ``motion.add_push``.
+    Formula: ``motion.push``.
     """
     check_exact(before, "the term push")
     return 0.0 - (after.line[:, PUSHED] - before.line[:, PUSHED]).sum(axis=1)
 
 
 def drove(before: State, step: Step, after: State) -> Floats:
-    """Term drove, [n, N]: minus the speed that the engine alone gives (m/s).
+    """Term drove, [n, N]: minus the speed (m/s) that each vehicle's engine alone gives in the step.
 
-    That is the integral of the force where it is positive (``motion.forces``).
+    This speed is the integral of the force where it is positive (``motion.forces.driving``).
     """
     check_exact(before, "the term drove")
     return 0.0 - (after.line[:, DROVE, :-1] - before.line[:, DROVE, :-1])
 
 
 def still_moving(before: State, step: Step, after: State) -> Floats:
-    """Term still_moving, [n]: -1 if a vehicle moves at the horizon, otherwise 0."""
+    """Term still_moving, [n]: -1 if the step ends at the horizon with a vehicle in motion, otherwise 0."""
     check_exact(before, "the term still_moving")
     return 0.0 - step.out[TRUNCATED] * after.moving
 
@@ -160,8 +163,9 @@ def still_moving(before: State, step: Step, after: State) -> Floats:
 def potential(settings: StepSettings, state: State) -> Floats:
     """Minus the least further harm that constant decelerations of the learners can reach, [n] m2/s2.
 
-    Each learner tries nine shares of its braking capacity, front to rear (several learners: twice); all others brake
-    fully. Harm is counted as in the reward. The potential is 0 once an episode has ended.
+    The learners choose in turn, front to rear, among nine shares of their braking capacity (several learners: in two
+    rounds); all other vehicles brake fully. Harm is counted as in the reward. The potential of an episode that has
+    ended is 0.
     """
     learners = settings.learners.tolist()
     rounds = 1 if len(learners) == 1 else 2
@@ -174,7 +178,7 @@ def potential(settings: StepSettings, state: State) -> Floats:
 
 
 class Shaping(NamedTuple):
-    """The term shaping. Its memory is the potential of the state, [n]."""
+    """The term shaping. Its memory is the potential of the present state, [n] m2/s2."""
 
     settings: StepSettings
     discount: float
@@ -183,7 +187,7 @@ class Shaping(NamedTuple):
         return potential(self.settings, state)
 
     def value(self, before: State, step: Step, after: State) -> tuple[Floats, Floats]:
-        """Value of the term, [n, N], and the new memory, [n]."""
+        """Value of the term, [n, N] m2/s2, and the new memory, [n] m2/s2."""
         new = potential(self.settings, after)
         value = np.zeros((after.n, after.vehicles))
         value[:, self.settings.learners - 1] = (self.discount * new - before.memories["shaping"])[:, np.newaxis]
@@ -191,12 +195,18 @@ class Shaping(NamedTuple):
 
 
 def growth(objectives: Sequence[Objective], count: str, before: State, step: Step, after: State) -> Floats:
-    """Term harm for vehicles with ``objectives``, one each, [n, N]; ``count`` says which harm (``episode.counts``)."""
+    """Term harm, [n, N]: minus the increase of the amount that each vehicle's objective minimises.
+
+    ``objectives`` has one per vehicle; ``count`` is the name of the count of harm (``episode.counts``).
+    """
     return -amounts(objectives, before, after, count)
 
 
 def component(name: str, count: str) -> TermFunction:
-    """Function of the component ``harm_K``, ``pair_J_K`` or ``obstacle`` in a count of harm; it returns [n]."""
+    """Function of the component ``harm_K``, ``pair_J_K`` or ``obstacle`` of a vector reward; the function returns [n].
+
+    ``count`` is the name of the count of harm.
+    """
     if name == "obstacle":
         return partial(_of_pair, 0, count)
     last_vehicle = int(name.rpartition("_")[2])
@@ -218,10 +228,11 @@ def _increase(count: str, before: State, after: State) -> Floats:
 
 
 def components_of(vector: Any, counted: Sequence[str], vehicles: int) -> tuple[str, ...]:
-    """Names of the components of a vector reward; ``vehicles`` stands for ``harm_1`` to ``harm_N``.
+    """Names of the components of a vector reward.
 
-    ``counted`` are the terms of the reward, which can be components too. Raises ``InvalidInput`` for an empty list or a
-    repeated name, ``UnknownName`` for an unknown one.
+    ``vector`` is a list of names, or ``"vehicles"`` for ``harm_1`` to ``harm_N``. ``counted`` are the terms of the
+    reward, which can be components, too. Raises ``InvalidInput`` for an empty list or a repeated name, ``UnknownName``
+    for an unknown name.
     """
     vehicle_components = [f"harm_{k + 1}" for k in range(vehicles)]
     if isinstance(vector, str) and vector == "vehicles":

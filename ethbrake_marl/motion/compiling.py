@@ -3,10 +3,11 @@
 A kernel is a function on arrays of numbers, compiled by numba. Kernels use + - * / sqrt, min, max and comparisons only,
 without fast-math: a world has the same bits in every batch and on every processor.
 
-Numba's own cache does not notice when a function that a kernel calls changes, and stops programs if its files are
-damaged. A file of machine code is therefore named by the digest of everything that decides it, above all of the sources
-of the core's kernels, of all kernels beside it, and of those in the folders of extensions that these import. Paths and
-times do not count, so all copies of this package share one cache. Code in ``python -OO`` is the same.
+Numba's own cache does not notice a change in a function that a kernel calls, and a damaged cache file stops the
+program. Here the name of a file of machine code is therefore a digest of everything that the code depends on: above
+all, the sources of the core's kernels, of the kernels in the same folder, and of the kernels in the extensions that
+these import. Paths and file times are not in the digest, so all copies of this package share one cache. ``python -OO``
+uses the same files.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _EXTENSION = re.compile(rb"^from ethbrake_marl\.extensions\.(\w+)", re.MULTILINE
 
 
 class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Announce the first compilation of a kernel in this process."""
+    """Listener that announces the first compilation of a kernel in this process."""
 
     def on_start(self, happened: event.Event) -> None:
         announce_compilation()
@@ -51,7 +52,7 @@ class _Teller(event.Listener):  # type: ignore[misc]  # numba has no types
 
 
 class _Postponer(event.Listener):  # type: ignore[misc]
-    """Postpone Ctrl-C until numba has compiled and stored a function: LLVM's calls of Python lose every exception."""
+    """Postpone Ctrl-C while numba compiles and stores a function: LLVM's calls of Python would lose the exception."""
 
     postponed = Postponed()
 
@@ -67,13 +68,13 @@ event.register("numba:compiler_lock", _Postponer())
 
 
 class _Cache(NullCache):  # type: ignore[misc]
-    """The machine code of one kernel for all types of its arguments, as numba asks for it and hands it over."""
+    """Stored machine code of one kernel, for all types of its arguments; numba calls the methods."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function, self._stamp = function, stamp_of(function.__code__.co_filename)
 
     def _name(self, signature: Any, codegen: Any) -> str:
-        """Name of the stored file: a digest of all that decides the machine code."""
+        """Name of the stored file: a digest of everything that the machine code depends on."""
         function = self._function
         versions = (numba.__version__, llvmlite.__version__, sys.version_info[:2], sys.abiflags)
         place = (function.__module__, function.__qualname__, function.__code__.co_firstlineno)
@@ -101,20 +102,20 @@ def _compile(function: Function, **options: Any) -> Function:
 
 
 def kernel(function: Function) -> Function:
-    """Compile a function that becomes a part of every kernel that calls it."""
+    """Compile a function that is inlined in every kernel that calls it."""
     return _compile(function, forceinline=True)
 
 
 def large(function: Function) -> Function:
-    """Compile a function once for all its callers, among them Python."""
+    """Compile a function once, without inlining. Kernels and Python code call it."""
     return _compile(function)
 
 
 @cache
 def stamp_of(file: str) -> str:
-    """Digest of all sources that decide the machine code of the kernels in ``file``, and of their names."""
+    """Digest of all source files, with their names, that the machine code of the kernels in ``file`` depends on."""
     folders, kernel_files = [Path(file).parent], set()
-    for folder in folders:  # which grow
+    for folder in folders:  # the loop appends to this list
         for path in folder.glob("*.py"):
             if _MARK in _source(path):
                 kernel_files.add(path)
@@ -128,5 +129,5 @@ def stamp_of(file: str) -> str:
 
 @cache
 def _source(path: Path) -> bytes:
-    """Content of a source file; empty if it cannot be read, and nothing can be imported from it."""
+    """Content of a source file; empty if the file does not exist or cannot be read."""
     return path.read_bytes() if path.is_file() and os.access(path, os.R_OK) else b""

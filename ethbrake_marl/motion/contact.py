@@ -1,8 +1,8 @@
-"""When a pair comes into contact. Between two events its gap is a polynomial of time, so the answer is exact.
+"""Time of a pair's next contact. Between two events the gap is a polynomial of time, so the result is exact.
 
 With the gap g, the closing speed w (``closing``), the closing acceleration b (``pressing``) and the closing jerk j
 (``jerk``; rear minus front, in m, m/s, m/s2 and m/s3), the gap after the time t is ``g - w t - b t^2 / 2 - j t^3 / 6``.
-Where brakes act at once, j is 0.
+If brakes act at once, j is 0.
 """
 
 from __future__ import annotations
@@ -14,17 +14,18 @@ from ethbrake_marl.motion.compiling import kernel, large
 
 @kernel
 def gap_after(gap, closing, pressing, jerk, time):
-    """Gap (m) after ``time`` (s)."""
+    """Gap of a pair (m) after ``time`` (s); formula: module docstring."""
     return gap - (closing + 0.5 * (pressing + jerk * time / 3.0) * time) * time
 
 
 @kernel
 def contact(gap, closing, pressing):
-    """Time (s) and closing speed (m/s) of the first contact at jerk 0; ``(inf, 0)`` if there is none.
+    """Time (s) and closing speed (m/s) of a pair's first contact at jerk 0; ``(inf, 0)`` if there is none.
 
-    Let ``D = w^2 + 2 b g``. If ``w > 0``, there is no contact for ``D < 0``, otherwise one at
-    ``t = 2 g / (w + sqrt(D))``. If ``w <= 0``, there is one only for ``b > 0``, at ``t = (sqrt(D) - w) / b``. The
-    closing speed is ``sqrt(D)`` itself; ``w + b t``, which is equal, loses digits by cancellation.
+    Let g = ``gap``, w = ``closing``, b = ``pressing`` and ``D = w^2 + 2 b g``. If ``w > 0``, there is no contact for
+    ``D < 0``, otherwise a contact at ``t = 2 g / (w + sqrt(D))``. If ``w <= 0``, there is a contact only for ``b > 0``,
+    at ``t = (sqrt(D) - w) / b``. The closing speed is computed as ``sqrt(D)``; ``w + b t``, which is equal, loses
+    digits by cancellation.
     """
     if closing > 0.0:
         squared = closing * closing + 2.0 * pressing * gap
@@ -40,11 +41,12 @@ def contact(gap, closing, pressing):
 
 @large
 def contact_on_cubic(gap, closing, pressing, jerk, end):
-    """Time (s) and closing speed (m/s) of the first contact before ``end`` (s); ``(inf, 0)`` if there is none.
+    """Time (s) and closing speed (m/s) of a pair's first contact before ``end`` (s); ``(inf, 0)`` if there is none.
 
-    The closing speed ``w + b t + j t^2 / 2`` has at most two roots, and the gap is monotone between them. The contact
-    is in the first part at whose end the gap is at most 0: Newton's method, with a bisection where a step leaves the
-    part. The closed formula of a cubic's roots cancels.
+    With w = ``closing``, b = ``pressing`` and j = ``jerk``, the closing speed ``w + b t + j t^2 / 2`` has at most two
+    roots, and the gap is monotone between them. The contact is in the first of these parts that ends with a gap of at
+    most 0. Newton's method finds it there, with a bisection where a step would leave the part. The closed formula for
+    the roots of a cubic would lose digits by cancellation.
     """
     first, second = -math.inf, -math.inf
     squared = pressing * pressing - 2.0 * jerk * closing
@@ -86,7 +88,7 @@ def contact_on_cubic(gap, closing, pressing, jerk, end):
 def first_return(value, rate, jerk):
     """First t > 0 (s) at which ``value + rate t + jerk t^2 / 2`` is 0; infinite if there is none.
 
-    A ``value`` that is 0 now does not count: the result is the next time.
+    If ``value`` is 0 now, the result is the next time.
     """
     if value == 0.0:
         return -2.0 * rate / jerk if rate * jerk < 0.0 else math.inf

@@ -1,4 +1,4 @@
-"""Which physics this is: a digest of what it does, not of how its code is written."""
+"""Digest of the physics: it depends on what the physics computes, not on how its code is written."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ INTERVALS_S = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # each with new commands
 
 @cache
 def physics_digest() -> str:
-    """16 hexadecimal digits of the bits of 2,000 worlds of 2 to 6 vehicles, in six intervals of random commands.
+    """16 hexadecimal digits, a hash of 2,000 random worlds of 2 to 6 vehicles after each of six intervals.
 
-    Every kernel of this folder takes part: obstacles, brakes that build up, touching vehicles, plastic impacts, speed
-    limits. Only a change of a result changes the digest.
+    In each interval all vehicles hold random commands. Every kernel of this folder takes part: obstacles, brakes that
+    build up, touching vehicles, plastic impacts, speed limits. The digest changes only if a result changes.
     """
     digest = hashlib.sha256()
     for vehicles in range(2, 7):
@@ -46,7 +46,7 @@ def physics_digest() -> str:
 
 
 def play_random_worlds(vehicles: int) -> list[Floats]:
-    """Lines of random worlds after each interval, [WORLDS, LINE_ROWS, vehicles + 1] each."""
+    """Arrays ``line`` of random worlds, one after each interval, [DIGEST_WORLDS, LINE_ROWS, vehicles + 1] each."""
     numbers = np.random.PCG64(vehicles)  # its raw numbers are the same in every version of numpy
 
     def draw(least: float, most: float, columns: int = vehicles) -> Floats:

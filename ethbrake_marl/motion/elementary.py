@@ -1,7 +1,7 @@
-"""Exponential, logarithm and normal quantile by exact operations, + - * / and sqrt, so all machines get the same bits.
+"""Exponential, logarithm and normal quantile from + - * / and sqrt only, so that all machines get the same bits.
 
-The C library and numpy choose an implementation by the processor, and the last bits differ. Each error bound here is
-the largest error, rounded up, that a comparison with values of 40 digits has shown.
+The C library and numpy choose an implementation by the processor, and the last bits differ. Each error bound in this
+file is the largest error, rounded up, in a comparison with values of 40 digits.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def exp_rest(x: float, k: int) -> float:
     """``e^x / 2^k`` for the whole number k nearest to ``x / ln 2``.
 
     The result is the Taylor series of ``e^y`` up to ``y^13``, with ``y = x - k ln 2``, so ``|y| <= ln(2) / 2``. The
-    relative error of ending the series there is 5e-18.
+    relative error of truncating the series is 5e-18.
     """
     return _polynomial(_EXP, (x - k * _LN2_HIGH) - k * _LN2_LOW)
 
@@ -113,8 +113,8 @@ def log(x: float) -> float:
 def normal_quantile(p: float) -> float:
     """Number below which a standard normal variable lies with probability p, within 1.5 ulp.
 
-    p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], let q be the smaller of p and 1 - p.
-    ``r = sqrt(-2 ln q)`` is the sum of two numbers; the first has 24 bits, so its square is exact.
+    p is clipped to [1e-22, 1 - 1e-22]. For p outside [1/4, 3/4], ``r = sqrt(-2 ln min(p, 1 - p))`` is computed as the
+    sum of two numbers; the first has 24 bits, so its square is exact.
     """
     q = p - 0.5
     if abs(q) <= 0.25:
@@ -137,11 +137,11 @@ def normal_quantile(p: float) -> float:
 
 @kernel
 def normal_probability(x: float) -> float:
-    """Probability that a standard normal variable is below x; the relative error is 1e-13 for x > -30.
+    """Probability that a standard normal variable is below x; the relative error is at most 1e-13 for x > -30.
 
-    With the standard normal density phi, the probability of a value above x is, for ``0 <= x <= 2``,
-    ``1/2 - phi(x) (x + x^3 / 3 + x^5 / 15 + ...)``, and for larger x the continued fraction
-    ``phi(x) / (x + 1 / (x + 2 / (x + ...)))``. For ``x < 0`` the result is the probability of a value above -x.
+    Let phi be the standard normal density. For ``0 <= x <= 2`` the probability of a value above x is ``1/2 - phi(x) (x
+    + x^3 / 3 + x^5 / 15 + ...)``, and for larger x it is the continued fraction ``phi(x) / (x + 1 / (x + 2 / (x +
+    ...)))``. For ``x < 0`` the result is the probability of a value above -x.
     """
     a = abs(x)
     density = _PER_SQRT_2PI * exp(-0.5 * a * a)
@@ -179,20 +179,20 @@ def _results_of(values: Floats, function_number: int) -> Floats:
 
 
 def exp_each(values: Floats) -> Floats:
-    """``exp`` of each entry."""
+    """``exp`` of every value, in the same shape."""
     return _results_of(values, 0)
 
 
 def log_each(values: Floats) -> Floats:
-    """``log`` of each entry."""
+    """``log`` of every value, in the same shape."""
     return _results_of(values, 1)
 
 
 def normal_quantile_each(values: Floats) -> Floats:
-    """``normal_quantile`` of each entry."""
+    """``normal_quantile`` of every value, in the same shape."""
     return _results_of(values, 2)
 
 
 def logistic(values: Floats) -> Floats:
-    """``1 / (1 + e^-x)`` of each entry."""
+    """``1 / (1 + e^-x)`` of every value x, in the same shape."""
     return 1.0 / (1.0 + exp_each(-values))

@@ -1,7 +1,7 @@
-"""The force of a body: what its brakes or engine do now, and what its acceleration is when it is free or pushed.
+"""Force of a body, and its acceleration when it moves freely or is pushed.
 
-The *force* is the acceleration that brakes or engine alone would cause. It goes to the command at the vehicle's rates,
-at once where a rate is infinite, and also while the vehicle is at rest.
+The *force* is the acceleration (m/s2) that brakes or engine alone would cause; negative brakes. It changes towards the
+command at the vehicle's rates (m/s3), and jumps where a rate is infinite. It also changes while the vehicle is at rest.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ ROUNDING_S = 1e-9  # an onset this shortly before the end of an interval is at i
 
 @kernel
 def acts(latency, time):
-    """Whether a command takes effect before ``time``. At ``time`` itself the next decision replaces it.
+    """Whether a command takes effect before ``time``. At ``time`` the next decision already replaces the command.
 
-    ``latency`` and ``time`` (s) count from the same moment.
+    ``latency`` is when the command takes effect; both times (s) count from the same moment.
     """
     return latency <= 0.0 or latency < time - ROUNDING_S
 
@@ -39,17 +39,17 @@ def acts(latency, time):
 def force_now(force, command, brake_rate, release_rate):
     """Force (m/s2) just after the ``command`` (m/s2) has taken effect.
 
-    The command itself if the rate (m/s3) towards it is infinite, otherwise the present ``force``.
+    If the rate (m/s3) towards the command is infinite, the new force is the command, otherwise still ``force`` (m/s2).
     """
     return command if math.isinf(brake_rate if command < force else release_rate) else force
 
 
 @large
 def driving(force, command, brake_rate, release_rate, duration):
-    """Speed (m/s) that the engine alone gives in ``duration`` (s), and the force (m/s2) then.
+    """Speed (m/s) that the engine alone gives in ``duration`` (s), and the force (m/s2) at the end.
 
-    It is the integral of the force where it is positive: the force goes from ``force`` to the ``command``
-    (m/s2) at the rate (m/s3) towards it, then stays there.
+    The speed is the integral of the force where it is positive. The force goes from ``force`` to ``command`` (m/s2) at
+    the rate (m/s3) in that direction, then stays constant.
     """
     if duration <= 0.0:
         return 0.0, force
@@ -65,20 +65,23 @@ def driving(force, command, brake_rate, release_rate, duration):
 
 @kernel
 def capacity(car, row, i, time):
-    """Largest deceleration (``row`` BRAKING) or acceleration (DRIVING) of body i of one world at ``time`` (s), m/s2."""
+    """Largest deceleration (``row`` BRAKING) or forward acceleration (DRIVING) of body i at ``time`` (s), m/s2."""
     return car[row, i]
 
 
 def capacities(car: Floats, row: int, time_s: Floats) -> Floats:
-    """``capacity`` of all bodies of n worlds at ``time_s`` [n], [n, N + 1] m/s2."""
+    """Largest deceleration (``row`` BRAKING) or forward acceleration (DRIVING) of all bodies, [n, N + 1] m/s2.
+
+    ``time_s`` [n] is the time in each world.
+    """
     return car[:, row]
 
 
 @kernel
 def plan_force(line, car, scratch, i, builds):
-    """Set how the force of body i goes on: its rate, its next goal and the time until then.
+    """Set how the force of body i changes: its rate, its next goal, and the time until the goal (rows of ``scratch``).
 
-    The goal is the command, or 0 if the force changes its sign on the way: there the body may start to move.
+    The goal is the command, or 0 if the force changes its sign on the way: at force 0 the body may start to move.
     """
     command = scratch[COMMAND, i] * scratch[ACTIVE, i]
     force = force_now(line[FORCE, i], command, car[BRAKE_RATE, i], car[RELEASE_RATE, i]) if builds else command
@@ -91,11 +94,11 @@ def plan_force(line, car, scratch, i, builds):
 
 @kernel
 def force_range(force, rate, speed, limit):
-    """``(forward, backward, rate of forward, rate of backward)``: what own forces do in each direction.
+    """``(forward, backward, rate of forward, rate of backward)`` of the acceleration by a body's own force.
 
-    The acceleration (m/s2) by own forces if the body is about to move forward, the same for backward, and their rates
-    (m/s3). They differ in two cases: brakes at rest act against motion in either direction; a vehicle that drives at
-    its speed limit uses only as much force as keeps it there.
+    ``forward`` is the acceleration (m/s2) if the body is about to move forward, ``backward`` if it is about to move
+    backward; their rates are in m/s3. The two differ in two cases: brakes at rest act against motion in either
+    direction; a vehicle that drives at its speed limit uses only as much force as keeps it there.
     """
     if force < 0.0 or (force == 0.0 and rate < 0.0):
         if speed > 0.0:
@@ -113,9 +116,10 @@ def force_range(force, rate, speed, limit):
 
 @kernel
 def settle(low, high, low_jerk, high_jerk):
-    """Acceleration (m/s2) and jerk (m/s3) of a body: the value nearest to 0 in the range that its forces allow.
+    """Acceleration (m/s2) and jerk (m/s3) of a body: the value nearest to 0 in the range ``[low, high]`` (m/s2).
 
-    ``[low, high]`` is the range (m/s2), ``low_jerk`` and ``high_jerk`` (m/s3) are the rates of its ends.
+    The body's own forces allow the accelerations in this range. ``low_jerk`` and ``high_jerk`` (m/s3) are the rates at
+    which its two ends change.
     """
     if low > 0.0 or (low == 0.0 and low_jerk > 0.0):
         return low, low_jerk
@@ -126,11 +130,11 @@ def settle(low, high, low_jerk, high_jerk):
 
 @kernel
 def stopping_m(speed, latency_left, capacity, rate):
-    """Distance (m) until a vehicle is at rest: it coasts for its latency, then brakes fully.
+    """Distance (m) in which a vehicle stops that coasts until its latency has elapsed and then brakes fully.
 
-    With speed v (m/s, at least 0), latency left tau (s), capacity a (m/s2) and rate r (m/s3), the distance is
-    ``v tau + v^2 / (2 a) + v a / (2 r) - a^3 / (24 r^2)``. A vehicle with ``v < a^2 / (2 r)`` stops before its brakes
-    have full force, after ``v tau + (2 / 3) v sqrt(2 v / r)``. For an infinite rate it is ``v tau + v^2 / (2 a)``.
+    With speed v (m/s, at least 0), remaining latency tau (s), capacity a (m/s2) and rate r (m/s3), the distance is ``v
+    tau + v^2 / (2 a) + v a / (2 r) - a^3 / (24 r^2)``. A vehicle with ``v < a^2 / (2 r)`` stops before its brakes have
+    full force, after ``v tau + (2 / 3) v sqrt(2 v / r)``. For an infinite rate the distance is ``v tau + v^2 / (2 a)``.
     """
     speed = max(speed, 0.0)
     if math.isinf(rate):
@@ -148,7 +152,7 @@ def _stopping_each(speed, latency_left, capacity, rate, out):
 
 
 def stopping_distances(speed: Floats, latency_left: Floats, capacity: Floats, rate: Floats) -> Floats:
-    """``stopping_m`` of n vehicles, [n] m."""
+    """Stopping distances (``stopping_m``) of n vehicles, [n] m; all arguments are [n]."""
     out, tidy = np.empty(len(speed)), np.ascontiguousarray
     _stopping_each(tidy(speed), tidy(latency_left), tidy(capacity), tidy(rate), out)
     return out

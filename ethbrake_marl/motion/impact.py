@@ -1,13 +1,13 @@
-"""Impacts, and bodies that push each other: one law for all touching bodies at once.
+"""Impacts, and bodies that push each other: one law for all bodies that touch.
 
-Resolving a pair after the other would make the result depend on their order. A *cluster* (touching bodies) is therefore
-resolved together, by the mass-weighted isotonic regression P from front to rear (pool adjacent violators):
+If pairs were resolved one after the other, the result would depend on their order. A *cluster* (bodies that touch) is
+therefore resolved as a whole, by the mass-weighted isotonic regression P from front to rear (pool adjacent violators):
 
 * impact with speeds v- before, v+ after, and restitution e: ``v+ = (1 + e) P(v-) - e v-``; for two vehicles this is the
   paper's eq. (14);
-* resting contact: the accelerations are ``P`` of the bodies' own ones; a block of masses m and own accelerations u has
-  ``sum(m u) / sum(m)``. Brakes at rest have any force up to a limit, so a block at rest moves only if the push exceeds
-  it.
+* resting contact: the accelerations are ``P`` of the accelerations u that the bodies' own forces would cause. A *block*
+  (bodies that move as one) with masses m has the acceleration ``sum(m u) / sum(m)``. Brakes at rest resist with any
+  force up to a limit, so a block at rest moves only if the push exceeds this limit.
 
 ``first`` and ``last`` are the front and rear body of a cluster.
 """
@@ -56,14 +56,15 @@ SAME_MPS2 = 5e-13  # touching bodies with accelerations closer than this move al
 
 @large
 def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk):
-    """Write the isotonic regression of the bodies ``first..last`` to ``value`` and ``jerk``; return the number of
-    blocks.
+    """Write the isotonic regression of the bodies ``first..last`` to ``value`` and ``jerk``; return the block count.
 
-    A body whose value is above the value of the body in front forms a *block* with it. All of a block have the value
-    ``settle`` of its mean range, weighted by mass. A body of infinite mass and its block have the value 0.
+    A body whose value is above the value of the body in front forms a *block* with it. All bodies of a block get the
+    same value: ``settle`` of the mean of their ranges, weighted by mass. A block with a body of infinite mass gets the
+    value 0.
 
-    ``low`` and ``high`` are the ends of each body's range (speeds or accelerations, equal for speeds), ``low_jerk`` and
-    ``high_jerk`` their rates; all are rows [N + 1]. The blocks stand in the rows BLOCK of ``scratch``.
+    ``low`` and ``high`` are the ends of each body's range (accelerations, or speeds, for which both ends are equal),
+    ``low_jerk`` and ``high_jerk`` the rates of the ends; all are rows [N + 1]. The blocks are written to the rows BLOCK
+    of ``scratch``.
     """
     count = 0
     for i in range(first, last + 1):
@@ -102,7 +103,10 @@ def pool(mass, low, high, low_jerk, high_jerk, scratch, first, last, value, jerk
 
 @kernel
 def restitution(car, closing):
-    """Coefficient of restitution of an impact of one world, 0 to 1; ``closing`` is its largest closing speed (m/s)."""
+    """Coefficient of restitution, 0 to 1, of an impact with the largest closing speed ``closing`` (m/s).
+
+    An impact with less than ``PLASTIC_MPS`` is plastic: 0.
+    """
     return car[RESTITUTION, 0] if closing >= PLASTIC_MPS else 0.0
 
 
@@ -110,10 +114,10 @@ def restitution(car, closing):
 def resolve_cluster(line, car, scratch, first, last):
     """Replace the speeds of the touching bodies ``first..last`` by their speeds after the impact.
 
-    The impact is plastic (e = 0) if the largest closing speed is below ``PLASTIC_MPS``. Each block's common speed is
-    corrected by its mean rounding error, so momentum is kept to 4 eps of ``sum(m |v|)`` for any masses. In a plastic
-    impact no speed may exceed the one in front by rounding, or two blocks could exchange a rounding error forever. The
-    speed of a body that is not struck keeps its bits.
+    The impact is plastic (e = 0) if the largest closing speed is below ``PLASTIC_MPS``. The common speed of each block
+    is corrected by its mean rounding error, so momentum is conserved to 4 eps of ``sum(m |v|)`` for any masses. After a
+    plastic impact no body may be faster than the body in front by rounding, or two blocks could exchange a rounding
+    error forever. A body that is not struck keeps its speed bit for bit.
     """
     largest = 0.0
     for p in range(first, last):
@@ -141,9 +145,10 @@ def resolve_cluster(line, car, scratch, first, last):
 
 @large
 def note_thrown(line, scratch, p):
-    """Add what an impact changes of the closing speed of pair p, which has had an impact before, to the row THROWN.
+    """Add the change of pair p's closing speed in an impact to the row THROWN; the pair has had an impact before.
 
-    If pair p itself closes in this impact, also add to PUSHED the part that forces had built up.
+    If pair p itself closes in this impact, also add to the row PUSHED the part of the change that takes up closing
+    speed that forces had built up.
     """
     change = (line[SPEED, p + 1] - scratch[BEFORE, p + 1]) - (line[SPEED, p] - scratch[BEFORE, p])
     closing = scratch[CLOSING, p]
@@ -154,7 +159,7 @@ def note_thrown(line, scratch, p):
 
 @large
 def after_impact_of(car, scratch, first, last, body):
-    """Speed (m/s) of ``body`` after the impact if only the bodies ``first..last`` were there."""
+    """Speed (m/s) of ``body`` after the impact if only the bodies ``first..last`` existed."""
     largest = 0.0
     for p in range(first, last):
         largest = max(largest, scratch[CLOSING, p])
@@ -171,12 +176,13 @@ def after_impact_of(car, scratch, first, last, body):
 
 @large
 def note_passed(line, car, scratch, first, last):
-    """Add to the row PASSED the harm that the contacts of a cluster of three bodies or more pass on in an impact.
+    """Add the harm that the contacts of a cluster pass on in an impact to the row PASSED. Two bodies pass nothing on.
 
-    In an impact a contact takes up the closing speed ``v_rear - v_front``: v_rear is what the body behind it would have
-    after the impact if no body were in front of it, v_front what the body in front of it would have if no body were
-    behind it. The harm that it passes on is the square of this, minus the harm of the pair's own closing speed. So
-    vehicles that touch when one of them is struck are not spared what they would bear a millimetre apart.
+    A contact takes up the closing speed ``v_rear - v_front``: v_rear is the speed after the impact that the body behind
+    the contact would have if no body were in front of it; v_front is the speed that the body in front of the contact
+    would have if no body were behind it. The harm passed on is the square of this, minus the harm of the pair's own
+    closing speed. So vehicles that touch when one of them is struck are not spared the harm that they would bear a
+    millimetre apart.
     """
     for p in range(first, last if last - first > 1 else first):  # two bodies pass nothing on
         front = after_impact_of(car, scratch, first, p, p)
@@ -188,14 +194,14 @@ def note_passed(line, car, scratch, first, last):
 
 @large
 def next_of_series(car, scratch, now, first, last):
-    """Pair of a cluster that an endless series of plastic impacts strikes next; -1 if the cluster is struck at once.
+    """Pair of a cluster that the next impact of an endless series strikes; -1: no series, the whole cluster is struck.
 
     All other pairs of the cluster then count as not closing.
 
-    With e = 0 a light vehicle may rattle between two others: each gap is about the square of the one before, until it
-    is 0 in floating-point numbers, and the pairs touch. The series is then played to its end at this moment, one pair
-    after the other, the hardest impact first. It is known by a pair that had an impact at this moment: after a plastic
-    impact at once no pair closes.
+    If impacts are plastic, a light vehicle may rattle between two others: each gap is about the square of the gap
+    before, until the gap is 0 in floating-point numbers and the pairs touch. The rest of the series then happens at
+    this moment, one pair after the other, the hardest impact first. A series is recognised by a pair that has already
+    had an impact at this moment while a pair still closes: after a plastic impact of a whole cluster no pair closes.
     """
     if car[RESTITUTION, 0] > 0.0 or last - first < 2:
         return -1
@@ -214,11 +220,12 @@ def next_of_series(car, scratch, now, first, last):
 
 @kernel
 def resolve_impacts(line, car, scratch, now, ahead):
-    """Resolve every cluster in which a pair closes, and count its harm; return False if no pair closes.
+    """Resolve every cluster in which a pair closes, and count the harm; return False if no pair closes.
 
-    Harm of an impact: the squared closing speed (m2/s2), added to the rows NEW of ``scratch``. A touch does none. The
-    part of a further impact that forces have built up since the pair last touched is a push (``motion.add_push``).
-    ``now`` (s from the start of the interval) is noted for the first impact of each pair.
+    The harm of an impact is its squared closing speed (m2/s2), added to the rows NEW of ``scratch``. A touch
+    (``TOUCH_MPS``) does no harm. In an impact after the pair's first, the part of the closing speed that forces have
+    built up since the pair last touched is a push (``motion.push``). ``now`` (s from the start of the interval) is
+    stored as the time of the pairs' impacts.
     """
     pairs, closes, first = line.shape[1] - 1, False, ahead
     for p in range(ahead, pairs):

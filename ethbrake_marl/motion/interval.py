@@ -1,8 +1,8 @@
-"""One line of bodies through an interval of constant commands, from event to event.
+"""Motion of one line of bodies through an interval of constant commands, from event to event.
 
-``builds`` says whether some body's force follows its command at a finite rate. Between two events every body has a
-constant jerk: 0 where brakes act at once, so the same text serves both, and the compiler drops the jerk where
-``builds`` is the constant False. ``ahead`` is the first body that takes part: 1 where there is no obstacle. Times
+``builds`` says whether the force of some body follows its command at a finite rate. Between two events the jerk of
+every body is constant; without such a body it is 0, and the compiler drops the jerk where ``builds`` is the constant
+False. ``ahead`` is the first body that takes part: the obstacle (0), or Vehicle 1 (1) if there is no obstacle. Times
 within an interval count from its start.
 """
 
@@ -69,16 +69,16 @@ LATE_S, LATE_MPS2 = 1e-9, 1e-12  # delay of a parting, so that rounding cannot u
 
 @kernel
 def crossing_s(below, rate):
-    """Time (s) until ``below`` (m/s2, at most 0), which grows at ``rate`` (m/s3), is surely above 0."""
+    """Time (s) until a value of ``below`` (m/s2, at most 0), which grows at ``rate`` (m/s3), is surely above 0."""
     return math.inf if rate <= 0.0 else max(-below / rate, 0.0) + LATE_S + LATE_MPS2 / rate
 
 
 @large
 def parting_s(car, scratch, head, tail):
-    """Time (s) until the bodies ``head..tail``, which move as one, part or start to move; infinite: never.
+    """Time (s) until the bodies ``head..tail``, which move as one block, part or start to move; infinite: never.
 
-    A moving block splits when its front bodies alone would accelerate more than the whole. A block that its brakes hold
-    starts to move when its front bodies drive away, or when its rear bodies would move backward.
+    A moving block splits when its front bodies alone would accelerate more than the whole block. A block that its
+    brakes hold at rest starts to move when its front bodies drive away, or when its rear bodies would move backward.
     """
     value, jerk, soonest = scratch[ACCELERATION, head], scratch[JERK, head], math.inf
     held = value == 0.0 and jerk == 0.0
@@ -106,7 +106,7 @@ def parting_s(car, scratch, head, tail):
 
 @kernel
 def accelerate(line, car, scratch, ahead, builds):
-    """Set acceleration and jerk of every body, and which pairs move as one; return the time (s) until one parts."""
+    """Set acceleration and jerk of every body, and which pairs move as one; return the time (s) until a pair parts."""
     bodies, soonest, first = line.shape[1], math.inf, ahead
     for i in range(ahead, bodies):
         plan_force(line, car, scratch, i, builds)
@@ -145,10 +145,10 @@ def accelerate(line, car, scratch, ahead, builds):
 
 @kernel
 def next_event(line, car, scratch, now, end, parting, ahead, builds):
-    """Set when each speed and pair has its next event; return the time (s) to the first, at most ``end - now``.
+    """Write the time to the next event of every body and pair; return the time (s) to the first, at most ``end - now``.
 
-    Events: contact, parting (in ``parting`` s), rest, the speed limit, a command that takes effect, a force that
-    reaches its command or 0.
+    Events: two bodies make contact or part (in ``parting`` s); a body comes to rest or reaches its speed limit; a
+    command takes effect; a force reaches its command or 0.
     """
     bodies, soonest = line.shape[1], min(end - now, parting)
     for i in range(ahead, bodies):
@@ -184,8 +184,8 @@ def next_event(line, car, scratch, now, end, parting, ahead, builds):
 def move(line, scratch, duration, ahead, builds):
     """Move gaps, speeds and forces to the next event, ``duration`` (s) later; return False if a contact was missed.
 
-    What happens at the event is set exactly: the gap of a pair in contact to 0, a speed to 0 or the limit, a force to
-    its goal, and the speed of the rear body of a contact to the front one's plus the closing speed.
+    Values at the event are set exactly: a gap to 0 at contact, a speed to 0 or to the limit, a force to its goal, and
+    the speed of the rear body of a contact to the front body's speed plus the closing speed.
     """
     bodies, sound, first = line.shape[1], True, ahead
     for p in range(ahead, bodies - 1):
@@ -225,10 +225,10 @@ def move(line, scratch, duration, ahead, builds):
 
 @kernel
 def solo(speed, command, onset, limit, duration):
-    """Move a vehicle that touches nothing; return its speed (m/s), its way (m) and its acceleration (m/s2).
+    """Speed (m/s) at the end, distance (m) and acceleration (m/s2) of a vehicle that touches nothing.
 
-    It coasts until ``onset`` (s), then brakes to rest or drives up to ``limit`` (m/s). Its speed is at least 0. The
-    acceleration is NaN if it changes on the way.
+    The vehicle coasts until ``onset`` (s), then brakes to rest or drives up to ``limit`` (m/s), for ``duration`` (s) in
+    all. ``speed`` is at least 0. The acceleration is NaN if it changes within this time.
     """
     way, steady = 0.0, command
     if onset > 0.0:
@@ -250,11 +250,12 @@ def solo(speed, command, onset, limit, duration):
 
 @kernel
 def move_apart(line, car, scratch, duration, ahead, builds):
-    """Move the line to the end of the interval at once and return True, if surely no two bodies touch; else do nothing.
+    """Move the line through the whole interval at once if surely no two bodies touch; return whether that was possible.
 
-    Alone, a speed only rises or only falls within the interval, so a gap shrinks by at most ``duration`` times (largest
-    rear speed minus smallest front speed). Where that is too much, and both accelerations are constant, ``contact``
-    says exactly. Forces must not build up within the interval.
+    Without contact a speed only rises or only falls within the interval, so a gap shrinks by at most ``duration`` (s)
+    times (largest rear speed minus smallest front speed). If the gap is smaller than that, and both accelerations are
+    constant, ``contact`` decides. The line is not moved if a force changes within the interval or a body moves
+    backward.
     """
     bodies, slowest, front = line.shape[1], math.inf, 0.0
     for i in range(ahead, bodies):
@@ -285,7 +286,7 @@ def move_apart(line, car, scratch, duration, ahead, builds):
 
 @kernel
 def through_interval(line, car, scratch, start, until, ahead, builds):
-    """The body of ``move_line``: at once if no two bodies touch, otherwise from event to event.
+    """Move one line as ``move_line`` does: at once if no two bodies touch, otherwise from event to event.
 
     ``builds`` must be a constant.
     """
@@ -334,15 +335,16 @@ def through_interval(line, car, scratch, start, until, ahead, builds):
 
 @large
 def through_interval_building(line, car, scratch, start, until, ahead):
-    """``through_interval`` where brakes build up."""
+    """``through_interval`` for a line in which some force follows its command at a finite rate."""
     return through_interval(line, car, scratch, start, until, ahead, True)
 
 
 @kernel
 def note_driving(line, car, wanted, start, until):
-    """Add to the row DROVE what the engines do from ``start`` to ``until``; ``line`` is that of ``start``.
+    """Add the speed that each vehicle's engine alone gives from ``start`` to ``until`` (s) to the row DROVE.
 
-    It depends on a vehicle's own force and command alone: no contact makes driving free.
+    ``line`` is the line at ``start``. The speed depends on the vehicle's own force and command only: no contact makes
+    driving free.
     """
     for i in range(1, line.shape[1]):
         if wanted[i] > 0.0 or line[FORCE, i] > 0.0:
@@ -357,8 +359,9 @@ def move_line(line, car, wanted, scratch, start, until):
     """Move one line from ``start`` to ``until`` (s after the alert) under the commands ``wanted`` [N + 1] (m/s2).
 
     A command has no effect before the body's latency has elapsed. Changes ``line``; returns ``NO_CONTACT``,
-    ``EVENT_BY_EVENT`` or ``FAILED``. If it is not ``NO_CONTACT``, the rows NEW of ``scratch`` hold the harm of this
-    interval, the rows NEXT and CHANGE its first impacts and largest changes of speed.
+    ``EVENT_BY_EVENT`` or ``FAILED``. Unless the result is ``NO_CONTACT``, ``scratch`` then holds the harm of this
+    interval (rows NEW), the first impact of each pair (rows NEXT) and the largest changes of speed by an impact (rows
+    CHANGE).
     """
     ahead, builds = 0 if line[GAP, 0] < FAR_M else 1, False
     for i in range(line.shape[1]):
@@ -373,9 +376,10 @@ def move_line(line, car, wanted, scratch, start, until):
 
 @large
 def move_lines(line, car, time, until, wanted, scratch):
-    """``move_line`` for n worlds from ``time`` to ``until`` [n] (s), in place; return a failed row, or -1.
+    """Move n worlds from ``time`` to ``until`` (s, [n] each), in place; return the index of a failed world, or -1.
 
-    ``line``, ``car`` and ``wanted`` have one more axis in front, [n, ...].
+    ``line``, ``car`` and ``wanted`` are those of ``move_line`` for n worlds, [n, ...]. A world fails if a check of the
+    physics fails.
     """
     failed = -1
     for k in range(len(until)):

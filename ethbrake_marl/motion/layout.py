@@ -1,11 +1,12 @@
 """One world as arrays of rows: what changes, what stays, and the scratch memory of the physics.
 
 Column 0 is the *obstacle* ahead of the line, columns 1 to N are the vehicles, front to rear; all are called *bodies*.
-In a row of pairs, column p is the pair (body p, body p + 1). The obstacle is always there: without one, it is ``FAR_M``
-ahead, and the physics leaves it out.
+In a row of pairs, column p is the pair (body p, body p + 1). Column 0 exists in every world: without an obstacle its
+gap is ``FAR_M``, and the physics leaves it out.
 
-Arrays that most functions share: ``line`` [12, N + 1] changes, ``car`` [10, N + 1] stays, ``scratch`` [ROWS, N + 1]
-belongs to one call. A batch of n worlds has one more axis in front: ``line`` [n, 12, N + 1], ``car`` [n, 10, N + 1].
+Arrays that most functions share: ``line`` [12, N + 1] changes, ``car`` [10, N + 1] stays the same, ``scratch`` [38, N +
+1] is the working memory of one call. A batch of n worlds has one more axis in front: ``line`` [n, 12, N + 1], ``car``
+[n, 10, N + 1].
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ FIRST = 4  # harm of the pair's first impact (m2/s2)
 TOTAL = 5  # harm of all its impacts (m2/s2)
 IMPACTS = 6  # number of its impacts
 PUSHED = 7  # push: closing speed that forces have built up and the pair's contact has taken up (m/s)
-DROVE = 8  # of the vehicle behind the pair: speed that its engine alone would have given it (m/s)
-MOVING = 9  # of the vehicle behind the pair: square of its speed at the horizon (m2/s2)
-THROWN = 10  # change of its closing speed by impacts since it last touched (m/s)
-PASSED = 11  # harm that its contact passes on in impacts, beyond that of its own closing speed (m2/s2)
+DROVE = 8  # of the pair's rear vehicle: speed that its engine alone would have given it (m/s)
+MOVING = 9  # of the pair's rear vehicle: square of its speed at the horizon (m2/s2)
+THROWN = 10  # change of the closing speed by impacts since the pair last touched (m/s)
+PASSED = 11  # harm that the contact passes on in impacts, beyond the harm of its own closing speed (m2/s2)
 LINE_ROWS = 12
 
 # rows of `car`
@@ -90,5 +91,5 @@ FAR_M = 1e300  # gap ahead of a line without an obstacle
 
 
 def scratch_for(bodies: int) -> Floats:
-    """Scratch memory for worlds of so many bodies."""
+    """Scratch memory for worlds with this number of ``bodies``, [SCRATCH_ROWS, bodies]."""
     return np.zeros((SCRATCH_ROWS, bodies))

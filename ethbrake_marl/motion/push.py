@@ -1,21 +1,21 @@
-"""The push: the closing speed that forces build up and a contact takes up, in further impacts or as long as it lasts.
+"""The push: closing speed that forces build up and a contact absorbs, in a further impact or while the contact lasts.
 
-An impact after the pair's first one changes the closing speed by c, from w before it. Of w the forces have built up
-``g = w - (row THROWN)``. Where g > 0, the push is ``c min(g / w, 1)``; ``motion.impact`` adds it. So ever smaller and
-more frequent impacts push as much as a contact that lasts, and one that is struck from behind and thrown forward does
-not push.
+An impact after the pair's first one reduces the closing speed w by c. Of w, forces have built up ``g = w - (row
+THROWN)``. If g > 0, the push is ``c min(g / w, 1)``; ``motion.impact`` adds it. So ever smaller and more frequent
+impacts push as much as a lasting contact, and a vehicle that is struck from behind and thrown forward does not push.
 
-Pair p, whose bodies touch and move as one, takes up the closing acceleration ``u_rear - u_front >= 0`` (m/s2): u_rear
-is what body p + 1 would do if no body were in front of it, u_front what body p would do if no body were behind it.
-Their integral over time is the push (m/s). Harm does not count it.
+A pair p that touches and moves as one absorbs the closing acceleration ``u_rear - u_front >= 0`` (m/s2): u_rear is the
+acceleration that body p + 1 would have if no body were in front of it, u_front the acceleration that body p would have
+if no body were behind it. The integral of this difference over time is the push (m/s). Impact harm does not contain it.
 
-By itself a part of the line obeys the law of resting contact (``motion.impact``). By the min-max formula of isotonic
-regression, u_rear is the largest of the mean accelerations of the bodies p + 1 to j, u_front the smallest of those of
-the bodies i to p, both over the bodies that move as one, weighted by mass. For two moving vehicles the push is the
-integral of ``u_{p+1} - u_p``. A part that its brakes hold, and the obstacle with what leans on it, has the
-acceleration 0.
+A part of the line alone obeys the law of resting contact (``motion.impact``). By the min-max formula of isotonic
+regression, u_rear is therefore the largest of the mean accelerations of the bodies p + 1 to j (for every j), and
+u_front the smallest of the mean accelerations of the bodies i to p (for every i), weighted by mass; only bodies that
+move as one with the pair count. For two moving vehicles the push is the integral of ``u_{p+1} - u_p``. A part that its
+brakes hold at rest has the acceleration 0, and so has the obstacle with the vehicles that touch it.
 
-Between two events each mean is a linear function of time, and so the largest is a convex one: the integral is exact.
+Between two events each mean is a linear function of time, so the largest of them is piecewise linear and convex, and
+the integral is exact.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from ethbrake_marl.motion.layout import ACCELERATION, HIGH, JERK, JOINED, LOW, L
 
 @kernel
 def integral_of_largest(value, rate, count, duration):
-    """Integral from 0 to ``duration`` of the largest of the ``count`` lines ``value[k] + rate[k] t``.
+    """Integral over t from 0 to ``duration`` of the largest of ``count`` linear functions, ``value[k] + rate[k] t``.
 
-    From one crossing to the next the largest line becomes steeper, so it changes at most ``count - 1`` times.
+    At every crossing the largest function becomes steeper, so it changes at most ``count - 1`` times.
     """
     best, area, start = 0, 0.0, 0.0
     for k in range(1, count):
@@ -51,11 +51,11 @@ def integral_of_largest(value, rate, count, duration):
 
 @kernel
 def group_acceleration(car, scratch, body, last, toward, side, held):
-    """Acceleration (m/s2) of ``body`` if only the bodies from it to ``last`` were there.
+    """Acceleration (m/s2) of ``body`` if only the bodies from ``body`` to ``last`` existed.
 
-    ``toward`` is 1 for the bodies behind a contact, where the largest mean counts, and -1 for those in front, where the
-    smallest does. ``side`` is the row of their own accelerations. ``held``: the block does not speed up or slow down,
-    so the brakes may hold any part of it.
+    ``toward`` is 1 for the bodies behind a contact, whose largest mean acceleration counts, and -1 for the bodies in
+    front, whose smallest counts. ``side`` is the row of ``scratch`` with the accelerations by the bodies' own forces.
+    ``held``: the block keeps its speed, so brakes may hold any part of it.
     """
     most, mass, i = toward * scratch[side, body], car[MASS, body], body
     force = mass * most
@@ -69,7 +69,10 @@ def group_acceleration(car, scratch, body, last, toward, side, held):
 
 @large
 def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
-    """Speed (m/s) that ``group_acceleration`` gives ``body`` where brakes build up; ``side_jerk``: row of the rates."""
+    """Change of speed (m/s) of ``body`` by ``group_acceleration`` in ``duration`` (s), if brakes build up.
+
+    ``side_jerk`` is the row of ``scratch`` with the rates of the row ``side``.
+    """
     count, mass, force, rate = 0, 0.0, 0.0, 0.0
     for i in range(body, last + toward, toward):
         if car[MASS, i] == math.inf:
@@ -87,7 +90,7 @@ def gain(car, scratch, body, last, toward, side, side_jerk, held, duration):
 
 @kernel
 def add_push(line, car, scratch, duration, ahead, builds):
-    """Add what the contacts take up in ``duration`` (s), in which no event happens, to the row PUSHED of ``line``."""
+    """Add the push of every pair in ``duration`` (s) to the row PUSHED of ``line``. No event happens in this time."""
     pairs, head = line.shape[1] - 1, ahead
     for p in range(ahead, pairs):
         if scratch[JOINED, p] == 0.0:
