@@ -109,7 +109,7 @@ def record_episode(world: State, team: Team, game: Game, sample_s: float = SAMPL
 
 
 def record_episodes(worlds: State, team: Team, game: Game, sample_s: float = SAMPLE_S) -> list[EpisodeRecord]:
-    """Record several worlds, which a team drives together (``record_episode``)."""
+    """Records of several worlds that a team drives, one per world, as by ``record_episode``."""
     check_exact(worlds, "a record of the motion between decisions")
     states = [worlds, *(state for _, state in play(game, worlds, team))]
     return [_record_of([state.take([row]) for state in states], team, game, sample_s) for row in range(worlds.n)]

@@ -47,9 +47,9 @@ class SummaryRow:
 
     @property
     def exploits(self) -> dict[str, str]:
-        """Conduct that harm does not count, name -> its size in words.
+        """Exploits: conduct that harm does not count, name -> its size in words.
 
-        ``pushes``: pushes Vehicle 1 far; ``moving``: still moves at the horizon.
+        ``pushes``: the team pushes Vehicle 1 far. ``moving``: a vehicle often still moves at the horizon.
         """
         pushed, moving = self.estimates.get("pushed_m_1"), self.horizon_ends / self.episodes
         words = {}

@@ -206,8 +206,8 @@ class Sheet:
             yield Text(f"\n{note}", "dim")
 
     def _fitted(self, width: int, rows: Sequence[Sequence[str]]) -> tuple[int, dict[str, str]]:
-        """Number of columns that fit into ``width`` characters; and the numbers of names that do not fit, name ->
-        ``[1]``.
+        """Number of columns that fit into ``width`` characters; and a number such as ``[1]`` for each name that does
+        not.
         """
         columns = self.formats
         texts = [[column.short or column.heading, *(row[k] for row in rows)] for k, column in enumerate(columns)]

@@ -78,7 +78,7 @@ class EvaluationPlan(FileModel):
 
 
 class TrainingRecipe(FileModel):
-    """Settings of a training that all algorithms share; the recipe of an algorithm is a subclass with more settings.
+    """The settings that all learning algorithms have; each algorithm has a subclass with further settings.
 
     An *update* collects decisions and learns from them. The text in ``Field(description=...)`` explains a key in new
     recipe files, in the JSON Schema and in the documentation.
@@ -361,7 +361,7 @@ VARIANTS: Registry[type[Any]] = Registry(
 
 
 def algorithm_of(recipe: TrainingRecipe) -> Any:
-    """New ``Algorithm`` for a recipe. Raises ``InvalidInput`` if it cannot use the recipe's device."""
+    """New ``Algorithm`` for a recipe. Raises ``InvalidInput`` if the algorithm cannot use the recipe's device."""
     if recipe.device == "cpu":
         algorithm = ALGORITHMS[recipe.algorithm][1]
         return (resolve_name(algorithm) if isinstance(algorithm, str) else algorithm)()

@@ -52,7 +52,7 @@ class Training(NamedTuple):
 
     @property
     def drivers(self) -> dict[str, str]:
-        """Learner -> folder of its policy in the run."""
+        """Folder of each learner's policy inside the run's folder, learner -> path."""
         return {name: f"policy/{name}" if self.scheme == "independent" else "policy" for name in self.learners}
 
     @property

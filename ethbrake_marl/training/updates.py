@@ -80,7 +80,7 @@ class BetweenUpdates(BaseCallback):
         return True
 
     def _on_rollout_start(self) -> None:
-        """Do the work, and write a checkpoint if it is due. Raises ``Stopped`` if the training must stop."""
+        """Call ``work``; write a checkpoint if one is due. Raises ``Stopped`` if the training must stop."""
         due = bool(self.count) and self.count % self.training.recipe.checkpoint_every_updates == 0
         if self.restored:
             self.restored = due = False
@@ -236,7 +236,10 @@ def policy_weights(training: Training, model: BaseAlgorithm) -> list[dict[str, F
 
 
 def make_policies(training: Training, steps: int, weights: Sequence[Mapping[str, Float32s]]) -> dict[str, Policy]:
-    """Policies after ``steps`` decisions, learner -> policy. ``weights``: of each group's policy, name -> tensor."""
+    """Policies after ``steps`` decisions, learner -> policy.
+
+    ``weights``: for each group of learners that share a policy, name of a tensor -> its entries.
+    """
     recipe, scenario = training.recipe, training.scenario
     policies: dict[str, Policy] = {}
     for learners, network, tensors in zip(training.groups, training.networks, weights, strict=True):

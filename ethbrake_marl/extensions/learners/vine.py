@@ -119,7 +119,10 @@ class VineModel(BranchingModel):
         return gained[np.arange(len(size)), learner], moved
 
     def measured_gradient(self, gained: Tensor, moved: Tensor) -> Tensor:
-        """Gradient at each decision, [B] float32, from the returns and moves of its two branches, [2B]."""
+        """Gradient of the return at each decision, [B] float32, limited to the recipe's ``gradient_limit``.
+
+        ``gained``, ``moved`` [2B]: return of each branch, and how far its actions were moved.
+        """
         (up, down), (higher, lower) = gained.chunk(2), moved.chunk(2)
         measured = (up - down) / (higher - lower)
         gradient = measured.clamp(-self.recipe.gradient_limit, self.recipe.gradient_limit)
