@@ -115,6 +115,6 @@ class ReplayBuffer(nn.Module):
 
 
 def draw_rows(rows: Ints, count: int) -> Ints:
-    """Random sample of ``count`` of the ``rows``, without repetition; all of them, in random order, if they are fewer."""
+    """Sample of ``count`` of the ``rows``, without repetition; all of them, in random order, if there are fewer."""
     sample: Ints = rows[torch.randperm(len(rows))[:count].numpy()]
     return sample
